@@ -39,7 +39,7 @@ class Covariance(NamedTuple):
 
 
 def benedict_bordner_beta(alpha: Array) -> Array:
-    """Velocity gain that goes with a position gain: ``beta = alpha^2 / (2 - alpha)``, equation (21).
+    """Return the velocity gain that goes with a position gain: ``beta = alpha^2 / (2 - alpha)``, equation (21).
 
     Benedict and Bordner (1962): the relation that minimises noise and transient error together.
     """
@@ -47,25 +47,25 @@ def benedict_bordner_beta(alpha: Array) -> Array:
 
 
 def predict(position: Array, velocity: Array, T: float | Array) -> Array:
-    """Predicted position, ``x + T v``; the predicted velocity is the velocity."""
+    """Return the predicted position, ``x + T v``; the predicted velocity is the velocity."""
     return position + T * velocity
 
 
 def update(
     predicted: Array, velocity: Array, innovation: Array, alpha: Array, beta: Array, T: float | Array
 ) -> tuple[Array, Array]:
-    """Position and velocity after the innovation, equations (19) and (20)."""
+    """Return the position and velocity after the innovation, equations (19) and (20)."""
     return predicted + alpha * innovation, velocity + (beta / T) * innovation
 
 
 def predict_covariance(P: Covariance, T: float | Array) -> Covariance:
-    """Covariance of the prediction, ``F P F^T`` with ``F = [[1, T], [0, 1]]`` and no process noise."""
+    """Return the covariance of the prediction, ``F P F^T`` with ``F = [[1, T], [0, 1]]`` and no process noise."""
     cross = P.cross + T * P.velocity
     return Covariance(P.position + T * (P.cross + cross), cross, P.velocity)
 
 
 def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: float | Array) -> Covariance:
-    """Covariance after an update with any gains (Joseph form).
+    """Return the covariance after an update with any gains (Joseph form).
 
     Args:
         P: covariance of the prediction.
@@ -87,7 +87,7 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
 def left_by_acceleration(
     P: Covariance, mean_square: Array, alpha: Array, beta: Array, T: float | Array, since: float | Array = 0.0
 ) -> Covariance:
-    """Covariance after an update when the target has accelerated since the measurement before.
+    """Return the covariance after an update when the target has accelerated since the measurement before.
 
     An acceleration ``a`` over an interval moves the position by ``d = a T^2 / 2`` and the velocity by ``2 d / T``, of
     which the update (19), (20) leaves ``(1 - alpha) d`` and ``(2 - beta) d / T``. Where it goes on for ``since`` s
@@ -113,7 +113,7 @@ def left_by_acceleration(
 
 
 def predict_joint_covariance(P: Array, T: float | Array) -> Array:
-    """``F P F^T`` for several coordinates at once, cross terms kept, no process noise.
+    """Return ``F P F^T`` for several coordinates at once, with cross terms and without process noise.
 
     Args:
         P: covariance of (positions, velocities), ``(2 d, 2 d, ...)``.
@@ -126,14 +126,14 @@ def predict_joint_covariance(P: Array, T: float | Array) -> Array:
 
 
 def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: float | Array) -> Array:
-    """Joseph form for several coordinates at once with the same gains in each.
+    """Update the covariance by the Joseph form for several coordinates at once with the same gains in each.
 
     Args:
         P: covariance of the prediction of (positions, velocities), ``(2 d, 2 d, ...)``.
         R: measurement variance of each coordinate, ``(d, ...)``; coordinates are measured independently.
         alpha: position gain, broadcasting against the trailing axes.
         beta: velocity gain; ``beta / T`` enters the filter.
-        T: s since the last measurement; one for all, or broadcasting likewise.
+        T: s since the last measurement; one for all, or broadcasting in the same way.
     """
     xp = namespace(P)
     d = P.shape[0] // 2

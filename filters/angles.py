@@ -14,7 +14,7 @@ PERIODS = {"rad": 2.0 * math.pi, "deg": 360.0}
 
 
 def unwrap(values: Array, reference: Array, periods: Mapping[int, float]) -> Array:
-    """Values with their angles on the turn nearest to a reference; what is there already keeps its bits.
+    """Return the values with their angles on the turn nearest to a reference; values already there keep their bits.
 
     Args:
         values: ``(n, ...)``.
@@ -30,5 +30,5 @@ def unwrap(values: Array, reference: Array, periods: Mapping[int, float]) -> Arr
 
 
 def shorten(difference: Array, periods: Mapping[int, float]) -> Array:
-    """Difference ``(n, ...)`` without whole turns; ``periods`` as of :func:`unwrap`."""
+    """Return the difference ``(n, ...)`` without whole turns; ``periods`` as of :func:`unwrap`."""
     return unwrap(difference, 0.0 * difference, periods) if periods else difference

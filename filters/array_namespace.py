@@ -20,7 +20,7 @@ def namespace(array: Array) -> ModuleType:
     """Return the array API namespace of ``array``.
 
     NumPy 2 implements the standard itself. Asking ``array_api_compat`` costs as much as three small array
-    operations, and ``torch.compile`` cannot follow it, so each type is asked for once.
+    operations, and ``torch.compile`` cannot follow it, so the result is stored by type.
     """
     kind = type(array)
     if kind not in _BY_TYPE:
@@ -29,14 +29,14 @@ def namespace(array: Array) -> ModuleType:
 
 
 def lane_arrays(values: Any) -> list[Array]:
-    """Arrays with axes that stand among the numbers of nested lists."""
+    """Return the arrays with axes that stand among the numbers of nested lists."""
     if isinstance(values, list | tuple):
         return [array for value in values for array in lane_arrays(value)]
     return [values] if getattr(values, "ndim", 0) else []
 
 
 def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
-    """Array of nested lists of numbers and arrays ``(N,)``, ``(..., N)``.
+    """Return the array of nested lists of numbers and arrays ``(N,)``, ``(..., N)``.
 
     Args:
         values: nested lists.
@@ -54,7 +54,7 @@ def zeros_for(shape: Sequence[int], *parts: Any) -> numpy.ndarray:
 
 
 def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
-    """Apply a function to the arrays of nested tuples and dictionaries; None holds none."""
+    """Apply a function to the arrays of nested tuples and dictionaries; None contains no array."""
     first = parts[0]
     if first is None:
         return None
@@ -67,14 +67,14 @@ def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
 
 
 def select_nested(which: Array, one: Any, other: Any) -> Any:
-    """Entries of one nested tuple or dictionary of arrays ``(..., N)`` where ``which``, ``(N,)``, is true, and of
-    another elsewhere; None holds none.
+    """Return the entries of one nested tuple or dictionary of arrays ``(..., N)`` where ``which``, ``(N,)``, is
+    true, and of another elsewhere; None contains no array.
     """
     return map_nested(functools.partial(namespace(which).where, which), one, other)
 
 
 def is_tensor(values: Any) -> bool:
-    """Whether this is a torch tensor; does not import torch."""
+    """Return whether this is a torch tensor, without importing torch."""
     return type(values).__module__.partition(".")[0] == "torch"
 
 

@@ -13,18 +13,18 @@ from .small_matrices import product, transpose
 
 
 def predict_bound(P: Array, F: Array, Q: Array | float = 0.0) -> Array:
-    """Bound before the measurement, ``F P F^T + Q``.
+    """Return the bound before the measurement, ``F P F^T + Q``.
 
     Args:
         P: bound after the previous measurement, ``(n, n, N)``.
         F: transition matrix, ``(n, n, 1)`` or ``(n, n, N)``.
-        Q: covariance of the process noise, likewise; zero where the input is known.
+        Q: covariance of the process noise, same shape; zero where the input is known.
     """
     return product(product(F, P), transpose(F)) + Q
 
 
 def posterior_cramer_rao_bound(P: Array, H: Array, R: Array) -> Array:
-    """Bound after a measurement.
+    """Return the bound after a measurement.
 
     Args:
         P: bound before it, ``(n, n, N)``.

@@ -23,7 +23,7 @@ not depend on the data (:func:`design_channels`), and :func:`update_channels` is
 Reading: the first sum of (8) is over s(k-1), for a fixed s(k). The type probabilities of a class are
 pi(rho | s) = sum_j pi(rho | type j) P(type j | s).
 Reading: in the gate (6), (7) the inverse is that of the standard normal distribution function and P_err the
-probability of *refusing* two bearings of one target, whatever the damaged prose calls it.
+probability of *refusing* two bearings of one target, although the damaged prose reads otherwise.
 
 Shapes: M classes, J types, n states, m measured components; probabilities ``(M, N)``, means ``(n, M, N)``,
 covariances ``(n, n, M, N)``, models ``(n, n, M)``.
@@ -73,7 +73,7 @@ class Advance(NamedTuple):
 
 
 def whiten(factor: list[list[Array]], innovation: Array) -> Array:
-    """``L^-1 Delta`` with ``Theta = L L^T``: independent components of variance one, ``(m, ...)``.
+    """Return ``L^-1 Delta`` with ``Theta = L L^T``: independent components of variance one, ``(m, ...)``.
 
     The first is the innovation of the first component over its predicted sigma, the next what of the second
     the first does not explain, over its sigma, and so on. Their squares add to the normalised innovation
@@ -85,7 +85,7 @@ def whiten(factor: list[list[Array]], innovation: Array) -> Array:
 def advance(
     probabilities: Array, mean: Array, covariance: Array, z: Array, models: Models, class_transition: Array
 ) -> Advance:
-    """Steps 1 to 3 of the recursion: radar update of every filter, class transition, mixing.
+    """Return the steps 1 to 3 of the recursion: radar update of every filter, class transition, mixing.
 
     A class that cannot be reached keeps its own filter.
 
@@ -141,7 +141,7 @@ def _solve_upper(L: list[list[Array]], B: Array) -> Array:
 
 
 class Channels(NamedTuple):
-    """What a bank of constant classes can know before any data, for scans 0 to K."""
+    """Gains and covariances of a bank of constant classes, which do not depend on the data, for scans 0 to K."""
 
     gain: Array
     """Kalman gains, ``(n, m, M, K + 1)``; zero at scan 0, where the track starts."""
@@ -154,7 +154,7 @@ class Channels(NamedTuple):
 
 
 def design_channels(models: Models, start: numpy.ndarray, scans: int) -> Channels:
-    """Gains, covariances and innovation statistics of the Kalman filters of all classes.
+    """Return the gains, covariances and innovation statistics of the Kalman filters of all classes.
 
     Args:
         models: of the classes, NumPy arrays.
@@ -196,7 +196,7 @@ class ChannelUpdate(NamedTuple):
 
 
 def update_channels(mean: Array, z: Array, models: Models, channels: Channels) -> ChannelUpdate:
-    """Step 1 of the recursion for filters whose gains are known.
+    """Apply step 1 of the recursion to filters whose gains are known.
 
     Args:
         mean: x(s), ``(n, M, N)``.
@@ -218,7 +218,7 @@ def update_channels(mean: Array, z: Array, models: Models, channels: Channels) -
 def add_coloured_errors(
     models: Models, start: numpy.ndarray, share: float, decay: float
 ) -> tuple[Models, numpy.ndarray]:
-    """Models whose states hold the coloured errors of the measured components, too; NumPy arrays.
+    """Return the models whose states hold the coloured errors of the measured components, too; NumPy arrays.
 
     With x the state and e the errors, ``e(k) = decay e(k-1) + w``, the new state is (x + H^T e, e): each measured
     component comes with its error, so that measurements are the first m components and white errors. At the start these
@@ -228,7 +228,7 @@ def add_coloured_errors(
         models: of the classes, with ``H = [I 0]``.
         start: covariances at scan 0, ``(n, n, M)``.
         share: variance of a coloured error over that of the white one.
-        decay: what is left of it after a scan.
+        decay: factor on the coloured error from scan to scan.
 
     Returns:
         The models and the covariances, of n + m states.
@@ -253,7 +253,7 @@ def add_coloured_errors(
 
 
 def take_away_coloured_errors(mean: Array, covariance: Array, measured: int = 2) -> tuple[Array, Array]:
-    """State without the coloured errors of :func:`add_coloured_errors`.
+    """Return the state without the coloured errors of :func:`add_coloured_errors`.
 
     Args:
         mean: ``(n + m, N)``.
@@ -271,7 +271,7 @@ def take_away_coloured_errors(mean: Array, covariance: Array, measured: int = 2)
 
 
 def decision_probabilities(confusion: numpy.ndarray, composition: numpy.ndarray) -> numpy.ndarray:
-    """Probability pi(rho | s) of every ESM decision for every class, ``(M, J)``.
+    """Return the probability pi(rho | s) of every ESM decision for every class, ``(M, J)``.
 
     Args:
         confusion: pi(rho | type), ``(J, J)``, row = true type, column = decision; equation (5).
@@ -281,7 +281,7 @@ def decision_probabilities(confusion: numpy.ndarray, composition: numpy.ndarray)
 
 
 def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_composition: Array) -> Array:
-    """Log-likelihood of the classes when all decisions are about one unchanging type, ``(M, N)``.
+    """Return the log-likelihood of the classes when all decisions are about one unchanging type, ``(M, N)``.
 
     (8) multiplies pi(rho | s) at every decision, which is Bayes' rule only if the type is drawn anew each
     time. For one type ``log sum_j P(type j | s) prod_rho pi(rho | type j)^count(rho)``: the posterior of type
@@ -301,7 +301,8 @@ def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_compo
 
 
 def change_class_and_type(log_joint: Array, log_composition: Array, change: float) -> Array:
-    """Log-probabilities of class and type after the class may have changed and brought its own type, ``(M, J, N)``.
+    """Return the log-probabilities of class and type after the class may have changed and brought its own type, ``(M,
+    J, N)``.
 
     ``P(s, j) <- (1 - c) P(s, j) + c P(type j | s) sum_{s' != s} P(s') / (M - 1)``: the transition q of (8), for a type
     that changes only together with the class. It is the prediction of Bayes' rule for a hidden Markov chain, and a
@@ -321,7 +322,7 @@ def change_class_and_type(log_joint: Array, log_composition: Array, change: floa
 
 
 def bearing_gate(radar_sigma: float, esm_sigma: float, error_probability: float) -> float:
-    """Largest difference of two bearings that are taken for one target, equation (7), in the sigmas' unit.
+    """Return the largest difference of two bearings that are taken for one target, equation (7), in the sigmas' unit.
 
     ``sqrt(sigma_Z^2 + sigma_Y^2) F^-1(1 - P_err / 2)``.
 
@@ -334,6 +335,6 @@ def bearing_gate(radar_sigma: float, esm_sigma: float, error_probability: float)
 
 
 def bearing_difference(first: Array, second: Array) -> Array:
-    """Difference of two bearings in degrees, wrapped to [-180, 180)."""
+    """Return the difference of two bearings in degrees, wrapped to [-180, 180)."""
     difference = first - second
     return difference - 360.0 * namespace(difference).floor((difference + 180.0) / 360.0)

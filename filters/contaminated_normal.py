@@ -1,4 +1,4 @@
-r"""Kalman's update where some measurements have far larger errors than stated, and nothing says which.
+r"""Kalman's update where some measurements, it is unknown which, have far larger errors than stated.
 
 The error is normal with variance R, or with probability g an outlier of variance k^2 R (the contaminated normal:
 J. W. Tukey, A survey of sampling from contaminated distributions, 1960). Either hypothesis i has its innovation

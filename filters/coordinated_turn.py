@@ -24,7 +24,7 @@ from .small_matrices import product, transpose
 
 
 def _sine_ratio(angle: Array) -> Array:
-    """Sine of an angle over the angle."""
+    """Return the sine of an angle over the angle."""
     xp = namespace(angle)
     nonzero = angle != 0.0
     divisor = xp.where(nonzero, angle, 1.0)
@@ -32,7 +32,7 @@ def _sine_ratio(angle: Array) -> Array:
 
 
 def _sine_ratio_derivative(angle: Array, cosine: Array, ratio: Array) -> Array:
-    """Derivative of :func:`_sine_ratio`; below 0.1, where the closed form cancels, a series to rounding."""
+    """Return the derivative of :func:`_sine_ratio`; below 0.1, where the closed form cancels, a series to rounding."""
     xp = namespace(angle)
     small = xp.abs(angle) < 0.1
     square = angle * angle
@@ -41,7 +41,7 @@ def _sine_ratio_derivative(angle: Array, cosine: Array, ratio: Array) -> Array:
 
 
 def propagate(state: Array, T: float | Array) -> Array:
-    """State after an interval at constant turn rate.
+    """Return the state after an interval at constant turn rate.
 
     Args:
         state: position (m), velocity (m/s) and turn rate (rad/s), ``(5, ...)``.
@@ -64,7 +64,7 @@ def propagate(state: Array, T: float | Array) -> Array:
 
 
 def jacobian(state: Array, T: float | Array) -> Array:
-    """Derivative of :func:`propagate` with respect to the state, ``(5, 5, ...)``; arguments as there."""
+    """Return the derivative of :func:`propagate` with respect to the state, ``(5, 5, ...)``; arguments as there."""
     xp = namespace(state)
     vx, vy, omega = state[2], state[3], state[4]
     angle = T * omega
@@ -84,7 +84,7 @@ def jacobian(state: Array, T: float | Array) -> Array:
 
 
 def process_noise(T: float, acceleration_sigma: float, turn_acceleration_sigma: float) -> list[list[float]]:
-    """Covariance of the noise over an interval, ``(5, 5)``, as nested lists.
+    """Return the covariance of the noise over an interval, ``(5, 5)``, as nested lists.
 
     Args:
         T: interval, s.
@@ -96,7 +96,7 @@ def process_noise(T: float, acceleration_sigma: float, turn_acceleration_sigma: 
 
 
 def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple[Array, Array]:
-    """Time update of the extended Kalman filter, ``P' = F P F^T + Q`` with the Jacobian F at the estimate.
+    """Apply the time update of the extended Kalman filter, ``P' = F P F^T + Q`` with the Jacobian F at the estimate.
 
     Args:
         mean: ``(5, N)``.
@@ -109,7 +109,7 @@ def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple
 
 
 def augment_turn_rate(mean: Array, covariance: Array, variance: float) -> tuple[Array, Array]:
-    """Estimate of position and velocity with an independent turn rate of mean zero as fifth state.
+    """Return the estimate of position and velocity with an independent turn rate of mean zero as fifth state.
 
     Args:
         mean: ``(4, N)``.

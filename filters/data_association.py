@@ -47,13 +47,13 @@ class Plots(NamedTuple):
 
 
 def _invert(xx: Array, xy: Array, yy: Array) -> tuple[Array, Array]:
-    """Inverse ``(2, 2, ...)`` and determinant of a symmetric matrix of two rows."""
+    """Return the inverse ``(2, 2, ...)`` and determinant of a symmetric matrix of two rows."""
     xp, determinant = namespace(xx), xx * yy - xy * xy
     return xp.stack([xp.stack([yy, -xy]), xp.stack([-xy, xx])]) / determinant, determinant
 
 
 def squared_distances(position: Array, covariance: Array, plots: Array, variances: Array) -> Array:
-    """Squared distances (1) of plots from a predicted position, ``(K, ...)``.
+    """Return the squared distances (1) of plots from a predicted position, ``(K, ...)``.
 
     Args:
         position: predicted, ``(2, ...)``.
@@ -70,7 +70,7 @@ def squared_distances(position: Array, covariance: Array, plots: Array, variance
 
 
 def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[Array, Array]:
-    """Plot that is nearest to the prediction.
+    """Return the plot that is nearest to the prediction.
 
     Args:
         distances: squared, ``(K, N)``.

@@ -1,4 +1,4 @@
-r"""Positions with slow errors, anchored by dead reckoning: what a second sensor says of the motion.
+r"""Positions with slow errors, anchored by dead reckoning from a second sensor.
 
 A receiver's errors last: for minutes they look like motion, and no filter of its positions alone can tell both apart. A
 sensor of another kind, such as wheels and a compass, a camera or an INS, can: its errors grow with the way, and the
@@ -12,8 +12,8 @@ receiver's do not. With its displacement d over an interval T, scaled by k and t
 The error e is a Gauss-Markov process of deviation s and correlation time tau (Brown and Hwang, Introduction to Random
 Signals and Applied Kalman Filtering, 1997, section 5.5), estimated with the position, so that what remains to be
 filtered is white (the same, section 8.7). The error of dead reckoning is a random walk of intensity q over the way l,
-the length of the displacement, and a little more: what stands still is known to creep no faster than ``CREEP``.
-Where the second sensor says nothing, the velocity goes on with a white acceleration a that is constant in the interval:
+the length of the displacement, and a little more: a still vehicle creeps no faster than ``CREEP``.
+Without a reading of the second sensor the velocity goes on with a white acceleration a, constant in the interval:
 
     p' = p + T v + T^2 / 2 a,              v' = v + T a
 
@@ -54,7 +54,7 @@ def _both_axes(block: list[list[Array]]) -> Array:
 
 
 def start(mean: Array, covariance: Array, deviation: float | Array) -> tuple[Array, Array]:
-    """State of which a measured position is all that is known: ``p = z - e - n``.
+    """Return the state of which a measured position is all that is known: ``p = z - e - n``.
 
     Args:
         mean: position and velocity, the position as it was measured, ``(4, N)``, m and m/s.
@@ -95,7 +95,7 @@ def predict_position(
     T: Array,
     noise: Noise,
 ) -> tuple[Array, Array]:
-    """Time update.
+    """Apply the time update.
 
     Args:
         mean: ``(6, N)``.

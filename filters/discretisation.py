@@ -12,7 +12,7 @@ With E = F - I, which keeps its digits where an interval is short, and Q' = A Q 
 
 Where drift is not linear: one or more steps of the classical Runge-Kutta method of order 4 for the mean, and for Q the
 matrix A at the end of the interval, held, with three points of Gauss-Legendre (exact to the fifth power of s) and the
-series of exp(A s) to the third power. Q is then a sum of what is not negative, whatever A is.
+series of exp(A s) to the third power. Q is then a sum of semidefinite terms for any A.
 
 Arrays are those of any namespace with the operator ``@``: NumPy's, or traced ones.
 """
@@ -34,14 +34,16 @@ GAUSS_LEGENDRE = tuple(zip(*(part.tolist() for part in numpy.polynomial.legendre
 
 
 class Series(NamedTuple):
-    """How many terms are summed, and how often the interval is doubled."""
+    """Number of terms of the sum, and number of doublings of the interval."""
 
     terms: int
     doublings: int
 
 
 def choose_series(A: numpy.ndarray, longest: float) -> Series:
-    """Series that is exact to rounding up to the longest interval, s; of integrators in a chain it ends by itself."""
+    """Return the series that is exact to rounding up to the longest interval, s; of integrators in a chain it ends
+    by itself.
+    """
     power = numpy.eye(len(A))
     for k in range(1, len(A) + 1):
         power = power @ A
@@ -52,7 +54,7 @@ def choose_series(A: numpy.ndarray, longest: float) -> Series:
 
 
 def discretise(A: numpy.ndarray, D: numpy.ndarray, interval: Any, series: Series) -> tuple[Array, Array]:
-    """Transition less the unit matrix, and process noise, ``(n, n)`` both.
+    """Return the transition less the unit matrix, and process noise, ``(n, n)`` both.
 
     Args:
         A: ``(n, n)``, 1/s.
@@ -75,7 +77,7 @@ def discretise(A: numpy.ndarray, D: numpy.ndarray, interval: Any, series: Series
 
 
 def runge_kutta(drift: Callable[[Array], Array], x: Array, interval: Any, steps: int = 1) -> Array:
-    """State an interval later by the classical method of order 4, ``(n,)``.
+    """Return the state an interval later by the classical method of order 4, ``(n,)``.
 
     Args:
         drift: from the state to its derivative.
@@ -94,7 +96,7 @@ def runge_kutta(drift: Callable[[Array], Array], x: Array, interval: Any, steps:
 
 
 def held_noise(A: Array, D: numpy.ndarray, interval: Any) -> Array:
-    """Process noise of a matrix A that is held, ``(n, n)``; arguments as of :func:`discretise`."""
+    """Return the process noise of a constant matrix A, ``(n, n)``; arguments as of :func:`discretise`."""
     square = A @ A
     cube, total = square @ A, 0.0
     for point, weight in GAUSS_LEGENDRE:

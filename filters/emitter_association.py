@@ -1,7 +1,7 @@
 r"""Whose emitter was heard: type decisions of a target beside a second emitter, when the target is silent at times.
 
 At a look a station hears the second emitter with probability q, otherwise the target if it radiates, otherwise nothing.
-What it hears it decides to be of type rho, with the probabilities pi(rho | type), and measures its bearing: the
+It decides that the heard emitter is of type rho, with the probabilities pi(rho | type), and measures its bearing: the
 difference d to the target's is zero in the mean for the target, and delta for the second emitter, with variance
 sigma^2. A target that radiates falls silent before a look with probability f, a silent one radiates again with
 probability g. The type j of the target, that of the second emitter, delta, q, f and g are constant.
@@ -19,8 +19,8 @@ and the table T(j, r, v) of the likelihood of all looks, which starts with the p
 
 the forward recursion of a hidden Markov model (L. R. Rabiner, A tutorial on hidden Markov models, Proc. IEEE 77 (1989),
 257-286, section III.A), exact on the grid. The mixture (1) is that of probabilistic data association (Bar-Shalom, Li
-and Kirubarajan, 2001, section 1.5) for one candidate of two sources. Silence says nothing of the class by itself;
-through r it says how probable the second emitter is when something is heard.
+and Kirubarajan, 2001, section 1.5) for one candidate of two sources. Silence alone does not inform about the class;
+through r it determines how probable the second emitter is when something is heard.
 
 Where types are drawn anew for every decision, pi(rho | class) takes the place of pi(rho | type): a label j is anything
 that is constant and has decision probabilities.
@@ -39,11 +39,11 @@ from .class_fusion import bearing_difference
 LEAST_DECISION = 1e-9
 """Probability of a decision that the station's matrix calls impossible."""
 FARTHEST = 300.0
-"""Largest exponent of a bearing's density: what is farther off is no less probable."""
+"""Largest exponent of a bearing's density: a larger difference has the same density."""
 
 
 class Surroundings(NamedTuple):
-    """Grid over what the filter does not know of the second emitter and of the target's silences, ``(V, 1)`` each."""
+    """Grid over the unknown second emitter and the unknown silences of the target, ``(V, 1)`` each."""
 
     other_type: Array
     """Index i of the second emitter's type, a whole number, ``(V,)``."""
@@ -93,7 +93,7 @@ def surroundings(
 
 
 def start_table(grid: Surroundings, labels: int) -> Array:
-    """Table before the first look, the same for all labels, with silences in balance, ``(J, 2, V, 1)``.
+    """Return the table before the first look, the same for all labels, with silences in balance, ``(J, 2, V, 1)``.
 
     Args:
         grid: of NumPy arrays.
@@ -104,7 +104,7 @@ def start_table(grid: Surroundings, labels: int) -> Array:
 
 
 def fall_silent(table: Array, grid: Surroundings, looked: Array) -> Array:
-    """Equation (3) before a look.
+    """Apply equation (3) before a look.
 
     Args:
         table: ``(J, 2, V, N)``.
@@ -119,7 +119,7 @@ def fall_silent(table: Array, grid: Surroundings, looked: Array) -> Array:
 
 
 class Look(NamedTuple):
-    """What the station says at one scan."""
+    """Report of the station at one scan."""
 
     looked: Array
     """Whether it looks, ``(N,)`` of booleans."""
@@ -132,7 +132,8 @@ class Look(NamedTuple):
 def look_likelihood(
     grid: Surroundings, confusion: Array, other_confusion: Array, look: Look, deviation: float
 ) -> Array:
-    """Likelihood (1), (2) of a look over the density of a bearing at its mean, ``(J, 2, V, N)``; one without a look.
+    """Return the likelihood (1), (2) of a look over the density of a bearing at its mean, ``(J, 2, V, N)``; one
+    without a look.
 
     Args:
         grid: V points.
@@ -155,11 +156,11 @@ def look_likelihood(
     target = xp.take(xp.clip(confusion, LEAST_DECISION, None), index, axis=1) * density(apart)
     kinds = xp.take(xp.clip(other_confusion, LEAST_DECISION, None), index, axis=1)
     other = grid.second_emitter * kinds[grid.other_type] * density(apart + grid.separation)
-    nobody = 1.0 - grid.second_emitter
+    unheard = 1.0 - grid.second_emitter
     none = 0.0 * apart
-    silent = xp.where(looked, xp.where(heard, other, nobody), 1.0 + none)
+    silent = xp.where(looked, xp.where(heard, other, unheard), 1.0 + none)
     radiates = [
-        xp.where(looked, xp.where(heard, other + nobody * target[j], none), 1.0 + none)
+        xp.where(looked, xp.where(heard, other + unheard * target[j], none), 1.0 + none)
         for j in range(target.shape[0])
     ]
     return xp.stack([xp.stack([silent, radiating]) for radiating in radiates])

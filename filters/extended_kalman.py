@@ -8,7 +8,7 @@ observation j with variance r_j:
 
 This is step 6 of Moroz's paper on an adaptive multi-hypothesis measurer, ``P = (P'^-1 + H^T R^-1 H)^-1``,
 ``x = x' + P H^T R^-1 nu``, for a diagonal R. It inverts nothing, keeps P exactly symmetric, uses the zeros of
-h, leaves out what is not available, and its terms nu'^2 / s are independent contributions to the normalised
+h, leaves out unavailable observations, and its terms nu'^2 / s are independent contributions to the normalised
 innovation squared, in the order in which the observations are taken. For 17 states and 14 observations it
 takes as long as one stacked product of 31 x 31 matrices.
 
@@ -73,7 +73,7 @@ def update_one_by_one(
     thresholds: Sequence[Array | float] | None = None,
     cautions: Sequence[Array | float] | None = None,
 ) -> Correction:
-    """Mean, covariance and likelihood after m independent scalar observations.
+    """Return the mean, covariance and likelihood after m independent scalar observations.
 
     Args:
         mean: predicted, ``(n, ...)``.
@@ -81,9 +81,9 @@ def update_one_by_one(
         residual: ``(m, ...)``, all of them at the predicted mean.
         rows: the Jacobian at the predicted mean.
         variance: of the noise, m values that broadcast against ``(...)``.
-        available: one where an observation is there, zero where it is not; m values, likewise.
-        thresholds: k of each observation in the robust update, likewise; infinity for none. None: the plain update.
-        cautions: factor on the variance of each observation in its gain alone, likewise. None: the Kalman gain.
+        available: one where an observation is there, zero where it is not; m values that broadcast.
+        thresholds: k of each observation in the robust update, m values; infinity for none. None: the plain update.
+        cautions: factor on the variance of each observation in its gain alone, m values. None: the Kalman gain.
 
     Returns:
         The update; an observation that is not available changes nothing and has no likelihood.

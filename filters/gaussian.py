@@ -8,7 +8,7 @@ from .small_matrices import cholesky, solve_lower
 
 
 def log_density(residual: Array, covariance: Array) -> tuple[Array, Array]:
-    """Log-density of ``N(0, covariance)`` at ``residual``, and the squared Mahalanobis distance.
+    """Return the log-density of ``N(0, covariance)`` at ``residual``, and the squared Mahalanobis distance.
 
     ``log N = -1/2 (d^2 + log det(2 pi S))``, ``d^2 = nu^T S^-1 nu``, by Cholesky factor; equation (11) of the
     IMM paper in logarithms, so that an innovation of 500 sigma keeps its likelihood.

@@ -29,10 +29,10 @@ GRAVITATIONAL_PARAMETER = 3.986004418e14
 
 
 def earth_fixed(latitude: Array, longitude: Array, height: Array) -> Array:
-    """Earth-fixed Cartesian coordinates of a site, ``(3,)``, m; of many ``(3, n)``.
+    """Return the Earth-fixed Cartesian coordinates of a site, ``(3,)``, m; of many ``(3, n)``.
 
     Args:
-        latitude: geodetic latitude, rad; a number or ``(n,)``, likewise the others.
+        latitude: geodetic latitude, rad; a number or ``(n,)``, as the others.
         longitude: rad, positive to the east.
         height: above the ellipsoid, m.
     """
@@ -49,7 +49,7 @@ def earth_fixed(latitude: Array, longitude: Array, height: Array) -> Array:
 
 
 def east_north_up(latitude: float, longitude: float) -> Array:
-    """Rotation from the Earth-fixed frame to east, north, up at a site, ``(3, 3)``.
+    """Return the rotation from the Earth-fixed frame to east, north, up at a site, ``(3, 3)``.
 
     Args:
         latitude: geodetic latitude, rad.
@@ -67,7 +67,8 @@ def east_north_up(latitude: float, longitude: float) -> Array:
 
 
 def east_north(latitude: Array, longitude: Array, height: Array, site: tuple[float, float]) -> Array:
-    """Coordinates east and north of a site on the ellipsoid, in the plane that touches it there, ``(2, n)``, m.
+    """Return the coordinates east and north of a site on the ellipsoid, in the plane that touches it there, ``(2,
+    n)``, m.
 
     Args:
         latitude: geodetic latitude, rad, ``(n,)``.
@@ -80,19 +81,19 @@ def east_north(latitude: Array, longitude: Array, height: Array, site: tuple[flo
 
 
 class PlaneOrigin(NamedTuple):
-    """Where the plane touches the ellipsoid in which positions of a log are metres east and north."""
+    """Point at which the local tangent plane of a log touches the ellipsoid."""
 
     latitude: float
-    """Degrees, likewise the longitude."""
+    """Degrees, as the longitude."""
     longitude: float
     altitude: float = 0.0
-    """Above the ellipsoid, m, of a position that says none; the plane itself lies at zero."""
+    """Above the ellipsoid, m, of a position without a height; the plane itself lies at zero."""
 
     def east_north(self, latitude: Array, longitude: Array, altitude: Array) -> Array:
-        """Coordinates east and north of it, ``(2, n)``, m.
+        """Return the coordinates east and north of the origin, ``(2, n)``, m.
 
         Args:
-            latitude: degrees, ``(n,)``, likewise the longitude.
+            latitude: degrees, ``(n,)``, as the longitude.
             longitude: positive to the east.
             altitude: above the ellipsoid, m, ``(n,)``; NaN where it is not known.
         """
@@ -102,7 +103,8 @@ class PlaneOrigin(NamedTuple):
 
 
 def geodetic(position: Array) -> Array:
-    """Latitude, rad, longitude, rad, and height above the ellipsoid, m, of Earth-fixed coordinates, ``(3, n)``.
+    """Return the latitude, rad, longitude, rad, and height above the ellipsoid, m, of Earth-fixed coordinates, ``(3,
+    n)``.
 
     The inverse of :func:`earth_fixed`, within a hundredth of a micrometre near the ground: Bowring's formula, The
     accuracy of geodetic latitude and height equations, Survey Review 28, 1985.

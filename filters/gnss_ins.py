@@ -67,7 +67,7 @@ class AxisModel(NamedTuple):
 
 
 def rest_model(T: float, velocity_sigma: float, acceleration_sigma: float) -> AxisModel:
-    """Hypothesis 1: the position stays, velocity and acceleration are reset to zero.
+    """Return the model of hypothesis 1: the position stays, velocity and acceleration are reset to zero.
 
     Args:
         T: step, s.
@@ -79,7 +79,7 @@ def rest_model(T: float, velocity_sigma: float, acceleration_sigma: float) -> Ax
 
 
 def constant_velocity_model(T: float, increment_sigma: float, acceleration_sigma: float) -> AxisModel:
-    """Hypothesis 2: constant velocity with a random increment; the acceleration is reset to zero.
+    """Return the model of hypothesis 2: constant velocity with a random increment; the acceleration is reset to zero.
 
     Args:
         T: step, s.
@@ -92,7 +92,7 @@ def constant_velocity_model(T: float, increment_sigma: float, acceleration_sigma
 
 
 def singer_model(T: float, alpha: float, sigma: float) -> AxisModel:
-    """Hypothesis 3: Singer's manoeuvre; see :mod:`.singer`."""
+    """Return the model of hypothesis 3: Singer's manoeuvre; see :mod:`.singer`."""
     return AxisModel(singer.transition(alpha, T), singer.process_noise(alpha, sigma, T))
 
 
@@ -150,7 +150,7 @@ def common_model(
 
 
 def process_noise(axis: AxisModel, common: CommonModel) -> Array:
-    """Covariance of the process noise of one hypothesis, ``(17, 17)``."""
+    """Return the covariance of the process noise of one hypothesis, ``(17, 17)``."""
     Q = zeros_for((SIZE, SIZE), axis.noise, *common)
     x, v, a = (list(range(SIZE))[part] for part in (POSITION, VELOCITY, ACCELERATION))
     for i in range(3):
@@ -191,7 +191,7 @@ def advance(state: Array, axis: Array, T: float, decay: float) -> Array:
 def predict(
     mean: Array, covariance: Array, axis: Array, T: float, decay: float, Q: Array
 ) -> tuple[Array, Array]:
-    """Time update of a bank, step 4: ``F x`` and ``F P F^T + Q``.
+    """Apply the time update of a bank, step 4: ``F x`` and ``F P F^T + Q``.
 
     Args:
         mean: ``(17, M, N)``.
@@ -208,7 +208,7 @@ def predict(
 
 
 class Geometry(NamedTuple):
-    """Where the satellites stand, relative to a user."""
+    """Positions of the satellites relative to a user."""
 
     distance: Array
     """``|s - X|``, ``(S, ...)``, m."""
@@ -221,7 +221,7 @@ class Geometry(NamedTuple):
 
 
 def geometry(state: Array, satellite_position: Array, satellite_velocity: Array) -> Geometry:
-    """Distances, directions and range rates of S satellites.
+    """Return the distances, directions and range rates of S satellites.
 
     Args:
         state: ``(17, ...)``.
@@ -236,12 +236,12 @@ def geometry(state: Array, satellite_position: Array, satellite_velocity: Array)
 
 
 def ranges(state: Array, seen: Geometry) -> tuple[Array, Array]:
-    """Pseudoranges, m, and pseudorange rates, m/s, each ``(S, ...)``."""
+    """Return the pseudoranges, m, and pseudorange rates, m/s, each ``(S, ...)``."""
     return seen.distance + state[CLOCK_BIAS], seen.range_rate + state[CLOCK_DRIFT]
 
 
 def range_jacobian(seen: Geometry) -> list[JacobianRow]:
-    """Rows of the Jacobian of S pseudoranges and then of S pseudorange rates."""
+    """Return the rows of the Jacobian of S pseudoranges and then of S pseudorange rates."""
     x, v = range(0, 3), range(4, 7)
     across = (seen.relative_velocity - seen.unit * seen.range_rate) / seen.distance
     count = seen.distance.shape[0]
@@ -259,7 +259,7 @@ def range_jacobian(seen: Geometry) -> list[JacobianRow]:
 
 
 def body_axes(angles: Array) -> tuple[tuple[Array, Array, Array], ...]:
-    """Rotation from east-north-up to body axes (forward, right, down), as three rows of three arrays.
+    """Return the rotation from east-north-up to body axes (forward, right, down), as three rows of three arrays.
 
     ``C = R_1(roll) R_2(pitch) R_3(heading) N``.
 
@@ -278,7 +278,7 @@ def body_axes(angles: Array) -> tuple[tuple[Array, Array, Array], ...]:
 
 
 def specific_force(state: Array, ins_angles: Array, gravity: float) -> tuple[Array, list[JacobianRow]]:
-    """Accelerometer readings, ``(3, ...)``, m/s^2, and the rows of their Jacobian.
+    """Return the accelerometer readings, ``(3, ...)``, m/s^2, and the rows of their Jacobian.
 
     The derivatives of C by its own angles are combinations of the readings themselves, for example
     ``df/droll = [0, f_down, -f_right]``.
@@ -305,14 +305,14 @@ def specific_force(state: Array, ins_angles: Array, gravity: float) -> tuple[Arr
 
 
 def attitude_jacobian() -> list[JacobianRow]:
-    """Rows of the Jacobian of the three attitude errors: each shows itself."""
+    """Return the rows of the Jacobian of the three attitude errors: each is observed directly."""
     return [JacobianRow((column,), (1.0,)) for column in range(11, 14)]
 
 
 def observe(
     state: Array, satellite_position: Array, satellite_velocity: Array, ins_angles: Array, gravity: float
 ) -> tuple[Array, list[JacobianRow]]:
-    """Observations of a state, ``(2 S + 6, ...)``, and the rows of their Jacobian there.
+    """Return the observations of a state, ``(2 S + 6, ...)``, and the rows of their Jacobian there.
 
     In this order: S pseudoranges, S pseudorange rates, three accelerometers, three attitude errors.
 
@@ -331,7 +331,7 @@ def observe(
 
 
 def sensor_groups(satellites: int) -> Sequence[slice]:
-    """Where pseudoranges, rates, accelerometers and attitude stand among the observations."""
+    """Return the slices of pseudoranges, rates, accelerometers and attitude in the observations."""
     return (
         slice(0, satellites),
         slice(satellites, 2 * satellites),

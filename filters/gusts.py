@@ -25,7 +25,7 @@ class FormingFilter(NamedTuple):
 
 
 def vertical_gust(airspeed: float, length: float, sigma: float) -> FormingFilter:
-    """First-order forming filter of the vertical gust seen as an angle of attack.
+    """Return the first-order forming filter of the vertical gust seen as an angle of attack.
 
     Args:
         airspeed: V, m/s.

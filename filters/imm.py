@@ -21,7 +21,7 @@ from .small_matrices import outer
 
 
 class ModePrediction(NamedTuple):
-    """What the Markov chain says before the measurement."""
+    """Prediction of the Markov chain before the measurement."""
 
     probabilities: Array
     """Predicted mode probabilities (13), ``(M, N)``."""
@@ -30,7 +30,7 @@ class ModePrediction(NamedTuple):
 
 
 def predict_mode_probabilities(transition: Array, probabilities: Array) -> ModePrediction:
-    """Predicted probabilities (13) and mixing weights (10).
+    """Return the predicted probabilities (13) and mixing weights (10).
 
     A mode that cannot be reached (predicted probability zero) keeps its own estimate.
 
@@ -50,7 +50,7 @@ def predict_mode_probabilities(transition: Array, probabilities: Array) -> ModeP
 
 
 def mix(mean: Array, covariance: Array, mixing: Array) -> tuple[Array, Array]:
-    """Mixed inputs of the M filters, equations (8) and (9).
+    """Return the mixed inputs of the M filters, equations (8) and (9).
 
     Args:
         mean: ``x^i(k-1|k-1)``, ``(n, M, N)``.
@@ -64,7 +64,7 @@ def mix(mean: Array, covariance: Array, mixing: Array) -> tuple[Array, Array]:
 
 
 def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:
-    """Mean and covariance of a Gaussian mixture, equations (15) and (16).
+    """Return the mean and covariance of a Gaussian mixture, equations (15) and (16).
 
     Args:
         mean: ``(n, M, ...)``.
@@ -84,7 +84,7 @@ def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Arra
 
 
 def log_probabilities(probabilities: Array) -> Array:
-    """Logarithm of probabilities, with a floor of 1e-300 in place of minus infinity."""
+    """Return the logarithm of probabilities, with a floor of 1e-300 in place of minus infinity."""
     xp = namespace(probabilities)
     if probabilities.dtype == xp.float64:
         return xp.log(xp.clip(probabilities, 1e-300, None))
@@ -94,14 +94,14 @@ def log_probabilities(probabilities: Array) -> Array:
 
 
 def softmax(logarithms: Array) -> Array:
-    """Probabilities from logarithms known up to a constant, normalised over the first axis, ``(M, N)``."""
+    """Return the probabilities from logarithms known up to a constant, normalised over the first axis, ``(M, N)``."""
     xp = namespace(logarithms)
     scaled = xp.exp(logarithms - xp.max(logarithms, axis=0))
     return scaled / ordered_sum(scaled)
 
 
 def log_mixture_density(log_weights: Array, log_likelihood: Array) -> Array:
-    """Logarithm of a mixture's density, ``log sum_j w_j Lambda_j``, ``(N,)``.
+    """Return the logarithm of a mixture's density, ``log sum_j w_j Lambda_j``, ``(N,)``.
 
     Args:
         log_weights: of the components, ``(M, N)``; the weights sum to one.
@@ -111,14 +111,14 @@ def log_mixture_density(log_weights: Array, log_likelihood: Array) -> Array:
 
 
 def log_sum(logarithms: Array) -> Array:
-    """Logarithm of the sum over the first axis of what has these logarithms, ``(M, ...)``."""
+    """Return the logarithm of the sum over the first axis of what has these logarithms, ``(M, ...)``."""
     xp = namespace(logarithms)
     largest = xp.max(logarithms, axis=0)
     return largest + xp.log(ordered_sum(xp.exp(logarithms - largest)))
 
 
 def mode_posterior(log_predicted: Array, log_likelihood: Array) -> Array:
-    """Posterior mode probabilities, equations (12) and (14), in logarithms.
+    """Return the posterior mode probabilities, equations (12) and (14), in logarithms.
 
     Working in logarithms, probabilities survive likelihoods that underflow (an innovation of 500 sigma).
 

@@ -24,12 +24,12 @@ from .unscented import GAUSSIAN, Spread, transform
 
 
 class Received(NamedTuple):
-    """What was received of a measurement."""
+    """Received part of a measurement."""
 
     innovation: Array
     """``(m, N)``, zero where nothing was."""
     H: Array
-    """``(m, n, N)``, likewise."""
+    """``(m, n, N)``, at the same points."""
     R: Array
     """``(m, m, N)``, of the identity where nothing was."""
     available: Array
@@ -37,7 +37,7 @@ class Received(NamedTuple):
 
 
 def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Received:
-    """Take what was not received out of an update.
+    """Remove the entries that were not received from an update.
 
     Args:
         innovation: ``(m, N)``, finite.
@@ -50,7 +50,7 @@ def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Re
 
 
 def _independent(S: Array, available: Array) -> Array:
-    """Covariance of ``(m, m, N)`` with rows and columns of the identity where nothing was received."""
+    """Return the covariance of ``(m, m, N)`` with rows and columns of the identity where nothing was received."""
     xp = namespace(available)
     m = available.shape[0]
     identity = xp.eye(m, dtype=available.dtype, device=available.device)[..., None]
@@ -58,13 +58,13 @@ def _independent(S: Array, available: Array) -> Array:
 
 
 def kalman_gain(covariance: Array, received: Received) -> Array:
-    """Gain that is optimal for a predicted covariance ``(n, n, N)``, ``(n, m, N)``."""
+    """Return the gain that is optimal for a predicted covariance ``(n, n, N)``, ``(n, m, N)``."""
     HP = product(received.H, covariance)
     return transpose(solve_definite(product(HP, transpose(received.H)) + received.R, HP))
 
 
 def update_with_gain(mean: Array, covariance: Array, received: Received, K: Array) -> Update:
-    """Measurement update with any gain.
+    """Return the measurement update with any gain.
 
     Args:
         mean: predicted, ``(n, N)``.
@@ -86,7 +86,7 @@ def update_with_gain(mean: Array, covariance: Array, received: Received, K: Arra
 
 
 def _of_missing(available: Array) -> Array:
-    """Takes out of a log-density what entries that were not received have added to it, ``(N,)``."""
+    """Return the contribution of entries that were not received to a log-density, ``(N,)``."""
     return 0.5 * math.log(2.0 * math.pi) * ordered_sum(1.0 - available)
 
 
@@ -101,7 +101,7 @@ def unscented_update(
     spread: Spread = GAUSSIAN,
     subtract: Callable[[Array, Array], Array] = operator.sub,
 ) -> Update:
-    """Measurement update by sigma points; Julier and Uhlmann, Unscented filtering and nonlinear estimation,
+    """Return the measurement update by sigma points; Julier and Uhlmann, Unscented filtering and nonlinear estimation,
     Proceedings of the IEEE 92 (2004), 401-422.
 
     Args:

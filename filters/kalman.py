@@ -36,7 +36,7 @@ def _with_batch_axis(matrix: Array) -> Array:
 def predict(
     mean: Array, covariance: Array, F: Array, Q: Array, offset: Array | None = None
 ) -> tuple[Array, Array]:
-    """Time update.
+    """Apply the time update.
 
     Args:
         mean: ``(n, N)``.
@@ -53,7 +53,7 @@ def predict(
 
 
 def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Update:
-    """Measurement update in Joseph form, with the log-likelihood of the measurement.
+    """Return the measurement update in Joseph form, with the log-likelihood of the measurement.
 
     Args:
         mean: predicted, ``(n, N)``.
@@ -79,7 +79,7 @@ def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Upda
 
 
 def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list[float]], list[list[float]]]:
-    """Constant-velocity model with an acceleration that is constant and independent in every interval.
+    """Return the constant-velocity model with an acceleration that is constant and independent in every interval.
 
     ``F = [[I, T I], [0, I]]``, ``Q = sigma^2 [[T^4/4 I, T^3/2 I], [T^3/2 I, T^2 I]]`` for the state
     (positions, velocities); ``B = [T^2/2, T]`` of the IMM paper with ``w ~ N(0, sigma^2)``.
@@ -103,7 +103,7 @@ def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list
 
 
 def constant_acceleration(T: Array, axes: int = 1) -> Array:
-    """Transition matrices of constant acceleration for the state (positions, velocities, accelerations).
+    """Return the transition matrices of constant acceleration for the state (positions, velocities, accelerations).
 
     ``F = [[I, T I, T^2/2 I], [0, I, T I], [0, 0, I]]``; Bar-Shalom, Li and Kirubarajan, section 6.2.3.
 

@@ -61,7 +61,7 @@ def intensity_matrix(name: str, matrix: ArrayLike, size: int, definite: bool = F
 
 @stored
 def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
-    """Discrete model of ``dx/dt = A x + B u`` with ``u`` constant in each interval.
+    """Return the discrete model of ``dx/dt = A x + B u`` with ``u`` constant in each interval.
 
     Args:
         A: ``(n, n)``, 1/s.
@@ -83,7 +83,7 @@ def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
 
 @stored
 def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matrix]:
-    """Transition matrix and process-noise covariance of a continuous model.
+    """Return the transition matrix and process-noise covariance of a continuous model.
 
     ``Q = integral over [0, T] of exp(A s) W exp(A^T s) ds`` from one exponential of
     ``[[-A, W], [0, A^T]] T``: Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404. Its upper left block
@@ -123,7 +123,7 @@ def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matr
 
 
 def noise_factor(Q: Matrix, negligible: float = 1e-12) -> Matrix:
-    """Lower-triangular ``C`` with ``C C^T = Q`` for a semidefinite ``Q``.
+    """Return the lower-triangular ``C`` with ``C C^T = Q`` for a semidefinite ``Q``.
 
     A coordinate whose variance, given those before it, is below ``negligible`` of its own variance gets a
     column of zeros: noise that enters through an integrator is nearly collinear with its source, and the
@@ -147,12 +147,12 @@ def noise_factor(Q: Matrix, negligible: float = 1e-12) -> Matrix:
 
 
 def spectral_radius(F: Matrix) -> float:
-    """Largest modulus of the eigenvalues of ``F``; a discrete system is stable below one."""
+    """Return the largest modulus of the eigenvalues of ``F``; a discrete system is stable below one."""
     return float(numpy.max(numpy.abs(numpy.linalg.eigvals(F))))
 
 
 def unobservable_modes(F: Matrix, H: Matrix, continuous: bool = False) -> list[complex]:
-    """Eigenvalues on or beyond the limit of stability that no measurement shows.
+    """Return the eigenvalues on or beyond the limit of stability that no measurement shows.
 
     Popov-Belevitch-Hautus test: the rank of ``[F - lambda I; H]``. The pair is detectable when the list is
     empty; with ``(F^T, B^T)`` in place of ``(F, H)`` it is stabilisable.
@@ -175,7 +175,7 @@ def _list(modes: list[complex]) -> str:
 
 
 class SteadyFilter(NamedTuple):
-    """The filter that the Kalman recursion settles to."""
+    """Steady state of the Kalman recursion."""
 
     gain: Matrix
     """K, ``(n, m)``, for an innovation against the prediction."""
@@ -188,7 +188,7 @@ class SteadyFilter(NamedTuple):
 
 
 def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) -> None:
-    """Refuse what has no stabilising solution, with the reason."""
+    """Raise ValueError with the reason if there is no stabilising solution."""
     if numpy.min(numpy.linalg.eigvalsh(R)) <= 0.0:
         raise ValueError(f"the measurement noise must be positive definite, got R = {R.tolist()}")
     hidden = unobservable_modes(F, H, continuous)
@@ -213,7 +213,7 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
 
 @stored
 def riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Any:
-    """Stabilising solution of an algebraic Riccati equation, "discrete" or "continuous".
+    """Return the stabilising solution of an algebraic Riccati equation, "discrete" or "continuous".
 
     Raises:
         ValueError: where it exists, but has no digits left in float64.
@@ -230,7 +230,7 @@ def riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> A
 
 
 def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
-    """Steady discrete Kalman filter (12), from the discrete algebraic Riccati equation.
+    """Return the steady discrete Kalman filter (12), from the discrete algebraic Riccati equation.
 
     Args:
         F: transition matrix, ``(n, n)``.
@@ -250,9 +250,9 @@ def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
 
 
 def steady_kalman_bucy(A: ArrayLike, H: ArrayLike, intensity: ArrayLike, R: ArrayLike) -> SteadyFilter:
-    """Steady continuous Kalman filter (4), (5), from the continuous algebraic Riccati equation.
+    """Return the steady continuous Kalman filter (4), (5), from the continuous algebraic Riccati equation.
 
-    A random constant in the state violates what it needs: its variance falls for ever, like 1/t.
+    A random constant in the state violates its conditions: the variance falls for ever, like 1/t.
 
     Args:
         A: ``(n, n)``, 1/s.
@@ -302,7 +302,7 @@ class Regulator(NamedTuple):
 
 
 def discrete_regulator(F: Matrix, B: Matrix, weight: Matrix, control_weight: Matrix) -> Regulator:
-    """Control that minimises the sum of ``x^T W x + u^T R u`` (discrete LQR).
+    """Return the control that minimises the sum of ``x^T W x + u^T R u`` (discrete LQR).
 
     Args:
         F: ``(n, n)``.
@@ -327,7 +327,7 @@ def check_stable(F: Matrix) -> None:
 
 
 def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
-    """Covariance X of ``x(k+1) = F x(k) + w(k)``: the discrete Lyapunov equation ``X = F X F^T + Q``.
+    """Return the covariance X of ``x(k+1) = F x(k) + w(k)``: the discrete Lyapunov equation ``X = F X F^T + Q``.
 
     Raises:
         ValueError: if F is not asymptotically stable.
@@ -340,7 +340,7 @@ def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
 
 
 def feedforward_gain(F: Matrix, B: Matrix, output: Matrix, L: Matrix) -> float:
-    """Gain N of ``u = N r - L x`` that makes the static gain from the command to ``output x`` one.
+    """Return the gain N of ``u = N r - L x`` that makes the static gain from the command to ``output x`` one.
 
     Args:
         F: ``(n, n)``.
@@ -368,7 +368,7 @@ class ClosedLoop(NamedTuple):
 def estimate_feedback_loop(
     F: Matrix, B: Matrix, H: Matrix, L: Matrix, K: Matrix, Q: Matrix, R: Matrix
 ) -> ClosedLoop:
-    """Loop closed over a filter, ``u = -L x(k|k)``, in the coordinates state and error ``e = x - x(k|k)``.
+    """Return the loop closed over a filter, ``u = -L x(k|k)``, in the coordinates state and error ``e = x - x(k|k)``.
 
     ``[x; e](k+1) = [[F - B L, B L], [0, (I - K H) F]] [x; e](k) + [[I, 0], [I - K H, -K]] [w; v]``. The zero
     block is the separation principle: the poles are those of ``F - B L`` and those of ``(I - K H) F``,
@@ -391,7 +391,7 @@ def estimate_feedback_loop(
 
 
 def measurement_feedback_loop(F: Matrix, B: Matrix, H: Matrix, L: Matrix, Q: Matrix, R: Matrix) -> ClosedLoop:
-    """Loop closed over raw measurements, ``u = -L H^+ z``, in the coordinates of the state.
+    """Return the loop closed over raw measurements, ``u = -L H^+ z``, in the coordinates of the state.
 
     A coordinate that no sensor measures is fed back as zero. The state holds the plant only: the noise of
     the measurement enters through the control.
@@ -401,7 +401,7 @@ def measurement_feedback_loop(F: Matrix, B: Matrix, H: Matrix, L: Matrix, Q: Mat
 
 
 def separation_defect(F: Matrix, B: Matrix, H: Matrix, L: Matrix, K: Matrix) -> float:
-    """Largest distance between a pole of the loop with filter and its partner in the separated designs.
+    """Return the largest distance between a pole of the loop with filter and its partner in the separated designs.
 
     The loop is written in state and *estimate*, where separation is not visible, and its poles are matched
     one to one with the union of ``eig(F - B L)`` and ``eig((I - K H) F)``: rounding, if the principle holds.

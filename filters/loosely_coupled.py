@@ -31,7 +31,7 @@ from .linear_systems import Matrix, van_loan
 def error_model(
     drift: float, coloured: float, correlation_time: float, white_intensity: float
 ) -> tuple[Matrix, Matrix, Matrix]:
-    """Continuous model of the INS error (delta, beta, eta).
+    """Return the continuous model of the INS error (delta, beta, eta).
 
     Args:
         drift: standard deviation of the constant rate error, m/s.
@@ -55,7 +55,7 @@ class Sampling(NamedTuple):
     drive: float
     """Displacement per unit of the coloured rate error at the start of the step, s."""
     decay: float
-    """What is left of the coloured rate error after a step."""
+    """Factor on the coloured rate error in a step."""
     coloured: float
     """Standard deviation of ``de`` per unit of the stationary one."""
     coupling: float
@@ -80,7 +80,7 @@ def sampling(correlation_time: float, step: float) -> Sampling:
 
 
 def steady_state_gain(growth: Array, R: Array) -> Array:
-    """Gain at which the sampled plain scheme settles, ``P / (P + R)`` with the settled prediction P.
+    """Return the gain at which the sampled plain scheme settles, ``P / (P + R)`` with the settled prediction P.
 
     ``P = q / 2 + sqrt(q^2 / 4 + q R)``; the gain is ``sqrt(Ge / N) step`` at first order in the step.
 
@@ -93,7 +93,7 @@ def steady_state_gain(growth: Array, R: Array) -> Array:
 
 
 def update_variance(P: Array, R: Array, gain: Array) -> Array:
-    """Variance after an update with any gain, ``(1 - gain)^2 P + gain^2 R`` (Joseph form), m^2."""
+    """Return the variance after an update with any gain, ``(1 - gain)^2 P + gain^2 R`` (Joseph form), m^2."""
     rest = 1.0 - gain
     return rest * rest * P + gain * gain * R
 
@@ -114,7 +114,7 @@ class PlainVariance(NamedTuple):
 def predict_plain(
     P: PlainVariance, s: Sampling, growth: float, drift: float, coloured: float, white_intensity: float
 ) -> PlainVariance:
-    """Variances after one step without a measurement.
+    """Return the variances after one step without a measurement.
 
     The rate errors keep their variances, because the plain scheme learns nothing of them.
 
@@ -138,7 +138,7 @@ def predict_plain(
 
 
 def update_plain(P: PlainVariance, R: Array, gain: Array) -> PlainVariance:
-    """Variances after an update with any gain that does not depend on the innovations (Joseph form).
+    """Return the variances after an update with any gain that does not depend on the innovations (Joseph form).
 
     Args:
         P: of the prediction.
@@ -155,7 +155,7 @@ def update_plain(P: PlainVariance, R: Array, gain: Array) -> PlainVariance:
 def best_constant_gain(
     drift: float, coloured: float, correlation_time: float, white_intensity: float, receiver_intensity: float
 ) -> float:
-    """Gain K, 1/s, of the least settled mean square error: a bound for any tuning of the plain scheme.
+    """Return the gain K, 1/s, of the least settled mean square error: a bound for any tuning of the plain scheme.
 
     From (6) for ``d Delta/dt = -K Delta + beta + eta + xi - K zeta`` the settled mean square error is
     ``(sigma_b / K)^2 + sigma^2 / (K (K + 1/tau)) + (G + K^2 N) / (2 K)``, m^2; the first term is what is left
@@ -212,7 +212,7 @@ class AugmentedCovariance(NamedTuple):
 def predict_augmented(
     P: AugmentedCovariance, s: Sampling, coloured: Array, white: Array
 ) -> AugmentedCovariance:
-    """Covariance after one step without a measurement, ``F P F^T + Qd``.
+    """Return the covariance after one step without a measurement, ``F P F^T + Qd``.
 
     Args:
         P: after the previous measurement.
@@ -247,7 +247,7 @@ class AugmentedFilterGain(NamedTuple):
 def update_augmented(
     P: AugmentedCovariance, R: Array, available: Array
 ) -> tuple[AugmentedFilterGain, AugmentedCovariance]:
-    """Gains and covariance of a measurement of delta.
+    """Return the gains and covariance of a measurement of delta.
 
     ``K = P H^T / S``, ``P - K S K^T``; with this gain, which is Kalman's, and one measurement the position
     variance is ``P R / S``, positive whatever the rounding.
@@ -270,8 +270,8 @@ def update_augmented(
 
 
 def update_augmented_by(P: AugmentedCovariance, R: Array, gain: AugmentedFilterGain) -> AugmentedCovariance:
-    """Covariance after a measurement of delta that was taken in with any gain, ``(I - K H) P (I - K H)^T + K R K^T``
-    (Joseph form).
+    """Return the covariance after a measurement of delta that was taken in with any gain, ``(I - K H) P (I - K H)^T +
+    K R K^T`` (Joseph form).
 
     Args:
         P: of the prediction.

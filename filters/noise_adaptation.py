@@ -29,7 +29,7 @@ where epsilon and P come from the Kalman update with that R, so (7) is iterated 
 
 Measurements are independent of each other: R is diagonal and everything is elementwise, ``(m, N)`` or ``(N,)``.
 ``available`` is 1 where there is a measurement and 0 where there is none; there nothing is learned or forgotten,
-and all other arguments may be any finite number. In units of what a sensor reports (innovations over the
+and all other arguments may be any finite number. In units of the reading of a sensor (innovations over the
 reported deviation) the same functions estimate the factor by which the report is wrong.
 """
 
@@ -52,7 +52,7 @@ class Level(NamedTuple):
 
 
 def fading_mean(level: Level, sample: Array, forgetting: float, available: Array | float = 1.0) -> Level:
-    """Mean of all samples with those of k measurements ago weighing ``forgetting^k``: equation (4).
+    """Return the mean of all samples with those of k measurements ago weighing ``forgetting^k``: equation (4).
 
     Args:
         level: before.
@@ -72,7 +72,7 @@ def sage_husa(
     least: Array | float,
     available: Array | float = 1.0,
 ) -> Level:
-    """Variance of a measurement's noise by equation (1), held above a least one.
+    """Return the variance of a measurement's noise by equation (1), held above a least one.
 
     Args:
         level: before.
@@ -87,7 +87,7 @@ def sage_husa(
 
 
 def process_noise_factor(correction: Array, updated: Array, carried: Array, unit: Array) -> Array:
-    """Sample of the factor on the process noise: the diagonal of equation (3) over that of the unit noise.
+    """Return the sample of the factor on the process noise: the diagonal of equation (3) over that of the unit noise.
 
     Its mean is the true factor where the filter believes the right one. Without a measurement it is the factor
     that the filter believes. Single samples are often negative: average them with :func:`fading_mean`, hold the average
@@ -107,7 +107,7 @@ def process_noise_factor(correction: Array, updated: Array, carried: Array, unit
 
 
 def start_window(variance: Array, size: int) -> Array:
-    """Window of equation (5) filled with the variance that is believed at the start, ``(size, ...)``."""
+    """Return the window of equation (5) filled with the variance that is believed at the start, ``(size, ...)``."""
     return namespace(variance).stack([variance] * size, axis=0)
 
 
@@ -118,7 +118,7 @@ def mehra(
     least: Array | float,
     available: Array | float = 1.0,
 ) -> tuple[Array, Array]:
-    """Variance of a measurement's noise by equation (5), held above a least one.
+    """Return the variance of a measurement's noise by equation (5), held above a least one.
 
     Args:
         window: the last samples, the oldest first, ``(W, ...)``.
@@ -152,7 +152,7 @@ class InverseGamma(NamedTuple):
 
 
 def forget(noise: InverseGamma, forgetting: float, available: Array | float = 1.0) -> InverseGamma:
-    """Equation (6): the same variance from fewer measurements.
+    """Apply equation (6): the same variance from fewer measurements.
 
     Args:
         noise: after the measurement before.
@@ -170,7 +170,7 @@ def variational_bayes(
     iterations: int,
     available: Array | float = 1.0,
 ) -> tuple[InverseGamma, State]:
-    """State and noise from one measurement by the fixed point of equation (7).
+    """Return the state and noise from one measurement by the fixed point of equation (7).
 
     Args:
         noise: after :func:`forget`.

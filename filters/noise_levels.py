@@ -35,7 +35,7 @@ LEAST_PROBABILITY = 1e-30
 
 
 class LevelHypotheses(NamedTuple):
-    """Filters by what they believe of the noise."""
+    """Filters, one for each hypothesis on the noise levels."""
 
     mean: Array
     """``(n, H, N)``."""
@@ -57,7 +57,7 @@ class LevelHypotheses(NamedTuple):
 
 
 def squares(deviation: Array) -> Array:
-    """Packed ``d d^T`` of ``(n, ...)``."""
+    """Return the packed ``d d^T`` of ``(n, ...)``."""
     xp = namespace(deviation)
     return xp.concat([deviation[j:] * deviation[j] for j in range(deviation.shape[0])], axis=0)
 
@@ -74,7 +74,7 @@ class Moments(NamedTuple):
 
 
 def merge(mean: Array, covariance: Array, weights: Array) -> Moments:
-    """Moments (2) of hypotheses.
+    """Return the moments (2) of hypotheses.
 
     Args:
         mean: ``(n, H, N)``.
@@ -92,7 +92,7 @@ def merge(mean: Array, covariance: Array, weights: Array) -> Moments:
 def switch(
     before: LevelHypotheses, change: Array, prior: Array, sensor_change: Array, levels: Array
 ) -> LevelHypotheses:
-    """Let levels change before a step, equations (1) to (4).
+    """Apply the possible changes of level before a step, equations (1) to (4).
 
     Args:
         before: after the last measurement.
@@ -124,7 +124,7 @@ def switch(
 
 
 class SensorUpdate(NamedTuple):
-    """What a reading makes of the hypotheses."""
+    """Hypotheses after a reading."""
 
     mean: Array
     covariance: Array
@@ -137,7 +137,7 @@ class SensorUpdate(NamedTuple):
 
 
 class SensorNoise(NamedTuple):
-    """What is believed of the noise of a sensor."""
+    """Distribution of the noise level of a sensor."""
 
     variances: Array
     """Of its levels, ascending, ``(L, H, 1)``."""
@@ -159,7 +159,7 @@ def update_sensor(
         covariance: predicted, packed.
         z: reading, ``(N,)``; where not available any finite number.
         rows: coordinates whose sum the sensor reads.
-        noise: what is believed of it.
+        noise: distribution of its level.
         available: 1 where there is a reading and 0 where there is none, ``(N,)``.
     """
     xp, n = namespace(mean), mean.shape[0]
@@ -173,7 +173,7 @@ def update_sensor(
         q = xp.concat([(1.0 - noise.outlier) * q, 0.0 * q[:1] + noise.outlier])
     mixture = receiver_faults.weigh_levels(squared, 1, variance, variances, q)
     levels = mixture.responsibilities
-    if noise.outlier:  # an outlier says nothing about the level
+    if noise.outlier:  # an outlier does not inform about the level
         levels = levels[:-1] + levels[-1] * noise.probabilities
     weighted = (available * (mixture.score - mixture.spread * squared)) * along
     return SensorUpdate(

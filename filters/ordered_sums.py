@@ -13,7 +13,7 @@ from .array_namespace import Array
 
 
 def ordered_sum(values: Iterable[Array]) -> Array:
-    """Sum over the first axis, ``((values[0] + values[1]) + values[2]) + ...``.
+    """Return the sum over the first axis, ``((values[0] + values[1]) + values[2]) + ...``.
 
     Args:
         values: ``(M, ...)``, or any other series of at least one array.
@@ -25,7 +25,7 @@ def ordered_sum(values: Iterable[Array]) -> Array:
 
 
 def weighted_sum(weights: Array, values: Array) -> Array:
-    """Sum over M hypotheses, ``sum_j weights[j] values[..., j, :]``.
+    """Return the sum over M hypotheses, ``sum_j weights[j] values[..., j, :]``.
 
     Args:
         weights: ``(M, ...)``.

@@ -24,39 +24,39 @@ from .ordered_sums import ordered_sum
 
 
 def position(n: int, i: int, j: int) -> int:
-    """Row of element (i, j) in the packed triangle of an ``n`` by ``n`` matrix."""
+    """Return the row of element (i, j) in the packed triangle of an ``n`` by ``n`` matrix."""
     i, j = max(i, j), min(i, j)
     return j * n - j * (j - 1) // 2 + i - j
 
 
 def column(n: int, j: int) -> list[int]:
-    """Rows of the packed triangle that hold column j of the matrix."""
+    """Return the rows of the packed triangle that hold column j of the matrix."""
     return [position(n, i, j) for i in range(n)]
 
 
 def diagonal(n: int) -> list[int]:
-    """Rows of the packed triangle that hold the diagonal."""
+    """Return the rows of the packed triangle that hold the diagonal."""
     return [position(n, i, i) for i in range(n)]
 
 
 def pack(P: Array) -> Array:
-    """Lower triangle of ``(n, n, ...)``, as ``(n (n + 1) / 2, ...)``."""
+    """Return the lower triangle of ``(n, n, ...)``, as ``(n (n + 1) / 2, ...)``."""
     return namespace(P).concat([P[j:, j] for j in range(P.shape[0])], axis=0)
 
 
 def unpack(packed: Array, n: int) -> Array:
-    """Symmetric matrix ``(n, n, ...)`` of a packed triangle."""
+    """Return the symmetric matrix ``(n, n, ...)`` of a packed triangle."""
     return packed[_matrix(n)]
 
 
 @functools.cache
 def _matrix(n: int) -> numpy.ndarray:
-    """Row of the packed triangle that holds each element of the matrix, ``(n, n)``."""
+    """Return the row of the packed triangle that holds each element of the matrix, ``(n, n)``."""
     return numpy.array([column(n, j) for j in range(n)])
 
 
 def propagator(F: numpy.ndarray) -> numpy.ndarray:
-    """Matrix M with ``pack(F P F^T) = M pack(P)``, ``(n (n + 1) / 2,) * 2``."""
+    """Return the matrix M with ``pack(F P F^T) = M pack(P)``, ``(n (n + 1) / 2,) * 2``."""
     n = len(F)
     M = numpy.zeros((n * (n + 1) // 2,) * 2)
     for j in range(n):
@@ -119,7 +119,7 @@ def update_coordinates(
 
 
 class GainModel(NamedTuple):
-    """What a Kalman gain is computed from where that is not what the covariance is computed from."""
+    """Covariance and variances from which a Kalman gain is computed, where they differ from those of the filter."""
 
     covariance: Array
     """Predicted, packed, ``(n (n + 1) / 2, N)``."""
@@ -135,7 +135,7 @@ class UpdateWithGain(NamedTuple):
     covariance: Array
     """Packed, ``(n (n + 1) / 2, N)``."""
     gain_covariance: Array
-    """The one that the gain is of, updated by it, likewise."""
+    """Covariance from which the gain is computed, updated by it, in the same form."""
 
 
 def update_coordinates_with_gain(

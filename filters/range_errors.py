@@ -44,11 +44,11 @@ LARGEST_PROBABILITY = 1.0 - 1e-12
 
 
 def start(mean: Array, covariance: Array, satellites: int, variance: Array) -> tuple[Array, Array]:
-    """State with the range errors, which are zero but for a variance.
+    """Return the state with the range errors, which are zero but for a variance.
 
     Args:
         mean: of the first 17 states, ``(17, N)``.
-        covariance: likewise, ``(17, 17, N)``.
+        covariance: of the same state, ``(17, 17, N)``.
         satellites: S.
         variance: of each error, m^2, ``(N,)``.
     """
@@ -69,7 +69,7 @@ def advance(state: Array, axis: Array, T: float, decay: float, kept: Array | lis
         axis: transition of (x, v, a), ``(3, 3, ...)``.
         T: step, s.
         decay: factor of the attitude rates.
-        kept: psi, what is left of a range error, broadcasts against ``(...)``; or a list of one for each.
+        kept: psi, factor on a range error in a step, broadcasts against ``(...)``; or a list of one for each.
     """
     known = gnss_ins.SIZE
     if isinstance(kept, list):
@@ -89,7 +89,7 @@ def predict(
     kept: Array | list[Array],
     gained: Array | list[Array],
 ) -> tuple[Array, Array]:
-    """Time update, ``F x`` and ``F P F^T + Q``.
+    """Apply the time update, ``F x`` and ``F P F^T + Q``.
 
     Args:
         mean: ``(17 + S, M, N)``.
@@ -99,7 +99,7 @@ def predict(
         decay: factor of the attitude rates.
         Q: covariance of the process noise of the first 17 states, with zeros beyond, ``(17 + S, 17 + S, M, 1)``.
         kept: psi, ``(N,)`` or a number; or a list of one for each error.
-        gained: variance of w, m^2, likewise.
+        gained: variance of w, m^2, same shape.
     """
     xp = namespace(mean)
     moved = advance(covariance, axis, T, decay, kept)
@@ -113,7 +113,7 @@ def predict(
 def observe(
     state: Array, satellite_position: Array, satellite_velocity: Array, ins_angles: Array, gravity: float
 ) -> tuple[Array, list[JacobianRow]]:
-    """Observations of a state and the rows of their Jacobian; pseudoranges with their errors."""
+    """Return the observations of a state and the rows of their Jacobian; pseudoranges with their errors."""
     expected, rows = gnss_ins.observe(state, satellite_position, satellite_velocity, ins_angles, gravity)
     errors = state[gnss_ins.SIZE :]
     S = errors.shape[0]
@@ -137,13 +137,14 @@ class SequentialUpdate(NamedTuple):
 
 
 def begin(mean: Array, covariance: Array) -> SequentialUpdate:
-    """Before the first observation."""
+    """Return the state before the first observation."""
     none = 0.0 * mean[0]
     return SequentialUpdate(0.0 * mean, covariance, none, none)
 
 
 def innovation_of(state: SequentialUpdate, residual: Array, row: JacobianRow) -> tuple[Array, Array, Array]:
-    """Innovation given what was taken in, its covariance with the state ``P h^T``, ``(n, ...)``, and ``h P h^T``.
+    """Return the innovation given what was taken in, its covariance with the state ``P h^T``, ``(n, ...)``, and ``h P
+    h^T``.
 
     Args:
         state: before the observation.
@@ -175,7 +176,7 @@ def take_reading(
         residual: at the predicted mean, ``(...)``; any finite number where it is not available.
         row: of the Jacobian there.
         levels: variances in ascending order, ``(L, ...)`` that broadcast.
-        probabilities: of the levels, likewise; that of the highest one above zero.
+        probabilities: of the levels, same shape; that of the highest one above zero.
         available: one where there is the observation, zero where there is none.
 
     Returns:
@@ -196,7 +197,7 @@ def take_reading(
 
 
 class Renewal(NamedTuple):
-    """How a range error may have been drawn anew; arrays that broadcast against ``(...)``."""
+    """Distribution of a range error that may have been drawn anew; arrays that broadcast against ``(...)``."""
 
     probability: Array
     """p."""
@@ -262,7 +263,7 @@ def take_pseudorange(
 
 
 def _replace(covariance: Array, place: int, values: Sequence[Array], own: Array) -> Array:
-    """Covariance with another row and column of one state, and another variance of it."""
+    """Return the covariance with another row and column of one state, and another variance of it."""
     xp = namespace(covariance)
     row = xp.concat([values[:place], own[None], values[place + 1 :]])
     covariance = xp.concat([covariance[:place], row[None], covariance[place + 1 :]])

@@ -1,4 +1,4 @@
-r"""Faults of a satellite receiver beside an INS: an error that the receiver adds, and noise whose level nobody knows.
+r"""Faults of a satellite receiver beside an INS: an error that the receiver adds, and noise of unknown level.
 
 The INS error (delta, beta, eta) of :mod:`.loosely_coupled` is followed by the receiver's own errors e,
 
@@ -48,14 +48,14 @@ class FaultCovariance(NamedTuple):
 def predict_fault(
     P: FaultCovariance, s: Sampling, coloured: Array, white: Array, decay: Array, gained: Array
 ) -> FaultCovariance:
-    """Covariance after one step without a measurement, ``F P F^T + Qd``.
+    """Return the covariance after one step without a measurement, ``F P F^T + Qd``.
 
     Args:
         P: after the previous measurement.
         s: sampling of the INS error.
         coloured: variance that the coloured rate error gains in a step, m^2/s^2.
         white: variance of the displacement in a step that this gain does not explain, m^2.
-        decay: psi, what is left of each error of the receiver after a step, ``(E, ...)``.
+        decay: psi, factor on each error of the receiver in a step, ``(E, ...)``.
         gained: variance that each of them gains in a step, ``(E, ...)``.
     """
     xp = namespace(P.cross)
@@ -73,7 +73,7 @@ def predict_fault(
 
 
 def add_fault(P: FaultCovariance, variance: Array) -> FaultCovariance:
-    """Covariance with one more error of the receiver, independent of all others.
+    """Return the covariance with one more error of the receiver, independent of all others.
 
     Args:
         P: without it.
@@ -90,7 +90,7 @@ def add_fault(P: FaultCovariance, variance: Array) -> FaultCovariance:
 
 
 def matrix(P: FaultCovariance) -> Array:
-    """Covariance of (delta, beta, eta, e), ``(3 + E, 3 + E, ...)``."""
+    """Return the covariance of (delta, beta, eta, e), ``(3 + E, 3 + E, ...)``."""
     xp, ins = namespace(P.faults), P.ins
     first = [
         [ins.position, ins.position_drift, ins.position_coloured],
@@ -120,7 +120,7 @@ class Direction(NamedTuple):
 
 
 def measured_direction(P: FaultCovariance, h: Array) -> Direction:
-    """Direction along which a measurement changes the estimate.
+    """Return the direction along which a measurement changes the estimate.
 
     Args:
         P: of the prediction.
@@ -143,7 +143,7 @@ def measured_direction(P: FaultCovariance, h: Array) -> Direction:
 
 
 def update_fault(P: FaultCovariance, along: Direction, weight: Array) -> FaultCovariance:
-    """Covariance after an update, ``P - P H^T weight H P``.
+    """Return the covariance after an update, ``P - P H^T weight H P``.
 
     Args:
         P: of the prediction.
@@ -168,7 +168,7 @@ def update_fault(P: FaultCovariance, along: Direction, weight: Array) -> FaultCo
 
 
 class NoiseMixture(NamedTuple):
-    """What an innovation says under noise that is a Gaussian sum."""
+    """Statistics of an innovation under noise that is a Gaussian sum."""
 
     log_density: Array
     """Of the innovation on all axes, ``(...)``."""
@@ -193,7 +193,7 @@ def weigh_levels(
         axes: number of axes, all with the same variances.
         variance: ``H P H^T``, m^2, ``(...)``.
         levels: variances ``R_l`` in ascending order, m^2, ``(L, ...)`` that broadcast.
-        probabilities: ``q_l``, likewise; that of the highest level above zero.
+        probabilities: ``q_l``, same shape; that of the highest level above zero.
     """
     xp = namespace(squares)
     precision = 1.0 / (variance + levels)

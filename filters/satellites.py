@@ -38,12 +38,12 @@ PLANE_SHIFT = numpy.deg2rad(15.0)
 
 
 def orbit_radius() -> float:
-    """Radius of a circular orbit of the nominal period, ``(mu (P / 2 pi)^2)^(1/3)``, m."""
+    """Return the radius of a circular orbit of the nominal period, ``(mu (P / 2 pi)^2)^(1/3)``, m."""
     return (GRAVITATIONAL_PARAMETER * (PERIOD / (2.0 * numpy.pi)) ** 2) ** (1.0 / 3.0)
 
 
 def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]:
-    """Earth-fixed positions and velocities of satellites.
+    """Return the Earth-fixed positions and velocities of satellites.
 
     Args:
         slots: S numbers from 1 to 24.
@@ -78,7 +78,7 @@ def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]
 def local_orbits(
     slots: Sequence[int], time: Array, latitude: float, longitude: float, height: float
 ) -> tuple[Array, Array]:
-    """Positions and velocities of satellites in the east-north-up frame of a site.
+    """Return the positions and velocities of satellites in the east-north-up frame of a site.
 
     Args:
         slots: S numbers from 1 to 24.
@@ -98,7 +98,7 @@ def local_orbits(
 
 
 def look_angles(local: Array) -> tuple[Array, Array]:
-    """Azimuth from north over east, and elevation, rad, of local positions ``(3, ...)``."""
+    """Return the azimuth from north over east, and elevation, rad, of local positions ``(3, ...)``."""
     azimuth = numpy.arctan2(local[0], local[1]) % (2.0 * numpy.pi)
     return azimuth, numpy.arctan2(local[2], numpy.hypot(local[0], local[1]))
 
@@ -115,7 +115,7 @@ class DilutionOfPrecision(NamedTuple):
 
 
 def dilution_of_precision(unit_vectors: Array) -> DilutionOfPrecision:
-    """Dilutions of precision of one epoch.
+    """Return the dilutions of precision of one epoch.
 
     Args:
         unit_vectors: from the user to S satellites, east-north-up, ``(3, S)``.

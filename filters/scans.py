@@ -20,7 +20,7 @@ from .array_namespace import Array, map_nested, namespace
 
 Carried = TypeVar("Carried", bound=tuple[Any, ...])
 Step = Callable[..., Any]
-"""Of what is given of a scan and what is carried from the next one; it knows no time axis."""
+"""Function of the input of a scan and of the value carried from the next one, without a time axis."""
 LEAST = 64
 """Scans from which on a recursion is compiled; a shorter one ends before its step is traced."""
 TOGETHER = 8192
@@ -28,7 +28,7 @@ TOGETHER = 8192
 
 
 class Scans(Sequence[Any]):
-    """The scans of a track, each made when it is asked for.
+    """Scans of a track, each computed on first use.
 
     Args:
         arrays: nested tuples of arrays ``(K, ..., N)``.
@@ -71,14 +71,14 @@ def take_scans(part: Any, scans: slice) -> Any:
 
 
 def over_time(function: Step, *parts: Any) -> Any:
-    """Call a function that knows no time axis once for all scans.
+    """Call a function without a time axis once for all scans.
 
     Args:
         function: of nested tuples of arrays ``(..., N)``, each episode for itself.
         *parts: the same with a time axis, ``(..., K, N)``.
 
     Returns:
-        What it returns, with a time axis.
+        Its result, with a time axis.
     """
     last = leaves(parts)[0].shape[-2:]
     found = function(*map_nested(_flatten_time, parts))
@@ -91,7 +91,7 @@ def by_stretches(function: Step, *parts: Any) -> Callable[[slice], Any]:
 
 
 def _flatten_time(values: Array) -> Array:
-    """Scans side by side in the batch."""
+    """Return the scans side by side in the batch."""
     return namespace(values).reshape(values, (*values.shape[:-2], values.shape[-2] * values.shape[-1]))
 
 
@@ -106,7 +106,7 @@ def repeat(part: Any, last: tuple[int, int]) -> Any:
 
 
 class Track(NamedTuple):
-    """What a recursion is given, some scans after the others."""
+    """Input of a recursion, a stretch of scans after the other."""
 
     scans: int
     """K."""
@@ -126,14 +126,14 @@ def backward(
     """Run a recursion from the end of a track.
 
     Args:
-        step: not made anew for each call, as what is compiled is kept by it.
-        track: what is given of the first K - 1 scans.
-        nothing_later: what is carried from some of K scans if nothing later is used.
+        step: the same object in every call, since its compiled form is stored by it.
+        track: input of the first K - 1 scans.
+        nothing_later: value carried from some of K scans if no later measurement is used.
         lag: how many later scans are used; default: all.
-        keep: what is kept of that which is carried from some scans, of each for itself.
+        keep: function that selects the stored part of the carried values, scan by scan.
 
     Returns:
-        What is kept of that which is carried from each of K scans.
+        The stored part of the values carried from each of K scans.
 
     Raises:
         ValueError: for a negative lag.
@@ -165,7 +165,7 @@ def _scan(part: Any, place: int) -> Any:
 def _run_lagged(
     step: Step, track: Track, nothing_later: Callable[[slice], Carried], lag: int, scans: slice
 ) -> Carried:
-    """What is carried from some scans with a lag: all take one step together, ``lag`` times over."""
+    """Return the carried values of some scans with a lag: all take one step together, ``lag`` times over."""
     last = min(scans.stop - 1 + lag, track.scans)  # of the scans that these depend on
     given, carried = track.given(slice(scans.start, last)), nothing_later(slice(scans.start, last + 1))
     end = take_scans(carried, slice(-1, None))
@@ -188,7 +188,7 @@ _traced = functools.lru_cache(16)(lambda step: CompiledFunction(step, Graph(), u
 
 
 def _compiled(step: Step, carried: Any) -> CompiledFunction | None:
-    """The step on NumPy's arrays, to be compiled; None on any others."""
+    """Return the step on NumPy arrays, to be compiled; None for other arrays."""
     if not AVAILABLE or any(type(values) is not numpy.ndarray for values in leaves(carried)):
         return None
     compiled: CompiledFunction = _traced(step)
@@ -217,7 +217,7 @@ def _run_compiled(compiled: CompiledFunction, given: Sequence[Any], start: Carri
 
 
 def _rows_of_scans(values: Array, width: int) -> numpy.ndarray:
-    """Arrays ``(..., K, N)`` as ``(K, ..., width)``, the last episode again in the lanes beyond."""
+    """Return the arrays ``(..., K, N)`` as ``(K, ..., width)``, the last episode again in the lanes beyond."""
     rows = numpy.moveaxis(values, -2, 0)
     found = numpy.empty((*rows.shape[:-1], width))
     found[..., : rows.shape[-1]], found[..., rows.shape[-1] :] = rows, rows[..., -1:]

@@ -5,7 +5,7 @@ have any distribution f(d), d = 1, 2, ... steps, and a mode of age d ends with i
 
     h(d) = f(d) / sum_{i >= d} f(i)                                                                            (1)
 
-before the next step. Kind and age together are Markov again. What is unknown of a mode (an acceleration, a turn rate)
+before the next step. Kind and age together are Markov again. The unknown part of a mode (an acceleration, a turn rate)
 is constant while it lasts, so each hypothesis has a filter of its own, conditional on when its mode began; the filters
 are not mixed. With p the probabilities after the last measurement, before the next
 
@@ -33,7 +33,7 @@ from .array_namespace import Array, namespace
 from .ordered_sums import ordered_sum
 
 LEAST_PROBABILITY = 1e-30
-"""Of a hypothesis: it can always come back, and weights of what is merged are never zero by zero."""
+"""Of a hypothesis: it can always come back, and the weights of a merge never are zero by zero."""
 
 
 class AgedHypotheses(NamedTuple):
@@ -62,7 +62,7 @@ class AgedHypotheses(NamedTuple):
 
 
 def hazards(durations: Sequence[float], ages: int) -> list[float]:
-    """Probabilities (1) that a mode ends after each age of a table.
+    """Return the probabilities (1) that a mode ends after each age of a table.
 
     The last age stands for all beyond it: dwell times go on geometrically with the mean that they have from there.
 
@@ -76,7 +76,7 @@ def hazards(durations: Sequence[float], ages: int) -> list[float]:
 
 
 def join(tables: Sequence[AgedHypotheses]) -> AgedHypotheses:
-    """Hypotheses of several tables, whose states are of the same size, one table after another."""
+    """Return the hypotheses of several tables, whose states are of the same size, one table after another."""
     xp = namespace(tables[0].mean)
     return AgedHypotheses(
         xp.concat([table.mean for table in tables], axis=1),
@@ -86,14 +86,14 @@ def join(tables: Sequence[AgedHypotheses]) -> AgedHypotheses:
 
 
 def merge(hypotheses: AgedHypotheses) -> AgedHypotheses:
-    """One hypothesis with the probability, mean and covariance of several together."""
+    """Return one hypothesis with the probability, mean and covariance of several together."""
     total = ordered_sum(hypotheses.probability)
     mean, covariance = imm.combine(hypotheses.mean, hypotheses.covariance, hypotheses.probability / total)
     return AgedHypotheses(mean[:, None], covariance[:, :, None], total[None])
 
 
 def grow_older(table: AgedHypotheses, begun: AgedHypotheses) -> AgedHypotheses:
-    """Table one step later: each hypothesis is of the next age, and the last two together are of the last.
+    """Return the table one step later: each hypothesis is of the next age, and the last two together are of the last.
 
     Args:
         table: before.
@@ -117,7 +117,7 @@ class Mode(NamedTuple):
 
 
 def switch(rest: AgedHypotheses, modes: Sequence[Mode]) -> tuple[AgedHypotheses, list[AgedHypotheses]]:
-    """Let modes end, begin and grow older, equations (2) to (5).
+    """End modes, begin new ones and increase their ages, equations (2) to (5).
 
     Args:
         rest: hypotheses of what the target does between modes.

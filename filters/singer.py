@@ -36,7 +36,8 @@ def _check(alpha: float, T: float) -> None:
 
 
 def acceleration_response(alpha: float, T: float) -> numpy.ndarray:
-    """Position, velocity and acceleration after T of a unit acceleration at 0: last column of Phi, ``(3,)``.
+    """Return the position, velocity and acceleration after T of a unit acceleration at 0: last column of Phi,
+    ``(3,)``.
 
     Args:
         alpha: inverse correlation time of the acceleration, 1/s; 0 is a constant acceleration.
@@ -56,7 +57,7 @@ def acceleration_response(alpha: float, T: float) -> numpy.ndarray:
 
 
 def transition(alpha: float, T: float) -> numpy.ndarray:
-    """Transition matrix Phi over an interval, ``(3, 3)``.
+    """Return the transition matrix Phi over an interval, ``(3, 3)``.
 
     Args:
         alpha: inverse correlation time of the acceleration, 1/s; 0 is a constant acceleration.
@@ -72,7 +73,7 @@ def transition(alpha: float, T: float) -> numpy.ndarray:
 
 
 def process_noise(alpha: float, sigma: float, T: float) -> numpy.ndarray:
-    """Covariance Q of the process noise over an interval, ``(3, 3)``, symmetric.
+    """Return the covariance Q of the process noise over an interval, ``(3, 3)``, symmetric.
 
     Args:
         alpha: inverse correlation time of the acceleration, 1/s.
@@ -103,7 +104,7 @@ def process_noise(alpha: float, sigma: float, T: float) -> numpy.ndarray:
 
 
 def acceleration_sigma(maximum: float, maximum_probability: float, zero_probability: float) -> float:
-    """Standard deviation of the acceleration by Singer's rule, in the unit of ``maximum``.
+    """Return the standard deviation of the acceleration by Singer's rule, in the unit of ``maximum``.
 
     The acceleration is +-maximum with ``maximum_probability`` each, zero with ``zero_probability``, and
     uniform between otherwise: ``sigma^2 = maximum^2 (1 + 4 P_max - P_0) / 3``.

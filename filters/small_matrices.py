@@ -45,7 +45,9 @@ def transpose(A: Array) -> Array:
 
 
 def mirror_lower(A: Array) -> Array:
-    """Symmetric matrix, ``(n, n, ...)``, of the lower triangle of another: rounding makes products differ in both."""
+    """Return the symmetric matrix, ``(n, n, ...)``, of the lower triangle of another: rounding makes products
+    differ in both.
+    """
     xp, rows = namespace(A), range(A.shape[0])
     return xp.stack([xp.stack([A[max(i, j), min(i, j)] for j in rows]) for i in rows])
 
@@ -56,7 +58,7 @@ def outer(x: Array, y: Array) -> Array:
 
 
 def cholesky(A: Array) -> list[list[Array]]:
-    """Factor ``A = L L^T``.
+    """Return the factor ``A = L L^T``.
 
     Args:
         A: symmetric positive definite, ``(n, n, ...)``; its lower triangle is read.

@@ -1,4 +1,4 @@
-r"""Smoothing: estimates that use later measurements too, from what a filter has kept.
+r"""Smoothing: estimates that use later measurements too, from the stored steps of a filter.
 
 **One model.** Rauch, Tung and Striebel, AIAA Journal 3 (1965), 1445-1450; Särkkä, Bayesian Filtering and Smoothing
 (2013), theorem 8.2, equations (8.6). With x, P after the update at a scan, x' = F x + b and P' = F P F^T + Q before
@@ -24,7 +24,7 @@ needs no further approximation.
 Approximations: the forward filter is an IMM, and the sum of B_j is replaced by one quadratic form. Reading: that one
 gives the same mean and covariance as the sum where it meets the filtered N(x_i, P_i). A sum may leave an estimate less
 certain than the filter was, in some direction, because the modes disagree about the future; no likelihood of this form
-does that, and in this direction the future then says nothing. With one model nothing is approximated. Recursions
+does that, and in this direction later measurements add nothing. With one model nothing is approximated. Recursions
 of the Rauch-Tung-Striebel kind mode by mode (Kim, Journal of Econometrics 60, 1994; Nadarajah, Tharmarasa, McDonald and
 Kirubarajan, IEEE Trans. AES 48, 2012, 2673-2678) divide by nothing and are shorter, but let a mode without noise be
 corrected by a smoothed state that it could never have reached.
@@ -57,7 +57,7 @@ class Gaussian(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How the state moves from a scan to the next one."""
+    """Motion of the state from a scan to the next one."""
 
     F: Array
     """Transition matrix, or the Jacobian at the estimate, ``(n, n, ...)``."""
@@ -76,7 +76,7 @@ def rauch_tung_striebel_step(filtered: Gaussian, motion: Motion, later: Gaussian
     Args:
         filtered: after the update at this scan, ``(n, N)`` and ``(n, n, N)``.
         motion: from it to the next one.
-        later: smoothed at the next one; what is filtered there smooths with one more measurement.
+        later: smoothed at the next one; the filtered estimate there smooths with one more measurement.
     """
     F, Q = motion.F, motion.Q
     FP = product(F, filtered.covariance)
@@ -113,8 +113,10 @@ def smooth(
 
 
 def _track(filtered: Any, motion: Any) -> Track:
-    """What a backward recursion is given of a track; ``motion`` is that of all scans, or a function of some, and what
-    is the same at all scans or in the whole batch has an axis of one there.
+    """Return the input of a backward recursion.
+
+    ``motion`` is that of all scans, or a function of some scans; an axis of one stands for equal values at all scans or
+    in the whole batch.
     """
     K, N = filtered.mean.shape[-2:]
     whole = None if callable(motion) else repeat(motion, (K - 1, N))
@@ -142,7 +144,7 @@ class GaussianMixture(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """How M models move from a scan to the next one, and what is measured there."""
+    """Motion of M models from a scan to the next one, and the measurement there."""
 
     motion: Motion
     """Of each model, ``(n, n, M, ...)`` and ``(n, M, ...)``, predicted from its mixed mean as the IMM does."""
@@ -221,11 +223,11 @@ def smooth_imm(
         arrival: at all scans but the first, K - 1 of them before the batch; or a function that makes some of them.
         transition: of the modes, row = from, column = to, ``(M, M)``.
         lag: as of :func:`smooth`.
-        keep: what is kept of the smoothed estimates of some scans; default: all of them.
+        keep: function that selects the stored part of the smoothed estimates of some scans; default: all of them.
 
     Returns:
-        The smoothed estimates of each mode and the smoothed mode probabilities, in the same shapes, or what is kept of
-        them.
+        The smoothed estimates of each mode and the smoothed mode probabilities, in the same shapes, or the stored part
+        of them.
 
     Raises:
         ValueError: for a negative lag.
@@ -248,7 +250,7 @@ def smooth_imm(
 
 
 def _imm_step_of(transition: Array) -> Step:
-    """The step of an IMM with a transition matrix, the same object for the same numbers: what is compiled is kept."""
+    """Return the step of an IMM with a transition matrix; one object for equal numbers, so that it is compiled once."""
     if isinstance(transition, numpy.ndarray):
         return _imm_step_of_numbers(transition.tobytes(), len(transition))
     return functools.partial(imm_step, transition=transition)
@@ -271,7 +273,7 @@ def _expand_about(likelihood: QuadraticLikelihood, centre: Array) -> QuadraticLi
 
 
 def _add_measurement(later: QuadraticLikelihood, arrival: Arrival) -> QuadraticLikelihood:
-    """Add what is measured at a scan to what follows it, about the predicted means."""
+    """Add the measurement of a scan to the likelihood of the later ones, about the predicted means."""
     likelihood = _expand_about(later, arrival.motion.predicted)
     H, precision = (_insert_axis(matrix, -2) for matrix in (arrival.H, arrival.precision))
     weighted = product(transpose(H), precision)
@@ -304,7 +306,7 @@ def _pull_back(likelihood: QuadraticLikelihood, motion: Motion, centre: Array) -
 
 
 def _posterior(likelihood: QuadraticLikelihood, root: Array) -> tuple[Gaussian, Array]:
-    """Bayes' rule for ``x = centre + root e`` with ``e ~ N(0, I)``.
+    """Apply Bayes' rule to ``x = centre + root e`` with ``e ~ N(0, I)``.
 
     Returns:
         Mean and covariance of e, and the logarithm of the evidence.
@@ -321,12 +323,13 @@ def _posterior(likelihood: QuadraticLikelihood, root: Array) -> tuple[Gaussian, 
 def _likelihood_from_moments(
     centre: Array, root: Array, error: Gaussian, log_evidence: Array
 ) -> QuadraticLikelihood:
-    """Likelihood that leads from ``e ~ N(0, I)`` to an error with this mean and covariance, ``x = centre + root e``.
+    """Return the likelihood that leads from ``e ~ N(0, I)`` to an error with this mean and covariance, ``x = centre +
+    root e``.
 
-    In a direction in which the variance is not below one it says nothing.
+    In a direction in which the variance is not below one it carries no information.
     """
     xp = namespace(centre)
-    # LAPACK refuses what is not finite, for the whole batch; here only the episode's own estimates are lost.
+    # LAPACK refuses values that are not finite, for the whole batch; here only the episode's own estimates are lost.
     lost = xp.isnan(ordered_sum([row for matrix in error.covariance for row in matrix]))
     covariance = xp.where(lost, _identity(centre), error.covariance)
     variances, directions = eigenvectors(covariance)
@@ -350,8 +353,8 @@ SWEEPS = 7
 
 
 def eigenvectors(A: Array) -> tuple[Array, Array]:
-    """Eigenvalues ``(n, ...)`` and eigenvectors, the columns of ``(n, n, ...)``, of symmetric matrices: of LAPACK, or
-    in a trace by Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
+    """Return the eigenvalues ``(n, ...)`` and eigenvectors, the columns of ``(n, n, ...)``, of symmetric matrices:
+    of LAPACK, or in a trace by Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
     """
     xp, n = namespace(A), A.shape[0]
     if hasattr(xp, "linalg"):
@@ -389,7 +392,7 @@ def _rotate(rows: list[list[Array]], columns: list[list[Array]], p: int, q: int)
 
 
 def semidefinite_root(A: Array) -> Array:
-    """Lower triangular L with ``A = L L^T``; where a pivot is rounding, its column is zero.
+    """Return the lower triangular L with ``A = L L^T``; where a pivot is rounding, its column is zero.
 
     Args:
         A: symmetric and not negative, ``(n, n, ...)``.
@@ -445,23 +448,23 @@ def _solve(L: Array, b: Array) -> Array:
 
 
 def _log_diagonal(L: Array) -> Array:
-    """Half the logarithm of the determinant of ``L L^T``."""
+    """Return half the logarithm of the determinant of ``L L^T``."""
     xp = namespace(L)
     return ordered_sum([xp.log(L[i, i]) for i in range(L.shape[0])])
 
 
 def _congruence(A: Array, P: Array) -> Array:
-    """``A P A^T``."""
+    """Return ``A P A^T``."""
     return product(product(A, P), transpose(A))
 
 
 def _symmetrize(P: Array) -> Array:
-    """Without the asymmetry that rounding leaves."""
+    """Remove the asymmetry of rounding."""
     return 0.5 * (P + transpose(P))
 
 
 def _identity(mean: Array) -> Array:
-    """Unit matrix ``(n, n, 1, ...)`` for vectors ``(n, ...)``."""
+    """Return the unit matrix ``(n, n, 1, ...)`` for vectors ``(n, ...)``."""
     xp, n = namespace(mean), mean.shape[0]
     unit = xp.eye(n, dtype=mean.dtype, device=mean.device)
     return xp.reshape(unit, (n, n, *(1 for _ in mean.shape[1:])))

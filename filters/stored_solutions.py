@@ -17,7 +17,7 @@ FILE = Path(__file__).with_suffix(".json")
 
 
 def stored(solve: Solve) -> Solve:
-    """Let a function take its answer from the file where that has it.
+    """Decorate a function to read its result from the file of stored solutions, where present.
 
     Args:
         solve: of words, numbers and matrices; it returns a matrix or a tuple of them.
@@ -35,7 +35,7 @@ def stored(solve: Solve) -> Solve:
 
 
 def key_of(name: str, *arguments: Any) -> str:
-    """Text of a function and its arguments, every digit of them."""
+    """Return the text of a function and its arguments, every digit of them."""
     return json.dumps(
         [name, *(a if isinstance(a, str) else numpy.asarray(a, float).tolist() for a in arguments)]
     )

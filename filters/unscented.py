@@ -32,7 +32,7 @@ class Spread(NamedTuple):
     alpha: float | Array = 1.0
     """How far the points lie from the mean; a number, or one of each lane, ``(...)``."""
     beta: float = 2.0
-    """What is known of the fourth moments; 2 is best for a Gaussian variable."""
+    """Knowledge of the fourth moments; 2 is best for a Gaussian variable."""
     kappa: float = 0.0
     """Second scaling; 3 - n is Julier's first choice."""
 
@@ -41,7 +41,8 @@ GAUSSIAN = Spread()
 
 
 def sigma_points(mean: Array, covariance: Array, spread: Spread = GAUSSIAN) -> Array:
-    """Sigma points in order: the mean, then the columns of the root added, then subtracted, ``(n, 2n + 1, ...)``.
+    """Return the sigma points in order: the mean, then the columns of the root added, then subtracted, ``(n, 2n + 1,
+    ...)``.
 
     Args:
         mean: ``(n, ...)``.
@@ -59,7 +60,7 @@ def sigma_points(mean: Array, covariance: Array, spread: Spread = GAUSSIAN) -> A
 
 
 def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[Any], list[Any]]:
-    """Weights of the points for the mean and for the covariance, 2n + 1 each.
+    """Return the weights of the points for the mean and for the covariance, 2n + 1 each.
 
     Args:
         n: dimension of the variable.
@@ -72,7 +73,7 @@ def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[Any], list[Any]]:
 
 
 def narrow(jacobian: Array, covariance: Array, limit: float) -> Spread:
-    """Spread whose sigma points move a function of the mean by no more than a limit, to first order.
+    """Return a spread whose sigma points move a function of the mean by no more than a limit, to first order.
 
     The columns of the scaled root of P move a row H of the function by at most alpha sqrt(n H P H^T). Angles are
     measured up to whole turns, so points that move one by half a turn or more have no difference of known sign.
@@ -95,7 +96,7 @@ def narrow(jacobian: Array, covariance: Array, limit: float) -> Spread:
 def transform(
     mean: Array, covariance: Array, function: Callable[[Array], Array], spread: Spread = GAUSSIAN
 ) -> tuple[Array, Array]:
-    """Mean and covariance of a function of a Gaussian variable.
+    """Return the mean and covariance of a function of a Gaussian variable.
 
     Args:
         mean: ``(n, ...)``.

@@ -8,7 +8,7 @@ import pytest
 from models import make_model
 
 from filtergym import evaluate
-from filtergym.baselines.radar_esm_tracking.exact_bayes import TRAINING, VAGUE, ExactBayes
+from filtergym.envs.radar_esm_tracking.exact_bayes import TRAINING, VAGUE, ExactBayes
 from filtergym.baselines.radar_esm_tracking.references import Ideal
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds

@@ -11,12 +11,12 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
+from ...envs.radar_esm_tracking.exact_bayes import FEW, TRAINING, VAGUE, ClassPrior, ExactBayes
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
 from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import ClassAlarm
-from .exact_bayes import FEW, TRAINING, VAGUE, ClassPrior, ExactBayes
 from .metrics import METRICS
 from .references import Ideal, KnownDrawBound
 

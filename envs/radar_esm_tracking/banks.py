@@ -88,6 +88,38 @@ def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: in
     return class_fusion.design_channels(class_fusion.Models(*models), start, scans)
 
 
+def bearing_gate(p: RadarEsmTrackingParameters) -> float:
+    """Return the largest difference of bearings that the paper takes for one target, degrees."""
+    return class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
+
+
+def decision_blocks(task: RadarEsmProblem) -> tuple[Block, Block]:
+    """Return the blocks of the ESM's decision and of its bearing."""
+    none = task.types
+    return (
+        Block(
+            "decision", lambda f, measurement: one_hot(measurement.decision, none + 1, task.xp),
+            "1 where the ESM decides for this emitter type; none: for nothing at this scan",
+            (*(str(j) for j in range(none)), "none"), SHARE, over_interval="mean",
+        ),
+        Block(
+            "bearing_difference", lambda f, measurement: measurement.bearing_difference,
+            "radar minus ESM bearing over the gate", over_interval="mean",
+            shown=linear_scale(1.0 / bearing_gate(task.parameters), limits=(-180.0, 180.0)),
+        ),
+    )  # fmt: skip
+
+
+def clock_block(task: RadarEsmProblem) -> Block:
+    """Return the block of the time since the start of the track."""
+    xp, factor = task.xp, task.parameters.sampling_interval / TIME_SHOWN
+    return Block(
+        "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * factor,
+        f"time since the start of the track over {TIME_SHOWN:g} s",
+        shown=within(0.0, (task.parameters.horizon + 1) * factor),
+    )  # fmt: skip
+
+
 class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     """Every control: one Kalman filter for each class; with class transitions they mix on their weights."""
 
@@ -97,7 +129,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         super().__init__(task, control)
         p, constant = self.parameters, task.constant
         self.forgetting = math.exp(-1.0 / p.averaging_measurements)
-        self.gate = class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
+        self.gate = bearing_gate(p)
         self.mixes = not numpy.array_equal(numpy.array(p.class_transition), numpy.eye(task.classes))
         self.class_transition = constant(p.class_transition)
         self.start_covariance = constant(task.design_models(p)[1])[..., None]
@@ -124,7 +156,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         xp, p, classes = self.xp, self.parameters, self.task.modes
         none = self.task.types
         types = tuple(str(j) for j in range(none))
-        time_factor = p.sampling_interval / TIME_SHOWN
+        decision, bearing_difference = decision_blocks(self.task)
         average = f"exponential average over {p.averaging_measurements:g} scans"
         count = f"decisions for this emitter type so far over {COUNT_SHOWN:g}"
         counted = within(0.0, (self.last_scan + 1) / COUNT_SHOWN)
@@ -154,11 +186,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
             ),
             log_squared_block(classes),
             average_log_squared_block(average, classes),
-            Block(
-                "decision", lambda f, measurement: one_hot(measurement.decision, none + 1, xp),
-                "1 where the ESM decides for this emitter type; none: for nothing at this scan",
-                (*types, "none"), SHARE, over_interval="mean",
-            ),
+            decision,
             Block(
                 "decision_refused",
                 lambda f, measurement: xp.astype((measurement.decision < none) & ~f.used, xp.float64),
@@ -168,17 +196,9 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
             Block(
                 "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_SHOWN), f"refused {count}", types, counted
             ),
-            Block(
-                "bearing_difference", lambda f, measurement: measurement.bearing_difference,
-                "radar minus ESM bearing over the gate", over_interval="mean",
-                shown=linear_scale(1.0 / self.gate, limits=(-180.0, 180.0)),
-            ),
+            bearing_difference,
             last_weight_block(classes),
-            Block(
-                "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * time_factor,
-                f"time since the start of the track over {TIME_SHOWN:g} s",
-                shown=within(0.0, self.last_scan * time_factor),
-            ),
+            clock_block(self.task),
         )  # fmt: skip
 
     # --- the clock

@@ -17,6 +17,7 @@ from ..contract.task import Component, PaperPolicy, Reward
 from . import ID
 from .banks import ClassBank, one_hot
 from .causes import causes_of
+from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
 from .parameters import RadarEsmTrackingParameters
 from .problem import RadarEsmProblem
@@ -126,7 +127,7 @@ class RadarEsmTracking(RadarEsmProblem):
     interface = 4
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
-    banks = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank}
+    banks = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank, "hypotheses": HypothesesBank}
     scenarios = SCENARIOS
     components = (
         Component("range", "m"),
@@ -154,6 +155,9 @@ class RadarEsmTracking(RadarEsmProblem):
                 "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
                 "mode": "the class that is believed",
                 "weights": "class probabilities, normalised; all zero is uniform",
+                "hypotheses": "factors r^a in Bayes' rule over class, its change and emitters at every scan: probability of "
+                "each class (r = 1.15), odds that the class has changed (1.3) and of a second emitter (2), process noise "
+                "(2), variance of the radar (1.35); **0 is `exact-bayes`**",
             },
             {"evidence": ("evidence_scale", "decision_interval")},
         ),

@@ -19,6 +19,15 @@ change tells nothing about the second emitter and the silences. What else is app
   on a few points on either side.
 * The radar's coloured errors have one strength and one correlation time for all targets.
 * Outliers, where the prior has any, are weighed by each filter on its own.
+
+It is the estimator ``exact-bayes`` of the baselines, and the control ``hypotheses`` multiplies its settings by factors
+f at each scan. Before the radar is taken in,
+
+    P(s, h) <- P(s, h) f(s) f4^changed(h),    T(j, e) <- T(j, e) f5^disturbed(e)    normalised again by Bayes' rule
+    Q <- f6 Q,    R <- f7 R
+
+with one factor for each of the three classes; changed: the class has changed since the start; disturbed: there is a
+second emitter; Q: process noise of the motion and of the coloured errors; R: white noise of the radar.
 """
 
 import itertools
@@ -27,15 +36,16 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Filter, FilterInput, Likelihood
-from ...envs.contract.observation import Array
-from ...envs.radar_esm_tracking.task import RadarEsmTracking
-from ...envs.radar_esm_tracking.world import Measurement, Start
 from ...filters import class_fusion, contaminated_normal, imm, kalman, packed_covariance
 from ...filters import emitter_association as emitters
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import LEAST_PROBABILITY
 from ...filters.small_matrices import mirror_lower
+from ..contract.controls import SteerableFilter
+from ..contract.filter import FilterInput, Likelihood
+from ..contract.observation import Array
+from .problem import RadarEsmProblem
+from .world import Measurement, Start
 
 LEAST_NUMBER = 1e-200
 """Of a probability, before all are normalised: an outlier of many sigma leaves more than one hypothesis at zero, whose
@@ -129,7 +139,7 @@ class ClassState(NamedTuple):
     likelihood: Likelihood
 
 
-class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
+class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
     """Filter.
 
     Args:
@@ -138,10 +148,13 @@ class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
         changed: fields of the prior that are otherwise.
     """
 
-    def __init__(self, task: RadarEsmTracking, prior: ClassPrior = TRAINING, **changed: Any) -> None:
+    def __init__(self, task: RadarEsmProblem, prior: ClassPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
         self.prior = prior = prior._replace(**changed)
         p, self.classes = task.parameters, task.classes
+        self.settings = dict.fromkeys(p.class_names, 1.15) | {
+            "changed": 1.3, "second_emitter": 2.0, "process": 2.0, "radar": 1.35
+        }  # fmt: skip
         self.spacing = p.esm_period
         models, start = task.design_models(p)
         decay = math.exp(-p.sampling_interval / prior.correlation_time)
@@ -252,16 +265,52 @@ class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
             later,
         )
 
+    def apply_factors(self, memory: ClassTracks, logarithms: Array) -> ClassTracks:
+        """Multiply the probabilities of classes, of changes and of a second emitter by factors of these logarithms."""
+        xp, S = self.xp, self.classes
+        classes, changed = xp.exp(logarithms[:S]), xp.exp(logarithms[S])
+        second_emitter = xp.exp(self.disturbed * logarithms[S + 1])
+        return memory._replace(
+            weights=xp.concat(
+                [
+                    classes[:, None] * memory.weights[:, :1],
+                    classes[:, None] * changed * memory.weights[:, 1:],
+                ],
+                axis=1,
+            ),
+            unchanged=classes * memory.unchanged,
+            changed=classes[:, None, None] * changed * memory.changed,
+            first=second_emitter * memory.first,
+            later=second_emitter * memory.later,
+        )
+
+    def predict_motion(self, memory: ClassTracks, process: Array = 1.0) -> tuple[Array, Array]:
+        """Predict all hypotheses to the next scan.
+
+        Args:
+            memory: hypotheses after a scan.
+            process: factor on the covariance of the process noise, ``(N,)`` or a number.
+
+        Returns:
+            Means ``(n, S, M, N)`` and covariances ``(n, n, S, M, N)``.
+        """
+        P = packed_covariance.unpack(memory.covariance, self.states)
+        return kalman.predict(memory.mean, P, self.F, process * self.Q)
+
     def update(self, state: ClassState, given: FilterInput) -> ClassState:
         """One cycle: motion and radar, change of class, ESM. Its likelihood is that of the radar."""
         xp, prior, memory, measurement = self.xp, self.prior, state.tracks, given.measurement
-        P = packed_covariance.unpack(memory.covariance, self.states)
-        mean, P = kalman.predict(memory.mean, P, self.F, self.Q)
+        process, variance = 1.0, self.variance
+        if given.action is not None:
+            memory = self.apply_factors(memory, given.action)
+            process, factor = xp.exp(given.action[-2:])
+            variance = factor * variance
+        mean, P = self.predict_motion(memory, process)
         radar = contaminated_normal.update_position(
             mean,
             P,
             measurement.radar[:, None, None],
-            self.variance,
+            variance,
             prior.outliers,
             prior.outlier_factor,
         )
