@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,9 @@ class TunedPolicy:
     """All that it is made of, in words: what is equal in these is compiled once."""
     anchored: bool = False
     """As of :class:`.Tunable`: it takes what only recordings hold."""
+    tunable: Tunable | None = None
+    """What takes the values, where it is known."""
+    values: Mapping[str, float] = field(default_factory=dict)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, TunedPolicy) and other.content == self.content
@@ -181,7 +184,7 @@ def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) 
     """
     keywords, make = tunable.apply(values)
     content = f"{name} {sorted(values.items())!r}"
-    return TunedPolicy(keywords, tunable.control, make, content, tunable.anchored)
+    return TunedPolicy(keywords, tunable.control, make, content, tunable.anchored, tunable, values)
 
 
 def round_value(value: float) -> float:

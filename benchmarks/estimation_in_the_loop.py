@@ -304,7 +304,9 @@ def draw_episode(file: Path) -> None:
         axis.set_ylabel(label)
         axis.grid(alpha=0.25)
     figure.axes[1].set_xlabel("time, s")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), ncols=4, frameon=False, loc="outside upper center")
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), ncols=4, frameon=False, loc="outside upper center"
+    )
     figure.savefig(file, dpi=150)
 
 

@@ -78,7 +78,7 @@ int main(int argc, char **argv) {{
             {own}_state state;
             {own}_initial initial;
             set_initial(&initial, initials + e * I);
-            {own}_start(&state, &initial);
+            {own}_start(&state, &initial, NULL);
             for (k = 0; k < T; ++k) {{
                 {own}_measurement measurement;
                 {own}_estimate estimate;

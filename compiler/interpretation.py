@@ -33,7 +33,7 @@ def interpret(
         between: called with the first results as soon as they are known, before any other input is read.
         results: how many these are.
     """
-    constants = _in_range(program.constants, dtype)
+    constants = in_range(program.constants, dtype)
     values: list[Any] = []
     pause = first_steps(program, results) if between is not None else -1
     with numpy.errstate(all="ignore"):
@@ -65,7 +65,8 @@ def interpret(
     return [numpy.asarray(values[result.node]) for result in program.results]
 
 
-def _in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
+def in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
+    """Numbers of a precision, in place of those beyond its range the nearest normal ones."""
     limits = numpy.finfo(dtype)
     size = numpy.clip(numpy.abs(constants), float(limits.tiny), float(limits.max))
     changed = numpy.isfinite(constants) & (constants != 0.0) & (limits.dtype != numpy.float64)

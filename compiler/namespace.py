@@ -50,6 +50,17 @@ def tracing(graph: Graph) -> Iterator[Graph]:
             _OPEN.reset(token)
 
 
+def _settled(array: Any, use: str) -> Any:
+    """Plain value that the open graph has for an expression, see :meth:`.Graph.settle`."""
+    graph = _OPEN.get(None)
+    return None if graph is None or array.nodes.size != 1 else graph.settle(array.nodes.item(), use)
+
+
+def _decide(self: Any) -> builtins.bool:
+    known = _settled(self, "branch")
+    return _refuse(self) if known is None else builtins.bool(known)
+
+
 def _refuse(self: Any, *_: Any) -> Any:
     raise NotTraceable(
         "a branch or a loop depends on the numbers of an array: numpy.where, numpy.maximum and numpy.minimum choose, "
@@ -57,11 +68,25 @@ def _refuse(self: Any, *_: Any) -> Any:
     )
 
 
+def _number(self: Any) -> float:
+    known = _settled(self, "number")
+    return _refuse_number(self) if known is None else float(known)
+
+
 def _refuse_number(self: Any) -> Any:
     raise NotTraceable(
         "a number that varies is made a float: take NumPy's functions in place of math's, and a list, or numpy.array "
         "of one without dtype, in place of an array whose entries are set"
     )
+
+
+def _round(self: Any, digits: Any = None) -> Any:
+    return builtins.round(_number(self), digits)
+
+
+def _format(self: Any, form: str) -> str:
+    known = _settled(self, "words")
+    return str(self) if known is None else format(known, form)
 
 
 def _refuse_entry(self: Any, *_: Any) -> Any:
@@ -78,11 +103,13 @@ class Traced:
 
     __slots__ = ("dtype", "nodes")
     device = None
-    __bool__ = _refuse
+    __bool__ = _decide
     __index__ = _refuse
-    __float__ = _refuse_number
+    __float__ = _number
     __int__ = _refuse_number
     __complex__ = _refuse_number
+    __format__ = _format
+    __round__ = _round
     __setitem__ = _refuse_entry
 
     def __init__(self, nodes: Any, dtype: Any) -> None:
@@ -188,6 +215,10 @@ class Traced:
         from .numpy_functions import mean
 
         return mean(self, axis)
+
+    def item(self) -> "Traced":
+        """Return the only entry."""
+        return self.reshape(())
 
     def dot(self, other: Any) -> "Traced":
         """Product with a vector or a matrix."""

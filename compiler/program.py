@@ -143,6 +143,12 @@ class Graph:
             self.groups.append(self.group)
         return found
 
+    def settle(self, node: int, use: str) -> Any:
+        """Plain value of an expression that decides a ``branch``, becomes a ``number`` or is put into ``words``; None:
+        there is none.
+        """
+        return None
+
     def begin_group(self) -> None:
         """Say that what is made from now on is another array operation."""
         self.group += 1

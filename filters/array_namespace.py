@@ -1,7 +1,7 @@
 """The array library that an array belongs to, NumPy or torch through the array API standard, and ways between them."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -46,6 +46,11 @@ def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
     if isinstance(values, list | tuple):
         return xp.stack([stack_nested(value, zero, xp) for value in values])
     return values + zero
+
+
+def zeros_for(shape: Sequence[int], *parts: Any) -> numpy.ndarray:
+    """Zeros of NumPy whose entries may be set to those of the parts, which may be expressions in place of numbers."""
+    return numpy.zeros(shape, numpy.result_type(float, *map(numpy.asarray, parts)))
 
 
 def map_nested(function: Callable[..., Array], *parts: Any) -> Any:

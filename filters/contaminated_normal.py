@@ -43,7 +43,7 @@ def update_position(
     """
     xp = namespace(mean)
     innovation = z - mean[:2]
-    deviations = [(1.0, 1.0 - probability)] + [(factor, probability)] * bool(probability > 0.0)
+    deviations = [(1.0, 1.0 - probability), *([(factor, probability)] if probability > 0.0 else [])]
     inverses, distances, weighted = [], [], []
     for deviation, prior in deviations:
         xx, yy = (covariance[i, i] + deviation**2 * variance[i] for i in range(2))

@@ -43,7 +43,7 @@ from typing import NamedTuple
 import numpy
 
 from . import singer
-from .array_namespace import Array, namespace
+from .array_namespace import Array, namespace, zeros_for
 from .extended_kalman import JacobianRow
 
 POSITION = slice(0, 3)
@@ -142,16 +142,16 @@ def common_model(
     )
     return CommonModel(
         T,
-        float(numpy.exp(-T / rate_time)),
+        numpy.exp(-T / rate_time).item(),
         clock,
         angle_walk**2 * T,
-        float(-(rate_sigma**2) * numpy.expm1(-2.0 * T / rate_time)),
+        (-(rate_sigma**2) * numpy.expm1(-2.0 * T / rate_time)).item(),
     )
 
 
 def process_noise(axis: AxisModel, common: CommonModel) -> Array:
     """Return the covariance of the process noise of one hypothesis, ``(17, 17)``."""
-    Q = numpy.zeros((SIZE, SIZE))
+    Q = zeros_for((SIZE, SIZE), axis.noise, *common)
     x, v, a = (list(range(SIZE))[part] for part in (POSITION, VELOCITY, ACCELERATION))
     for i in range(3):
         places = [x[i], v[i], a[i]]

@@ -66,8 +66,9 @@ def transition(alpha: float, T: float) -> numpy.ndarray:
     Raises:
         ValueError: an argument is negative or not finite.
     """
-    Phi = numpy.array([[1.0, T, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    Phi[:, 2] = acceleration_response(alpha, T)
+    response = acceleration_response(alpha, T)
+    Phi = numpy.array([[1.0, T, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]], dtype=response.dtype)
+    Phi[:, 2] = response
     return Phi
 
 

@@ -324,7 +324,7 @@ int main(void) {{
     {own}_measurement measurement;
     {own}_estimate estimate;
     set_initial(&initial, initials[0]);
-    {own}_start(&state, &initial);
+    {own}_start(&state, &initial, NULL);
     before = state;
     set_measurement(&measurement, measurements[0]);
     measurement.position[1] = NAN;

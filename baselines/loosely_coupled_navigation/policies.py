@@ -47,7 +47,7 @@ class FixedGain(ConstantPolicy):
         super().__init__(model)
         if not 0.0 <= gain <= 1.0:
             raise ValueError(f"gain must lie in [0, 1], got {gain!r}")
-        self.action = (float(gain_bank(model).action_for_gain(gain)),) * self.task.parameters.axes
+        self.action = (gain_bank(model).action_for_gain(gain).item(),) * self.task.parameters.axes
 
 
 class PlainReduced(PaperAction):

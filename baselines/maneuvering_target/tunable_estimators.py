@@ -136,7 +136,17 @@ _TURN_RATES = {
     "log10_turn_rate_change": (-1.5, log10(0.3), 0.3),
 }
 
-TUNABLE = {
+_UNITS = {
+    **dict.fromkeys(("turn_rate_start", "turn_rate_change"), "degrees/s"),
+    **dict.fromkeys(("leave", "leave_quiet", "leave_noisy", "leave_turn"), "probability from scan to scan"),
+    **dict.fromkeys(("stay_quiet", "stay_noisy"), "probability from scan to scan"),
+    **dict.fromkeys(
+        ("acceleration", "acceleration_quiet", "acceleration_noisy", "acceleration_turn"), "m/s^2"
+    ),
+    **dict.fromkeys(("turn", "turn_gentle", "turn_steep"), "mean acceleration, m/s^2"),
+}
+
+_TUNABLE = {
     "kalman-imm": tunable(KalmanInteractingMultipleModel, _imm(KalmanInteractingMultipleModel), **_IMM),
     "kalman-pda": tunable(ProbabilisticDataAssociation, log10_acceleration=(-1.5, log10(3.0), 1.0)),
     "kalman-imm-pda": tunable(
@@ -160,3 +170,4 @@ TUNABLE = {
     "semi-markov-vague-pda": _semi_markov(SEMI_MARKOV_VAGUE_DATA_ASSOCIATION, VAGUE),
     "unscented-turn": tunable(UnscentedTurn, log10_acceleration=(-1.5, log10(0.3), 1.0), **_TURN_RATES),
 }
+TUNABLE = {name: dataclasses.replace(own, units=_UNITS) for name, own in _TUNABLE.items()}

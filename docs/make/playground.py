@@ -57,7 +57,7 @@ EXPORT("initial") double *initial_place(void) {{ return (double *)&initial; }}
 EXPORT("measurement") double *measurement_place(void) {{ return (double *)&measurement; }}
 EXPORT("estimate") double *estimate_place(void) {{ return (double *)&estimate; }}
 EXPORT("weights") double *weights_place(void) {{ return weights; }}
-EXPORT("start") void start(void) {{ {stem}_start(&state, &initial); }}
+EXPORT("start") void start(void) {{ {stem}_start(&state, &initial, NULL); }}
 EXPORT("update") int update(void) {{
     int became = {stem}_update(&state, &measurement, &estimate);
 {sums}

@@ -168,7 +168,7 @@ class LooselyCoupledNavigation(Task):
         names = ("position",) if p.axes == 1 else tuple(f"position_{axis}" for axis in AXES[: p.axes])
         group = "position" if p.axes > 1 else ""
         self.components: tuple[Component, ...] = tuple(Component(name, "m", group=group) for name in names)
-        action = float(GainBank(self, "gain").action_for_gain(p.steady_state_gains[1]))
+        action = GainBank(self, "gain").action_for_gain(p.steady_state_gains[1]).item()
         self.paper_policy = PaperPolicy("gain", (action,) * p.axes)
         self.companions = (LostTracks(float(p.axes)), *type(self).companions)
 

@@ -5,7 +5,7 @@ Equations and their numbers stand in ``filters/class_fusion.py``.
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -78,13 +78,15 @@ class Filters(NamedTuple):
 
 
 @functools.lru_cache(8)  # an evaluation makes the same bank for every competitor, on numbers and on symbols
-def _design_channels(
-    design_models: Callable[[RadarEsmTrackingParameters], tuple[class_fusion.Models, numpy.ndarray]],
-    parameters: RadarEsmTrackingParameters,
-) -> class_fusion.Channels:
-    """Gains and innovation statistics of the classes' filters for every scan of an episode."""
-    # One scan beyond the horizon is measured; lanes that wait for their reset stay at the last column.
-    return class_fusion.design_channels(*design_models(parameters), parameters.horizon + 1)
+def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: int) -> class_fusion.Channels:
+    """Gains and innovation statistics of the classes' filters for every scan of an episode.
+
+    Args:
+        content: shape and numbers of the arrays of the models, and of the covariances at the start.
+        scans: the last scan.
+    """
+    *models, start = (numpy.frombuffer(numbers).reshape(shape) for shape, numbers in content)
+    return class_fusion.design_channels(class_fusion.Models(*models), start, scans)
 
 
 def bearing_gate(p: RadarEsmTrackingParameters) -> float:
@@ -134,7 +136,10 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         self.start_covariance: Array = constant(task.design_models(p)[1])[..., None]
         self.last_scan: int = p.horizon + 1
         if not self.mixes:
-            channels = _design_channels(task.design_models, p)
+            models, start = task.design_models(p)
+            arrays = [numpy.asarray(part, dtype=float) for part in (*models, start)]
+            # One scan beyond the horizon is measured; lanes that wait for their reset stay at the last column.
+            channels = _design_channels(tuple((a.shape, a.tobytes()) for a in arrays), p.horizon + 1)
             self.channels: Channels = class_fusion.Channels(*(constant(table) for table in channels))
         esm = class_fusion.decision_probabilities(numpy.array(p.recognition), numpy.array(p.composition))
         silence = numpy.ones((task.classes, 1))

@@ -174,7 +174,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         labels = numpy.concatenate(
             [(1.0 - prior.redrawn) * composition, prior.redrawn * numpy.eye(self.classes)], axis=1
         )
-        used = labels.sum(axis=0) > 0.0
+        used = numpy.asarray(labels.sum(axis=0) > 0.0, dtype=bool)
         self.labels: numpy.ndarray = labels[:, used]
         self.confusion: numpy.ndarray = numpy.concatenate([recognition, redrawn])[used]
         self.other_confusion = recognition

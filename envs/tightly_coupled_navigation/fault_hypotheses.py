@@ -38,6 +38,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...filters import extended_kalman, gnss_ins, imm, range_errors
+from ...filters.array_namespace import zeros_for
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
 from ..contract.controls import SteerableFilter
@@ -192,9 +193,10 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         self.prior = prior
         T, S, n = task.common.T, task.satellites, gnss_ins.SIZE + task.satellites
         self.size = n
-        noise, known = numpy.zeros((n, n, 3, 1)), gnss_ins.SIZE
-        for i, model in enumerate(task.models):
-            noise[:known, :known, i, 0] = gnss_ins.process_noise(model, task.common)
+        noises, known = [gnss_ins.process_noise(m, task.common) for m in task.models], gnss_ins.SIZE
+        noise = zeros_for((n, n, 3, 1), *noises)
+        for i, own in enumerate(noises):
+            noise[:known, :known, i, 0] = own
         self.noise: Array = task.constant(noise)
         open_sky = math.exp(-T / prior.correlation_time)
         # Arrays: of two plain numbers torch would choose in single precision.
@@ -214,7 +216,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         over = 1.0 - math.exp(-T / prior.noisy_time)
         chain = numpy.diag([1.0 - onset] + [1.0 - over] * (L - 1))
         chain[0, 1:], chain[1:, 0] = onset / (L - 1), over
-        self.level_chain = chain
+        self.level_chain = chain.tolist()
         self.first_levels = task.constant(numpy.array([1.0 - 1e-3] + [1e-3 / (L - 1)] * (L - 1)))[:, None]
 
         heights = [math.log(level) / math.log(prior.levels[-1]) for level in prior.levels]
@@ -428,9 +430,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         L = levels.shape[0]
         return self.xp.stack(
             [
-                ordered_sum(
-                    [float(self.level_chain[i, j]) * levels[i] for i in range(L) if self.level_chain[i, j]]
-                )
+                ordered_sum([self.level_chain[i][j] * levels[i] for i in range(L) if self.level_chain[i][j]])
                 for j in range(L)
             ]
         )

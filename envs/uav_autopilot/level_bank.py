@@ -167,10 +167,11 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         self.sensor_change: Array = by_hypothesis(0.0, prior.sensor_change)
         factors = grid(prior.sensors, prior.sensor_points)
         chances = numpy.full(len(factors), 1.0 / len(factors))
-        kept = (1.0 - prior.kept) * chances
-        kept[numpy.abs(numpy.log(factors)).argmin()] += prior.kept
-        believed = numpy.repeat(chances[:, None], each, axis=1)
-        believed[:, 0] = kept
+        nearest = numpy.arange(len(factors)) == numpy.abs(numpy.log(factors)).argmin()
+        kept = (1.0 - prior.kept) * chances + prior.kept * nearest
+        believed = numpy.concatenate(
+            [kept[:, None], numpy.repeat(chances[:, None], each - 1, axis=1)], axis=1
+        )
         squared = numpy.repeat(factors[:, None] ** 2, each, axis=1)
         squared[:, 0] = 1.0
         squared, believed = (numpy.tile(values, (1, self.groups)) for values in (squared, believed))

@@ -260,7 +260,7 @@ class ConstantPolicy(Policy):
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Repeat the action for every episode."""
-        return numpy.tile(numpy.asarray(self.action, dtype=float), (len(observation), 1)), None
+        return numpy.tile(1.0 * numpy.asarray(self.action), (len(observation), 1)), None
 
 
 DRAWN_AT_ONCE = 32

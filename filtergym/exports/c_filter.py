@@ -14,8 +14,19 @@ from ..compiler.c_loops import Arrays, Rows
 from ..compiler.c_source import helper_functions, write_program
 from ..compiler.c_text import Parameter, Scalar, comment, function_text, identifier, literal
 from .c_network import memory_size, network_operations, network_text, scratch_size
+from .c_parameters import parameter_members, parameter_text, parameter_words
 from .c_structs import struct_text, structure
-from .traced_filter import ANSWER, ESTIMATE, INITIAL, MEASUREMENT, SHOWN, STATE, TracedFilter, count_answers
+from .traced_filter import (
+    ANSWER,
+    DERIVED,
+    ESTIMATE,
+    INITIAL,
+    MEASUREMENT,
+    SHOWN,
+    STATE,
+    TracedFilter,
+    count_answers,
+)
 
 TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
 """Names that a filter's files must not have: those of the others."""
@@ -49,7 +60,7 @@ class FilterText:
         self.name: str = file_stem(name)
         own = self.name
         parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
-        parts["estimate"] = traced.estimate
+        parts |= {"estimate": traced.estimate, "parameters": parameter_members(traced.free.declared)}
         self.structs = {key: structure(f"{own}_{key}", members) for key, members in parts.items()}
         self.memory: int = memory_size(traced.network) if traced.network is not None else 0
         self.has_state: bool = bool(traced.state or self.memory)
@@ -59,7 +70,10 @@ class FilterText:
     def _parameters(self, *parts: str) -> list[Parameter]:
         """Parameters that point to structs; ``const`` is what is only read."""
         return [
-            Parameter(f"{'const ' * (part in ('initial', 'measurement'))}{self.structs[part].name} *", part)
+            Parameter(
+                f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *",
+                part,
+            )
             for part in parts
         ]
 
@@ -70,22 +84,38 @@ class FilterText:
 
     def _start(self) -> tuple[str, Any]:
         to, given = self.structs["state"].places, self.structs["initial"].places
-        parameters = self._parameters("state", "initial")
+        parameters, own, free = (
+            self._parameters("state", "initial", "parameters"),
+            self.name,
+            self.traced.free,
+        )
+        own_rows = Rows("own", range(len(free.usual)))
+        inner = [*parameters, Parameter(f"const {self.scalar.name} *", "own")] if free.usual else parameters
+
+        def read(argument: int, row: int) -> str:
+            if argument == INITIAL:
+                return f"initial->{given[row]}"
+            return f"state->{to[row]}" if argument == STATE else f"own[{row}]"
+
         source = write_program(
             self.traced.start,
-            f"{self.name}_start",
-            parameters,
-            lambda _, row: f"initial->{given[row]}",
+            f"{own}_start",
+            inner,
+            read,
             lambda _, row: f"state->{to[row]}",
             self.scalar,
-            arrays=Arrays({INITIAL: self._rows("initial")}, {STATE: self._rows("state", qualifier="")}),
+            arrays=Arrays(
+                {INITIAL: self._rows("initial"), STATE: self._rows("state"), DERIVED: own_rows},
+                {STATE: self._rows("state", qualifier="")},
+            ),
         )
         body = list(source.body)
         if self.memory:
             zero = literal(0.0, self.scalar)
-            body += [f"for (i = 0; i < {self.memory}; ++i) state->network[i] = {zero};"]
-            body.insert(0, "int i;")
-        return f"{source.functions}\n{function_text('void', f'{self.name}_start', parameters, body)}", source
+            body += [f"for (int k = 0; k < {self.memory}; ++k) state->network[k] = {zero};"]
+        before, derived = parameter_text(own, free, self.scalar, self.structs["parameters"])
+        body = [*derived, *body, f"return {own.upper()}_TAKEN;"]
+        return f"{before}{source.functions}\n{function_text('int', f'{own}_start', parameters, body)}", source
 
     def _update(self) -> tuple[str, Any]:
         traced, real, own = self.traced, self.scalar.name, self.name
@@ -131,7 +161,7 @@ class FilterText:
         body = list(source.body)
         if self.has_state:
             # What is written is not what is read.
-            start = " = *state" if self.memory else ""
+            start = " = *state" if self.memory or traced.free.kept else ""
             body = [
                 f"{state.name} after{start};",
                 f"{state.name} *const next = &after;",
@@ -229,7 +259,12 @@ class FilterText:
         )
         refused = "its interval is negative or no number" if timed else "never, without an interval"
         functions = {
-            "start": ("Begins a track; the initial estimate is all that it takes.", ("state", "initial")),
+            "start": (
+                "Begins a track with an initial estimate and parameters; NULL in place of parameters: those of "
+                f"{own}_defaults. Returns {own.upper()}_TAKEN, or {own.upper()}_REFUSED where a parameter is outside "
+                "its limits: the state stays as it was.",
+                ("state", "initial", "parameters"),
+            ),
             "update": (
                 f"Takes in a measurement: {predicts}, and updates. The members of the measurement state what was "
                 "received, as in the environment. Returns what became of it; the state stays as it was where a "
@@ -242,6 +277,8 @@ class FilterText:
             f"#ifndef {guard}\n#define {guard}\n",
             '#ifdef __cplusplus\nextern "C" {\n#endif\n',
             struct_text(structs["initial"], scalar, "The estimate at the start of a track."),
+            struct_text(structs["parameters"], scalar, parameter_words(self.traced.free)),
+            *([f"extern const {own}_parameters {own}_defaults;\n"] if self.traced.free.declared else []),
             struct_text(structs["measurement"], scalar, "What the sensors say at one time."),
             struct_text(structs["estimate"], scalar, f"What is estimated of it. Components: {listed}."),
             struct_text(
@@ -264,8 +301,7 @@ class FilterText:
         )
         for name, (words, parts) in functions.items():
             arguments = ", ".join(f"{p.type}{p.name}" for p in self._parameters(*parts))
-            answer = "int" if name == "update" else "void"
-            text.append(f"{comment(words)}\n{answer} {own}_{name}({arguments});\n")
+            text.append(f"{comment(words)}\nint {own}_{name}({arguments});\n")
         text.append(f"#ifdef __cplusplus\n}}\n#endif\n\n#endif /* {guard} */\n")
         return "\n".join(text)
 

@@ -247,7 +247,7 @@ static int follow(long n) {{
                 {own}_initial initial;
                 {start}
                 set_initial(&initial, given);
-                {own}_start(&state, &initial);
+                {own}_start(&state, &initial, NULL);
             }}
             memcpy(p0, p, sizeof p0);
             memcpy(v0, v, sizeof v0);
@@ -302,7 +302,7 @@ static int follow(long n) {{
         held[c - RECEIVED] = own[k]->cell[c];
     }}
     set_initial(&initial, initial_estimate);
-    {own}_start(&state, &initial);
+    {own}_start(&state, &initial, NULL);
     before = own[0]->time - (FIRST > 0.0 ? FIRST : INTERVAL > 0.0 ? INTERVAL : usual_interval(n));
     for (i = 0; i < n; ++i) {{
         const Row *row = own[i];
@@ -358,7 +358,7 @@ static int follow(long n) {{
         if (i == 0) {{
             {start}
             set_initial(&initial, given);
-            {own}_start(&state, &initial);
+            {own}_start(&state, &initial, NULL);
             continue;
         }}
         {fill}

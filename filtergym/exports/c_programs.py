@@ -67,7 +67,7 @@ static int answer_all(long tracks, int steers, {own}_state *states, double *rows
     for (t = 0; t < tracks; ++t) {{
         {own}_initial initial;
         set_initial(&initial, rows + t * INITIAL);
-        {own}_start(&states[t], &initial);
+        {own}_start(&states[t], &initial, NULL);
     }}
     while (fread(rows, MEASUREMENT * sizeof *rows, (size_t)tracks, stdin) == (size_t)tracks) {{
         double *answer = rows + tracks * MEASUREMENT;
@@ -152,7 +152,7 @@ static int estimate_rows(FILE *file) {{
         if (begins(row)) {{
             {own}_initial initial;
             set_initial(&initial, initial_of(row));
-            {own}_start(&state, &initial);
+            {own}_start(&state, &initial, NULL);
             ++track;
             measurement = 0;
         }}
@@ -234,7 +234,7 @@ static double run(double worst) {{
         {own}_state state;
         {own}_initial initial;
         set_initial(&initial, initials[track]);
-        {own}_start(&state, &initial);
+        {own}_start(&state, &initial, NULL);
         for (k = track * MEASUREMENTS; k < (track + 1) * MEASUREMENTS; ++k) {{
             {own}_measurement measurement;
             {own}_estimate estimate;

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ..compiler.functions import address_of, empty_lanes, leaves, round_up_lanes
-from ..compiler.interpretation import first_steps, interpret
+from ..compiler.interpretation import first_steps, in_range, interpret
 from ..compiler.library import portable
 from ..compiler.native import AVAILABLE, native
 from ..compiler.program import StraightLineProgram
@@ -23,6 +23,8 @@ from ..evaluation.running.seeds import episode_seeds
 from .request import ExportRequest
 from .traced_filter import (
     ANSWER,
+    DERIVED,
+    INITIAL,
     MEASUREMENT,
     SHOWN,
     STATE,
@@ -108,7 +110,8 @@ def replay(
     kept: dict[str, list[numpy.ndarray]] = {"measurement": [], "mean": [], "covariance": []}
     # What cannot be exported is refused before it runs. Measurements have the same form whatever steers.
     first = start_lanes(plain, seeds[:1]).state.measurement
-    traced = trace_filter(problem.task, control, maker, name, plain, (started[0], first))
+    known = problem.baselines.tunable
+    traced = trace_filter(problem.task, control, maker, name, plain, (started[0], first), known)
     report = _report_estimator if kind == "estimator" else _report
     lost = numpy.zeros(episodes, dtype=bool)
     for found, _ in islice(rollout(model, maker, seeds, report, kind=kind, name=name), measurements):
@@ -169,13 +172,20 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     E = replayed.initial.shape[1]
     compiled = AVAILABLE and dtype is numpy.float64
     network = None if traced.network is None else _Network(traced.network, dtype)
-    state = interpret(traced.start, lambda _, row: replayed.initial[row], dtype)
+    own = list(in_range(numpy.array(traced.free.usual), dtype))
+    derived = own[: traced.free.kept]
+    given: dict[int, Any] = {
+        INITIAL: replayed.initial,
+        DERIVED: own,
+        STATE: dict(enumerate(derived, len(traced.state) - len(derived))),
+    }
+    state = interpret(traced.start, lambda argument, row: given[argument][row], dtype) + derived
     update = _CompiledUpdate(traced, E) if compiled else functools.partial(_interpret_update, traced, dtype)
     answers = []
     for measured in replayed.measurements:
         found = update({STATE: state, MEASUREMENT: measured}, network)
-        state = found[traced.shown : traced.shown + len(traced.state)]
-        rows = found[traced.shown + len(traced.state) :]
+        end = traced.shown + len(traced.state) - len(derived)
+        state, rows = [*found[traced.shown : end], *derived], found[end:]
         answers.append(numpy.stack([numpy.broadcast_to(row, (E,)) for row in rows]).astype(float))
     return numpy.stack(answers)
 

@@ -6,13 +6,17 @@ the state, and members that are always equal, as P[0, 1] and P[1, 0], are kept o
 
 import copy
 import functools
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count as count_from
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
+from ..baselines.table import Tunable
+from ..baselines.tuned_values import TunedPolicy
 from ..compiler import namespace
 from ..compiler.functions import leaves, map_arrays
 from ..compiler.namespace import NotTraceable, Traced
@@ -20,16 +24,28 @@ from ..compiler.program import Graph, ProgramResult, ProgramSteps, StraightLineP
 from ..envs.contract.companions import array_meanings
 from ..envs.contract.filter import Filter, FilterInput
 from ..envs.contract.model import Model
+from ..envs.contract.parameters import freeze
 from ..envs.contract.task import Task, field_words
 from ..evaluation.competitors.filters import as_filter
 from ..evaluation.competitors.kinds import RANKED, Policy, RandomPolicy, kind_of, make_competitor
 from ..evaluation.competitors.steered_filter import Decider, steer
+from .parameters import (
+    PARAMETER,
+    Declaration,
+    Declared,
+    ParameterGraph,
+    declaration,
+    expressions,
+    traced_functions,
+    with_parameters,
+)
 
 if TYPE_CHECKING:
     from ..agents.learned_policy import LearnedPolicy
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
-"""Arguments of the programs."""
+"""Arguments of the programs, beside :data:`~.parameters.PARAMETER`."""
+DERIVED, CONDITION = 7, 8
 LIKELIHOODS = ("log_likelihood", "nis", "nis_degrees")
 """What is told beside an estimate, where the filter tells it."""
 FEEDBACK = "feedback"
@@ -49,11 +65,36 @@ class Member(NamedTuple):
     """What its array is, where its class says so."""
 
 
+class FreeParameters(NamedTuple):
+    """Parameters of a filter that its user sets, and what it derives of them when a track starts."""
+
+    declared: Sequence[Declared] = ()
+    """Arrays in the order of the rows of the argument ``PARAMETER``."""
+    derive: StraightLineProgram | None = None
+    """From the parameters to the rows of the argument ``DERIVED``; None where none is free."""
+    usual: Sequence[float] = ()
+    """Values of these rows with the parameters in force, as they are in the filter itself."""
+    kept: int = 0
+    """First of these rows that are the last rows of the state, too: ``update`` reads them and leaves them alone."""
+    stated: range = range(0)
+    """Rows that computing may not give as they are in the filter, in double: a library's functions decide their
+    bits."""
+    condition: StraightLineProgram | None = None
+    """From the parameters to one result, whether the programs hold for them; None: for any within the limits."""
+    constant: Sequence[str] = ()
+    """Names of declared parameters that stay what they were when the filter was traced."""
+
+    @property
+    def values(self) -> list[float]:
+        """Parameters in force, row by row."""
+        return [value for one in self.declared for value in one.values]
+
+
 class TracedFilter(NamedTuple):
     """A filter as two programs."""
 
     start: StraightLineProgram
-    """From the initial estimate to the state."""
+    """From the initial estimate and the parameters to the state."""
     update: StraightLineProgram
     """From state and measurement to state and estimate; what a network is shown comes first among the results."""
     initial: list[Member]
@@ -66,6 +107,8 @@ class TracedFilter(NamedTuple):
     """Results of ``update`` that a network is shown, the first one whether it is asked; zero without network."""
     network: "LearnedPolicy | None"
     """That answers between the two parts of ``update``; None where none is asked."""
+    free: FreeParameters = FreeParameters()
+    """What its user sets."""
 
 
 class FilterSteps:
@@ -167,18 +210,17 @@ def check_kind(name: str, maker: Any) -> None:
 
 
 def steps_of(
-    task: type[Task], control: str, maker: Any, plain: Model, graph: Graph
+    traced: Task, control: str, maker: Any, plain: Model, graph: Graph
 ) -> tuple[FilterSteps, "AskedNetwork | None"]:
     """Make the steps of a competitor on traced arrays, and what stands in its network's place; while a graph is open.
 
     Args:
-        task: class of the environment.
+        traced: task on traced arrays.
         control: of the competitor.
         maker: of it.
         plain: model of the same parameters on NumPy.
         graph: that is open.
     """
-    traced = task(plain.task.parameters, namespace)
     if _traced_as(maker) == "learned estimator":
         policy, network = with_asked_network(maker(plain.task).network, graph)
         steered = steer(Model(traced, maker.bank), policy, 1)
@@ -198,7 +240,8 @@ def steps_of(
         if own.in_python:
             raise NotTraceable("it does not say that it is traceable")
         return FilterSteps(own, traced.world.mask_missing), None
-    policy, network = with_asked_network(make_competitor(maker, plain), graph)
+    acting = plain if traced.parameters is plain.task.parameters else Model(traced, control)
+    policy, network = with_asked_network(make_competitor(maker, acting), graph)
     if isinstance(policy, RandomPolicy):
         raise NotTraceable("its actions are drawn")
     if not isinstance(policy, Policy):
@@ -338,7 +381,13 @@ def _is_constant(graph: Graph, node: int, value: Any) -> bool:
 
 
 def trace_filter(
-    task: type[Task], control: str, maker: Any, name: str, plain: Model, template: tuple[Any, Any]
+    task: type[Task],
+    control: str,
+    maker: Any,
+    name: str,
+    plain: Model,
+    template: tuple[Any, Any],
+    known: Mapping[str, Tunable] = MappingProxyType({}),
 ) -> TracedFilter:
     """Trace a competitor.
 
@@ -349,27 +398,89 @@ def trace_filter(
         name: of it, in errors.
         plain: model of the control on NumPy, with the parameters of the export.
         template: initial estimate and measurement, any numbers of any width.
+        known: what can be tuned, by the names of competitors: those parameters are free, and the task's.
 
     Raises:
         ValueError: for what is neither estimator nor policy, or no straight line of arithmetic.
     """
     check_kind(name, maker)
-    graph = Graph(callers=True)
+    found = declaration(plain.task, maker, known, name)
+    arguments = task, control, maker, plain, template, found
     try:
-        with namespace.tracing(graph):
-            return _trace(*steps_of(task, control, maker, plain, graph), template, graph)
+        fixed = _trace_free(*arguments, [])
     except NotTraceable as error:
         raise ValueError(
             f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
         ) from error
+    assert isinstance(fixed, tuple)
+    traced, free = fixed, list[Declared]()
+    for tried in (found.all, found.tuned, found.own):
+        free = tried
+        try:
+            while isinstance(answer := _trace_free(*arguments, free, fixed[1]), set):
+                free = [one for one in free if one.name not in answer]
+        except NotTraceable:
+            free = []
+            continue
+        traced = answer
+        break
+    kept = {one.name for one in free} - {one.name for one in found.tuned}
+    left = kept | {one.name for one in traced[0].free.declared}
+    constant = [one.name for one in found.all if one.name not in left]
+    return traced[0]._replace(free=traced[0].free._replace(constant=constant))
+
+
+def _trace_free(
+    task: type[Task],
+    control: str,
+    maker: Any,
+    plain: Model,
+    template: tuple[Any, Any],
+    found: Declaration,
+    free: Sequence[Declared],
+    fixed: "_Nodes | None" = None,
+) -> "tuple[TracedFilter, _Nodes] | set[str]":
+    """Trace a competitor with some of its parameters free; or the names of those that cannot be.
+
+    Args:
+        task: class of the environment.
+        control: of the competitor.
+        maker: of it.
+        plain: model of the control on NumPy.
+        template: as of :func:`trace_filter`.
+        found: all parameters.
+        free: those that are tried.
+        fixed: expressions of the filter traced without.
+    """
+    graph = ParameterGraph(free)
+    firsts = [0, *itertools.accumulate(len(one.values) for one in free)]
+    with namespace.tracing(graph), traced_functions(graph):
+        values = {one.name: expressions(one, first, graph) for one, first in zip(free, firsts, strict=False)}
+        made = task(plain.task.parameters, namespace)
+        own = {one.name: values[one.name] for one in found.own if one.name in values}
+        if found.tunable is not None and any(one.name in values for one in found.tuned):
+            given = {one.name: values.get(one.name, one.values[0]) for one in found.tuned}
+            keywords, make = found.tunable.apply(given)
+            maker = TunedPolicy(keywords, found.tunable.control, make, "")
+            own |= {name: freeze(value) for name, value in keywords.items()}
+        if own:
+            made.parameters = with_parameters(made.parameters, own)
+            made.set_up()
+        traced = _trace(*steps_of(made, control, maker, plain, graph), template, graph, free, fixed)
+    names = [one.name for one in free for _ in one.values]
+    conditional = graph.rows(list(graph.conditions))
+    unused = {names[row] for row in conditional} - {one.name for one in traced[0].free.declared}
+    return {names[row] for row in graph.settled} | unused or traced
 
 
 def _trace(
     steps: FilterSteps,
     asked: "AskedNetwork | None",
     template: tuple[Any, Any],
-    graph: Graph,
-) -> TracedFilter:
+    graph: ParameterGraph,
+    free: Sequence[Declared],
+    plain: "_Nodes | None",
+) -> tuple[TracedFilter, "_Nodes"]:
     initial, measurement = (one_lane(part) for part in template)
     rows = count_from()
     begin = fill(initial, [graph.input(INITIAL, next(rows)) for _ in nodes_of(initial)], graph)
@@ -392,26 +503,169 @@ def _trace(
     results = nodes_of(estimate)
     live = _live_members(graph, classes.members, after, [*results, *shown])
     place = {member: row for row, member in enumerate(live)}
-    update = program(
-        graph,
-        [
-            *(ProgramResult(SHOWN, row, node) for row, node in enumerate(shown)),
-            *(ProgramResult(STATE, place[member], after[member]) for member in live),
-            *(ProgramResult(ESTIMATE, row, node) for row, node in enumerate(results)),
-        ],
-    )
-    start = program(graph, [ProgramResult(STATE, place[member], first[member]) for member in live])
+    written = [
+        *(ProgramResult(SHOWN, row, node) for row, node in enumerate(shown)),
+        *(ProgramResult(STATE, place[member], after[member]) for member in live),
+        *(ProgramResult(ESTIMATE, row, node) for row, node in enumerate(results)),
+    ]
+    begun = [first[member] for member in live]
+    nodes = _Nodes(graph, [*first, *after, *shown, *results])
+    own = _Derived(nodes, [result.node for result in written], begun, plain)
+    declared, moved = _used_parameters(free, graph.rows(own.nodes))
+    conditions = [
+        node if held else graph.node("logical_not", node)
+        for node, held in graph.conditions.items()
+        if declared and graph.rows([node]) <= moved.keys()
+    ]
+    condition = None
+    if conditions:
+        whole = functools.reduce(functools.partial(graph.node, "logical_and"), conditions)
+        condition = _renumbered(program(graph, [ProgramResult(CONDITION, 0, whole)]), PARAMETER, moved)
+    derive = _renumbered(own.program(), PARAMETER, moved) if declared else None
+    own.read()
+    start = program(graph, [ProgramResult(STATE, row, node) for row, node in enumerate(begun)])
+    update = program(graph, written)
+    place |= {KEPT + row: len(live) + row for row in range(own.kept)}
     listed = members_of(state)
-    return TracedFilter(
-        start,
-        _renumbered(update, place),
+    members = [listed[member] for member in live]
+    members += [Member("derived", (own.kept,), row, DERIVED_WORDS) for row in range(own.kept)]
+    found = TracedFilter(
+        _renumbered(start, STATE, place),
+        _renumbered(update, STATE, place),
         members_of(initial),
         members_of(measurement),
-        [listed[member] for member in live],
+        members,
         members_of(estimate),
         len(shown),
         asked.network if shown and asked is not None else None,
+        FreeParameters(declared, derive, own.values, own.kept, own.stated, condition),
     )
+    return found, nodes
+
+
+KEPT = 10**9
+"""First row of what the state keeps of it, while a filter is traced."""
+DERIVED_WORDS = "Derived from the parameters at the start, constant from then on."
+CLOSE = 1e-9
+"""Difference of a derived number and that of the filter itself, which computes it in another order, at most."""
+
+SMALL = 1e-15
+"""The same of numbers that may be zero."""
+
+
+class _Nodes(NamedTuple):
+    """Expressions that a filter is made of."""
+
+    graph: ParameterGraph
+    wanted: list[int]
+    """In an order that does not depend on its parameters."""
+
+
+def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
+    """Constants of a filter that stand where expressions of the same filter with free parameters stand."""
+    one, other, found = plain.graph, free.graph, dict[int, float]()
+    waiting = list(zip(plain.wanted, free.wanted, strict=True))
+    seen = set(waiting)
+    while waiting:
+        p, q = waiting.pop()
+        if (constant := one.values[p]) is not None:
+            found.setdefault(q, float(constant))
+        elif one.operations[p] == "take":  # of a table whose entries are chosen one by one where they vary
+            table = one.tables[one.arguments[p][0]]
+            while other.operations[q] == "where":
+                condition, entry, q = other.parts(q)
+                if (place := other.values[other.parts(condition)[-1]]) is not None:
+                    found.setdefault(entry, float(table[int(place)]))
+            found.setdefault(q, float(table[0]))
+        elif one.operations[p] == other.operations[q] and len(one.parts(p)) == len(other.parts(q)):
+            pairs = [pair for pair in zip(one.parts(p), other.parts(q), strict=True) if pair not in seen]
+            seen.update(pairs)
+            waiting += pairs
+    return found
+
+
+class _Derived:
+    """Largest expressions of parameters alone that a filter is made of, in the order of the rows of ``DERIVED``.
+
+    Args:
+        nodes: of the filter.
+        update: results of an update, whose expressions come first.
+        start: results of the start of a track.
+        plain: expressions of the same filter traced without parameters.
+
+    Attributes:
+        nodes: the expressions.
+        values: of them in the filter itself, with the parameters in force.
+        kept: how many are of the update.
+        stated: rows whose bits a library decides, or that are computed in another order.
+    """
+
+    def __init__(
+        self, nodes: "_Nodes", update: Sequence[int], start: Sequence[int], plain: "_Nodes | None"
+    ) -> None:
+        self.graph = graph = nodes.graph
+        both = self._find(update), self._find(start)
+        parts = [both[0], [node for node in both[1] if node not in both[0]]]
+        values, known = {}, {} if plain is None else _constants_in_place(plain, nodes)
+        stated = {node for part in parts for node in part if not graph.is_exact(node)}
+        for node in itertools.chain(*parts):
+            own = float(graph.value(node))
+            there = known.get(node, own)
+            values[node] = there if abs(there - own) <= max(CLOSE * abs(own), SMALL) else own
+            stated |= {node} if values[node] != own else set()
+        # Those whose values are stated stand together.
+        parts = [
+            sorted(part, key=lambda node: (node in stated) != last)
+            for part, last in zip(parts, (False, True), strict=True)
+        ]
+        self.nodes = [*parts[0], *parts[1]]
+        self.values, self.kept = [values[node] for node in self.nodes], len(parts[0])
+        first = sum(node not in stated for node in parts[0])
+        self.stated = range(first, first + len(stated))
+
+    def _find(self, wanted: Sequence[int]) -> list[int]:
+        graph, found = self.graph, dict[int, None]()
+        kinds: dict[int, int] = {}  # 0 constant, 1 of parameters alone, 2 of anything else
+        for node in graph.live(wanted):
+            parts = graph.parts(node)
+            if graph.operations[node] == "input":
+                kinds[node] = 1 if graph.arguments[node][0] == PARAMETER else 2
+            else:
+                constant = graph.values[node] is not None
+                kinds[node] = 0 if constant else max((kinds[part] for part in parts), default=0)
+            if kinds[node] == 2:
+                found |= dict.fromkeys(part for part in parts if kinds[part] == 1)
+        return list(found | dict.fromkeys(node for node in wanted if kinds[node] == 1))
+
+    def program(self) -> StraightLineProgram:
+        """Program from the parameters to these expressions."""
+        graph = self.graph
+        numbers = [graph.node("number", node) if graph.logical[node] else node for node in self.nodes]
+        return program(graph, [ProgramResult(DERIVED, row, node) for row, node in enumerate(numbers)])
+
+    def read(self) -> None:
+        """Let these expressions be read from then on: by the update from the state, where they are kept."""
+        graph = self.graph
+        for row, node in enumerate(self.nodes):
+            given = (STATE, KEPT + row) if row < self.kept else (DERIVED, row)
+            if graph.logical[node]:
+                again = graph.input(*given), graph.constant(0.0)
+                graph.operations[node], graph.arguments[node] = "not_equal", again
+            else:
+                graph.operations[node], graph.arguments[node] = "input", given
+
+
+def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Declared], dict[int, int]]:
+    """Parameters of which a row is used, and the rows that theirs become."""
+    declared, first = list[Declared](), 0
+    moved: dict[int, int] = {}
+    for one in free:
+        rows = range(first, first + len(one.values))
+        first = rows.stop
+        if used.intersection(rows):
+            moved |= {row: len(moved) + i for i, row in enumerate(rows)}
+            declared.append(one)
+    return declared, moved
 
 
 def _live_members(
@@ -431,11 +685,11 @@ def _live_members(
         live = more
 
 
-def _renumbered(code: StraightLineProgram, place: dict[int, int]) -> StraightLineProgram:
-    """The program with the rows of the state that are kept."""
+def _renumbered(code: StraightLineProgram, argument: int, place: Mapping[int, int]) -> StraightLineProgram:
+    """The program with other numbers of the rows of an argument."""
     steps, arguments = code.steps, code.steps.arguments.copy()
     inputs = steps.begins[:-1][steps.which("input")]
-    rows = 1 + inputs[arguments[inputs] == STATE]
+    rows = 1 + inputs[arguments[inputs] == argument]
     arguments[rows] = [place[row] for row in arguments[rows].tolist()]
     renumbered = ProgramSteps(steps.names, steps.kinds, steps.begins, arguments, steps.logical)
     return code._replace(steps=renumbered)
