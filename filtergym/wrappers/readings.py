@@ -7,7 +7,6 @@ and a lane of a vector environment meets that of a single one.
 """
 
 import dataclasses
-import numbers as number_types
 import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -88,8 +87,8 @@ def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) ->
 
 def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | None:
     """Return the places of components that are named or numbered; None for a matrix or a function."""
-    kinds = str | number_types.Integral
-    listed = [h] if isinstance(h, kinds) else h
+    kinds = (str, int, numpy.integer)
+    listed: Any = [h] if isinstance(h, kinds) else h
     if not isinstance(listed, Sequence) or not all(isinstance(one, kinds) for one in listed):
         return None
     places = []
@@ -99,7 +98,7 @@ def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | 
             raise ValueError(
                 f"the sensor {sensor!r} measures component {one!r}, and the state has {len(names)}: {', '.join(names)}"
             )
-        places.append(names.index(one) if isinstance(one, str) else one)
+        places.append(names.index(one) if isinstance(one, str) else int(one))
     return places
 
 
@@ -207,7 +206,7 @@ class Readings:
         given: Sequence[int | None] = [None] * self._lanes if seeds is None else seeds
         goes_on = lanes & self._is_seeded & (seeds is None)
         self._identities[1, goes_on] += numpy.uint64(1)
-        for lane in numpy.flatnonzero(lanes & ~goes_on):
+        for lane in numpy.flatnonzero(lanes & ~goes_on).tolist():
             seed = given[lane]
             if seed is None and not self._is_seeded[lane]:
                 seed = int(numpy.random.SeedSequence().generate_state(1)[0])

@@ -64,7 +64,7 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         lanes = self.every if mask is None else numpy.asarray(mask, dtype=bool)
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        self.reading = self._readings.begin(lanes, self._state(observations), seeds)  # type: ignore[arg-type]
+        self.reading = self._readings.begin(lanes, self._state(observations), seeds)
         self.final, self.began = None, lanes
         self._ended = self._ended & ~lanes
         return self._show(infos)
