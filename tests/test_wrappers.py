@@ -14,6 +14,7 @@ from filtergym import Sensor
 from filtergym.wrappers import (
     CLASSIC_CONTROL,
     EnvironmentModel,
+    EnvironmentSensor,
     EstimatedObservation,
     NoisyObservation,
     fit_model,
@@ -180,7 +181,7 @@ def readings_of(sensors, steps, model=None, name="Pendulum-v1", lanes=200):
 
 def test_noise_has_the_covariance_that_is_stated():
     R = [[0.04, 0.01], [0.01, 0.09]]
-    values, received = readings_of({"both": {"h": ["angle", "rate"], "R": R}}, 100)
+    values, received = readings_of({"both": {"h": ["angle", "rate"], "R": R}}, 100, name="CartPole-v1")
     # 20,000 independent numbers: their variance is known to 1 %.
     np.testing.assert_allclose(np.cov(values.reshape(-1, 2).T), R, atol=0.003)
     np.testing.assert_allclose(values.mean(axis=(0, 1)), 0.3, atol=0.01)
@@ -230,6 +231,21 @@ def test_agents_meet_the_same_noise():
         angle = np.arctan2(*env.unwrapped._get_obs()[[1, 0]].astype(float))
         found.append(env.reading.values[0, 0] - angle)
     assert found[0] == pytest.approx(found[1], abs=1e-12)
+
+
+def test_a_measured_angle_is_an_angle_in_whatever_form_it_is_named():
+    forms = [
+        {"h": "angle", "R": 0.01}, {"h": 0, "R": 0.01}, {"h": [[1.0, 0.0]], "R": 0.01},
+        EnvironmentSensor(h="angle", R=0.01), Sensor(h=[[1.0, 0.0]], R=[[0.01]]),
+    ]  # fmt: skip
+    found = []
+    for sensor in forms:
+        env = wrapped("Pendulum-v1", {"encoder": sensor}, show=ALL)
+        env.reset(seed=3)
+        found.append([env.step([2.0])[0] for _ in range(100)])
+        assert np.abs(np.array(found)[..., -1]).max() < np.pi
+    for one in found[1:]:
+        np.testing.assert_array_equal(one, found[0])
 
 
 def test_lanes_without_a_seed_go_on():
@@ -409,6 +425,7 @@ def pendulum(**sensor):
         (lambda: pendulum(delay=-1), "delay of a sensor"),
         (lambda: pendulum(quantum=-1), "quantum of a sensor"),
         (lambda: pendulum(speed=1), "must be a Sensor, or a mapping"),
+        (lambda: pendulum(h=["angle", "rate"]), "one sensor to each kind"),
         (lambda: pendulum(h=True), "component True"),
         (lambda: pendulum(R=np.nan), "positive definite"),
         (

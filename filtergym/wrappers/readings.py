@@ -77,16 +77,25 @@ def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) ->
         places = _component_places(name, values["h"], names)
         if places is not None:
             turning = {angles.get(names[place]) for place in places}
-            wraps = turning.pop() if len(turning) == 1 else None
+            if len(turning) > 1 and values.get("wraps") is None:
+                raise ValueError(
+                    f"the sensor {name!r} measures {', '.join(names[place] for place in places)}, of which angles wrap "
+                    "and others do not: give one sensor to each kind"
+                )
+            wraps = values.get("wraps") or turning.pop()
             R = values["R"] if callable(values["R"]) else numpy.asarray(values["R"], dtype=float)
             R = numpy.diag(numpy.broadcast_to(R, len(places))) if not callable(R) and R.ndim == 0 else R
-            values = {"wraps": wraps, **values, "h": numpy.eye(len(names))[places], "R": R}
+            values = {**values, "wraps": wraps, "h": numpy.eye(len(names))[places], "R": R}
         found[str(name)] = EnvironmentSensor(**values)
     return found
 
 
 def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | None:
-    """Return the places of components that are named or numbered; None for a matrix or a function."""
+    """Return the places of components that are named, numbered or chosen by a matrix; None for any other h."""
+    if not callable(h) and numpy.shape(h)[1:] == (len(names),):
+        rows = numpy.asarray(h, dtype=float)
+        is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
+        return rows.argmax(axis=1).tolist() if is_choice and len(rows) else None
     kinds = (str, int, numpy.integer)
     listed: Any = [h] if isinstance(h, kinds) else h
     if not isinstance(listed, Sequence) or not all(isinstance(one, kinds) for one in listed):
