@@ -242,7 +242,8 @@ class Estimates:
         )
         shown: tuple[Array, ...] = present.T.copy(), numpy.sqrt(variance.T), nis
         for i, period in self.turns:
-            shown[0][:, i] -= period * numpy.rint(shown[0][:, i] / period)
+            angle = shown[0][:, i]
+            angle -= period * numpy.rint(angle / period)
         if lanes is not None:
             old = self.mean, self.deviation, self.nis
             shown = tuple(
@@ -325,4 +326,4 @@ class Estimates:
             else:
                 value = getattr(self, name)
                 parts.append(value[:, None] if value.ndim == 1 else value)
-        return numpy.concatenate(parts, axis=1).astype(dtype)
+        return (parts[0] if len(parts) == 1 else numpy.concatenate(parts, axis=1)).astype(dtype, order="C")
