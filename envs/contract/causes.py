@@ -135,7 +135,7 @@ class Causes(NamedTuple):
 
     @classmethod
     def of(cls, task: Any) -> "Causes":
-        """Causes of a task, by default missed measurements."""
+        """Return the causes of a task, by default missed measurements."""
         return find_companion(task, cls) or cls()
 
 

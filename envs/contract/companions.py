@@ -92,13 +92,13 @@ class LoopRecords(NamedTuple):
 
 
 def trained_banks(task: Any) -> Mapping[str, type]:
-    """Trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
+    """Return the trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
     found = find_companion(task, TrainedBanks)
     return {} if found is None else found.banks
 
 
 def action_reach(task: Any, control: str) -> tuple[str, ...]:
-    """Parameters that say how far an action of a control reaches, see :class:`Actions`."""
+    """Return the parameters that say how far an action of a control reaches, see :class:`Actions`."""
     found = find_companion(task, Actions)
     return () if found is None else found.reach.get(control, ())
 

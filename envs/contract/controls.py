@@ -16,7 +16,7 @@ from .observation import Array
 
 
 def bank_action_space(control: str, count: int) -> gymnasium.Space[Any]:
-    """Action space of a control over a bank of ``count`` hypotheses.
+    """Return the action space of a control over a bank of ``count`` hypotheses.
 
     ``mode``: the one hypothesis that is believed. ``weights``: absolute weights, normalised by the task (all
     zero = uniform). ``evidence``: scaled and added to the log-posterior of Bayes' rule; zero is the paper.
@@ -35,7 +35,7 @@ def bank_probabilities(
     evidence_scale: float,
     xp: ModuleType,
 ) -> Array:
-    """Weights of the bank that an action puts in force, ``(M, N)``.
+    """Return the weights of the bank that an action puts in force, ``(M, N)``.
 
     Args:
         control: "mode", "weights" or "evidence".

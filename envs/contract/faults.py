@@ -104,23 +104,25 @@ class Disturbance(ABC):
         return state
 
     def advance(self, state: Any, step: DisturbanceInput) -> Any:
-        """State at a measurement, from that at the one before."""
+        """Return the state at a measurement, from that at the one before."""
         return state
 
     def change_deviations(self, state: Any, deviations: Array) -> Array:
-        """Standard deviations of the white errors over the usual ones, ``(..., N)``, with what it does to them."""
+        """Return the standard deviations of the white errors over the usual ones, ``(..., N)``, with what it does
+        to them.
+        """
         return deviations
 
     def change_errors(self, state: Any, errors: Array) -> Array:
-        """Errors, ``(n, N)`` in the world's units of them, with what it does to them."""
+        """Return the errors, ``(n, N)`` in the world's units of them, with what it does to them."""
         return errors
 
     def change_reading(self, state: Any, reading: Array) -> tuple[Any, Array]:
-        """State and what the sensor reads, ``(n, N)`` in its own coordinates, with what it does to them."""
+        """Return the state and what the sensor reads, ``(n, N)`` in its own coordinates, with what it does to them."""
         return state, reading
 
     def change_measurement(self, state: Any, measurement: Any, step: DisturbanceInput) -> tuple[Any, Any]:
-        """State and measurement with what it does to them.
+        """Return the state and measurement with what it does to them.
 
         Args:
             state: of :meth:`advance`.
@@ -187,7 +189,7 @@ class Disturbances:
         return self._draw(lambda part: part.begin(draws, shares[part.name], zero))
 
     def complete(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
-        """States with what only some scenarios draw."""
+        """Return the states with what only some scenarios draw."""
         return self._draw(lambda part: part.complete(states[part.name], draws))
 
     def _draw(self, draw: Callable[[Disturbance], Any]) -> dict[str, Any]:
@@ -196,7 +198,7 @@ class Disturbances:
         return {part.name: states[part.name] for part in self.parts}
 
     def quiet(self, states: dict[str, Any], calm: Array | None) -> dict[str, Any]:
-        """States with no hidden disturbance in some episodes, see :func:`undisturbed`."""
+        """Return the states with no hidden disturbance in some episodes, see :func:`undisturbed`."""
         if calm is None:
             return states
         return {part.name: part.quiet(states[part.name], calm) for part in self.parts}
@@ -204,7 +206,7 @@ class Disturbances:
     def share(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
     ) -> dict[str, DisturbanceInput]:
-        """Hand out a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
+        """Return the hand out a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
         steps, n, u = {}, 0, 0
         for part in self.parts:
             own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
@@ -213,23 +215,23 @@ class Disturbances:
         return steps
 
     def advance(self, states: Mapping[str, Any], steps: Mapping[str, DisturbanceInput]) -> dict[str, Any]:
-        """States at a measurement."""
+        """Return the states at a measurement."""
         return {part.name: part.advance(states[part.name], steps[part.name]) for part in self.parts}
 
     def change_deviations(self, states: Mapping[str, Any], deviations: Array) -> Array:
-        """Standard deviations of the white errors over the usual ones with what each does to them."""
+        """Return the standard deviations of the white errors over the usual ones with what each does to them."""
         for part in self.parts:
             deviations = part.change_deviations(states[part.name], deviations)
         return deviations
 
     def change_errors(self, states: Mapping[str, Any], errors: Array) -> Array:
-        """Errors with what each does to them."""
+        """Return the errors with what each does to them."""
         for part in self.parts:
             errors = part.change_errors(states[part.name], errors)
         return errors
 
     def change_reading(self, states: Mapping[str, Any], reading: Array) -> tuple[dict[str, Any], Array]:
-        """States and what the sensor reads, with what each does to them."""
+        """Return the states and what the sensor reads, with what each does to them."""
         changed = dict(states)
         for part in self.parts:
             changed[part.name], reading = part.change_reading(changed[part.name], reading)
@@ -238,7 +240,7 @@ class Disturbances:
     def change_measurement(
         self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, DisturbanceInput]
     ) -> tuple[dict[str, Any], Any]:
-        """States and measurement with what each does to them."""
+        """Return the states and measurement with what each does to them."""
         changed = dict(states)
         for part in self.parts:
             own = changed[part.name], measurement, steps[part.name]
@@ -283,7 +285,7 @@ class Outliers(Disturbance):
     @staticmethod
     @abstractmethod
     def limits(parameters: Any) -> tuple[float, float]:
-        """Probability and factor."""
+        """Return the probability and factor."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
         """Start with a usual one."""

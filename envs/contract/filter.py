@@ -131,10 +131,12 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     @abstractmethod
     def start(self, initial: Any) -> State:
-        """State at the start of the track, of the task's :class:`Initial`."""
+        """Return the state at the start of the track, of the task's :class:`Initial`."""
 
     def initialise(self, given: FilterInput) -> State:
-        """State at the start of the track, of all that the filter is given: the initial estimate as measurement."""
+        """Return the state at the start of the track, of all that the filter is given: the initial estimate as
+        measurement.
+        """
         return self.start(given.measurement)
 
     def predict(self, state: State, measurement: Measurement) -> State:
@@ -155,12 +157,14 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         return self.update(self.predict(state, given.measurement), given)
 
     def mean(self, state: State) -> Array:
-        """Estimate of the task's components, after :meth:`update`, ``(C, N)``; by default the state's ``mean``."""
+        """Return the estimate of the task's components, after :meth:`update`, ``(C, N)``; by default the state's
+        ``mean``.
+        """
         mean: Array = state.mean  # type: ignore[attr-defined]
         return mean
 
     def covariance(self, state: State) -> Array:
-        """Covariance that is reported for it, ``(C, C, N)``; by default the state's ``covariance``."""
+        """Return the covariance that is reported for it, ``(C, C, N)``; by default the state's ``covariance``."""
         covariance: Array = state.covariance  # type: ignore[attr-defined]
         return covariance
 

@@ -120,7 +120,7 @@ class LiveInput:
             )
 
     def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Initial estimate of the task's NamedTuple, arrays ``(..., N)`` also of one track, and memory.
+        """Return the initial estimate of the task's NamedTuple, arrays ``(..., N)`` also of one track, and memory.
 
         Args:
             time: of the start, s, ``(N,)``, of one track a float.
@@ -184,7 +184,7 @@ class LiveInput:
         return type(self.measurement)(**made), {**memory, "time": time, "count": count}
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
-        """Initial mean and covariance from the first two measurements, each with its ``time``.
+        """Return the initial mean and covariance from the first two measurements, each with its ``time``.
 
         Raises:
             ValueError: if two measurements start no track here, or one lacks what it takes.
@@ -192,7 +192,7 @@ class LiveInput:
         raise ValueError(f"a track of {self.task.id} does not start from two measurements: call start")
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
-        """Numbers that stand for what was not received; zeros."""
+        """Return the numbers that stand for what was not received; zeros."""
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
 
 
@@ -213,7 +213,7 @@ class LiveValues:
         return all(self.values.get(name) is not None for name in names)
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Value of each track, ``(N,)``; NaN where none came."""
+        """Return the value of each track, ``(N,)``; NaN where none came."""
         return numpy.atleast_1d(self.input.read(self.values, name))
 
     def place(self, number: int) -> str:
@@ -221,7 +221,7 @@ class LiveValues:
         return f"track {number}"
 
     def deviations(self, name: str) -> Any:
-        """Standard deviations, ``(N,)``, of one track a float; NaN where none is stated.
+        """Return the standard deviations, ``(N,)``, of one track a float; NaN where none is stated.
 
         Raises:
             ValueError: if one is not above zero.
@@ -239,7 +239,7 @@ class LiveReader(NamedTuple):
 
     @classmethod
     def of(cls, task: Any) -> "LiveReader":
-        """Reader of a task, or of a class of tasks; by default that of the arrays by their names."""
+        """Return the reader of a task, or of a class of tasks; by default that of the arrays by their names."""
         return find_companion(task, cls) or cls()
 
 

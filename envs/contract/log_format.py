@@ -40,7 +40,7 @@ class Readings(Protocol):
         ...
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Numbers of a column, ``(n,)``; NaN where one did not come."""
+        """Return the numbers of a column, ``(n,)``; NaN where one did not come."""
         ...
 
     def place(self, number: int) -> str:
@@ -49,7 +49,7 @@ class Readings(Protocol):
 
 
 def optional(readings: Readings, name: str, count: int) -> numpy.ndarray:
-    """Numbers of a column that may lack, ``(n,)``; then NaN.
+    """Return the numbers of a column that may lack, ``(n,)``; then NaN.
 
     Args:
         readings: given.
@@ -87,7 +87,7 @@ def is_assumed(words: str) -> bool:
 
 
 def deviation_words(deviations: Mapping[str, float]) -> str:
-    """Typical deviations in words, such as "sigma_x 13.8 m, sigma_y 13.8 m"."""
+    """Return the typical deviations in words, such as "sigma_x 13.8 m, sigma_y 13.8 m"."""
     return ", ".join(f"{name} {value:.3g} {UNITS.get(name, 'm')}" for name, value in deviations.items())
 
 
@@ -226,7 +226,9 @@ class LogSetup(NamedTuple):
     """Measurements of the longest track; zero: not known."""
 
     def scenario(self, task: Any) -> Scenario:
-        """Parameters of a task on logs that are read in the same way, in place of those of a simulated scenario."""
+        """Return the parameters of a task on logs that are read in the same way, in place of those of a simulated
+        scenario.
+        """
         log_format: Any = find_companion(task, LogFormat)
         known = ("horizon", self.horizon), ("decision_interval", log_format.decision_interval)
         return Scenario("log", "", {**{name: value for name, value in known if value}, **self.parameters})

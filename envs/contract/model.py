@@ -75,7 +75,7 @@ class Model:
         return "torch" if "torch" in self.task.xp.__name__ else "numpy"
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Positions of named fields in the observation.
+        """Return the positions of named fields in the observation.
 
         Raises:
             ValueError: for a name that is no field.
@@ -126,21 +126,21 @@ class Model:
         return None if maker is None or self.task.recording is not None else maker.make(self)
 
     def truth_for_filter(self, truth: Any) -> Any:
-        """Truth as the filter is given it: None unless it ``knows`` something."""
+        """Return the truth as the filter is given it: None unless it ``knows`` something."""
         return truth if self.filter.knows else None
 
     # --- the filter's part of a step
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
-        """State of the filter at the start of the track."""
+        """Return the state of the filter at the start of the track."""
         return self.filter.initialise(FilterInput(initial, truth))
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
-        """State of the filter when a measurement has come, before it is taken in."""
+        """Return the state of the filter when a measurement has come, before it is taken in."""
         return self.filter.predict(state, measurement)
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
-        """State of the filter when the measurement is taken in, by a bank with the action."""
+        """Return the state of the filter when the measurement is taken in, by a bank with the action."""
         return self.filter.update(state, FilterInput(measurement, truth, action))
 
     def feedback(self, state: Any, measurement: Any) -> Any:
@@ -155,7 +155,7 @@ class Model:
     # --- what the engine calls
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Episode at the start of the track.
+        """Return the episode at the start of the track.
 
         Args:
             uniforms: ``(noise.uniforms, N)``, of the task.
@@ -165,7 +165,7 @@ class Model:
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
+        """Return the steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.task.world.advance(episode.truth, noise, feedback)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
@@ -183,7 +183,7 @@ class Model:
         return episode._replace(filter=self.update_filter(episode.filter, episode.measurement, action, truth))
 
     def mean(self, episode: Episode) -> Array:
-        """Estimate, ``(len(components), N)``, in the units of ``components``."""
+        """Return the estimate, ``(len(components), N)``, in the units of ``components``."""
         return self.filter.mean(episode.filter)
 
     def context(self, episode: Episode) -> dict[str, Array]:
@@ -212,7 +212,7 @@ class Model:
         return self.task.world.cost(episode.truth, self.filter.mean(episode.filter))
 
     def counted_cost(self, episode: Episode) -> Array:
-        """Part of the cost that the reward counts, ``(N,)``; see :meth:`World.counted_cost`."""
+        """Return the part of the cost that the reward counts, ``(N,)``; see :meth:`World.counted_cost`."""
         return self.task.world.counted_cost(episode.truth, self.filter.mean(episode.filter))
 
     def error(self, episode: Episode) -> Array:
@@ -220,7 +220,7 @@ class Model:
         return self.task.subtract(self.filter.mean(episode.filter), self.task.world.state(episode.truth))
 
     def covariance(self, episode: Episode) -> Array:
-        """Covariance that the estimator reports for its error, ``(C, C, N)``."""
+        """Return the covariance that the estimator reports for its error, ``(C, C, N)``."""
         return self.filter.covariance(episode.filter)
 
     def track(self, episode: Episode) -> dict[str, Array]:
@@ -231,8 +231,9 @@ class Model:
         return {**self._truth_and_estimate(episode), **measured}
 
     def picture_track(self, episode: Episode) -> dict[str, Array]:
-        """Arrays that a picture of a track shows: as :meth:`track`, but of the measurement only ``seen``, the readings
-        of the components ``(C, N)``, if the world has any; NaN where a component was not measured.
+        """Return the arrays that a picture of a track shows: as :meth:`track`, but of the measurement only
+        ``seen``, the readings of the components ``(C, N)``, if the world has any; NaN where a component was not
+        measured.
         """
         seen = self.task.world.component_readings(episode.measurement)
         return {**self._truth_and_estimate(episode), **({} if seen is None else {"seen": seen})}

@@ -76,7 +76,7 @@ class TaskParameters:
 
 @cache
 def field_limits(cls: type) -> dict[str, tuple[Any, ParameterLimits]]:
-    """Type and limits of every field of a parameters' dataclass."""
+    """Return the type and limits of every field of a parameters' dataclass."""
     hints = typing.get_type_hints(cls)
     return {
         f.name: (hints[f.name], f.metadata.get("limits", ParameterLimits())) for f in dataclasses.fields(cls)

@@ -168,7 +168,7 @@ class Task(TaskBase):
 
 
 def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
-    """Arrays of nested NamedTuples, with the names that lead to them."""
+    """Return the arrays of nested NamedTuples, with the names that lead to them."""
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
             yield from named_arrays(value, f"{prefix}{name}_")

@@ -152,7 +152,7 @@ class TaskBase(ABC):
         return getattr(self.parameters, "sampling_interval", None)
 
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
+        """Return the number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
 
         Args:
             uniforms: of the scenario, ``(noise.uniforms, N)``; the first row draws the flight.
@@ -160,7 +160,7 @@ class TaskBase(ABC):
         return numpy.floor(len(self.flights) * uniforms[0]).astype(int)
 
     def lengths(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Measurements acted on in each episode, ``(N,)``.
+        """Return the measurements acted on in each episode, ``(N,)``.
 
         Args:
             uniforms: of the scenario, ``(noise.uniforms, N)``.

@@ -55,7 +55,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     @abstractmethod
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Any]:
-        """Truth at the start of the track, and the initial estimate given to every filter.
+        """Return the truth at the start of the track, and the initial estimate given to every filter.
 
         Args:
             draws: what fixes the scenario of each episode.
@@ -76,7 +76,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """
 
     def state(self, truth: Truth) -> Array:
-        """True values of the task's components, ``(C, N)``; by default the truth's ``state``."""
+        """Return the true values of the task's components, ``(C, N)``; by default the truth's ``state``."""
         state: Array = truth.state  # type: ignore[attr-defined]
         return state
 
@@ -107,21 +107,21 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return measurement
 
     def component_readings(self, measurement: Measurement) -> Array | None:
-        """Readings of the task's components, ``(C, N)`` in their units, for pictures.
+        """Return the readings of the task's components, ``(C, N)`` in their units, for pictures.
 
         NaN where they say nothing; None, as here, where what is measured is no component at all.
         """
         return None
 
     def component_deviations(self, measurement: Measurement) -> Array | None:
-        """Standard deviations that are stated for the errors of :meth:`component_readings`, in the same form; None
-        where that is None.
+        """Return the standard deviations that are stated for the errors of :meth:`component_readings`, in the same
+        form; None where that is None.
         """
         return None
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Standard deviations of the errors of what sensors read, stated or nominal, in the shape of the readings; here
-        the square roots of ``stated_field``.
+        """Return the standard deviations of the errors of what sensors read, stated or nominal, in the shape of the
+        readings; here the square roots of ``stated_field``.
 
         Args:
             measurement: of :meth:`advance`.
@@ -154,8 +154,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.error_cost(self.task.subtract(mean, self.state(truth)))
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
-        """Part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it, unless some is
-        known not to be its fault.
+        """Return the part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it,
+        unless some is known not to be its fault.
 
         Args:
             truth: at the measurement that the estimate is for.

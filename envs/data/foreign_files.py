@@ -299,7 +299,7 @@ def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
 
 
 def _array_forms(value: Any) -> Iterator[tuple[str, list[int]]]:
-    """Types and shapes of the arrays that a head names, in their order."""
+    """Return the types and shapes of the arrays that a head names, in their order."""
     if isinstance(value, dict):
         if "array" in value:
             yield value["dtype"], value["shape"]

@@ -325,7 +325,7 @@ class _Bag(NamedTuple):
     """Of a type's definition as the library knows it; None where a bag holds none."""
 
     def busiest(self, kind: str) -> str:
-        """Topic that has most messages of a type; empty where there are none."""
+        """Return the topic that has most messages of a type; empty where there are none."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             if connection.msgtype == kind:
@@ -333,7 +333,7 @@ class _Bag(NamedTuple):
         return next(iter(counts.most_common(1)), ("", 0))[0]
 
     def rows(self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int) -> Any:
-        """Numbers of the messages of a topic, a column each: messages take a hundred times as much.
+        """Return the numbers of the messages of a topic, a column each: messages take a hundred times as much.
 
         Raises:
             ValueError: if there are none or too many, or they are of another definition.

@@ -182,7 +182,7 @@ class RecordedWorld(_ForeignWorld):
         return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
 
     def _at(self, table: Array, column: Array) -> Array:
-        """Entries of a table, ``(..., N)``."""
+        """Return the entries of a table, ``(..., N)``."""
         return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
 
     def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
@@ -190,7 +190,7 @@ class RecordedWorld(_ForeignWorld):
         return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
 
     def state(self, truth: Replayed) -> Array:
-        """True values of the task's components, ``(C, N)``.
+        """Return the true values of the task's components, ``(C, N)``.
 
         Raises:
             ValueError: if the recording has none.
@@ -200,7 +200,7 @@ class RecordedWorld(_ForeignWorld):
         return self._at(self.tables.truth, self._column(truth))
 
     def records(self, truth: Replayed) -> dict[str, Array]:
-        """Time since the start of the track, s."""
+        """Return the time since the start of the track, s."""
         return {"seconds": self._at(self.tables.seconds, self._column(truth))}
 
     def context(self, truth: Replayed) -> dict[str, Array]:
@@ -290,5 +290,5 @@ class LiveWorld(_ForeignWorld):
 
 
 def _count_numbers(like: Any) -> int:
-    """Numbers of a NamedTuple of arrays in one lane."""
+    """Return the numbers of a NamedTuple of arrays in one lane."""
     return sum(math.prod(array.shape[:-1]) for _, array in named_arrays(like))

@@ -184,7 +184,7 @@ class Recording(ScenarioData):
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
-        """Measurements acted on in each episode, whole decisions, none beyond the horizon."""
+        """Return the measurements acted on in each episode, whole decisions, none beyond the horizon."""
         lengths = numpy.minimum(self.lengths, horizon)
         return tuple((lengths - lengths % decision_interval).tolist())
 
@@ -480,12 +480,12 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
 
 
 def _first(values: numpy.ndarray) -> int:
-    """Place of the first row that is not finite."""
+    """Return the place of the first row that is not finite."""
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 
 def differing(parameters: Any) -> dict[str, Any]:
-    """Parameters of a task that differ from the defaults, without the horizon."""
+    """Return the parameters of a task that differ from the defaults, without the horizon."""
     found = {}
     for each in dataclasses.fields(parameters):
         value = getattr(parameters, each.name)

@@ -68,7 +68,7 @@ class EstimatePicture(Picture):
         return values
 
     def strips(self) -> Sequence[Strip]:
-        """Errors of the first components."""
+        """Return the errors of the first components."""
         return [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
             for component in self.task.components[:MOST_STRIPS]
@@ -154,7 +154,7 @@ class EstimatePicture(Picture):
 
 
 def _extent(values: numpy.ndarray) -> tuple[float, float]:
-    """Lowest and highest value with a margin."""
+    """Return the lowest and highest value with a margin."""
     finite = values[numpy.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
     margin = MARGIN * (high - low) or 1.0

@@ -75,14 +75,14 @@ class Strip(NamedTuple):
 
 
 def error_strip(title: str, component: str, limit: float) -> Strip:
-    """Panel of a component's error with its reported band, between plus and minus ``limit`` at first."""
+    """Return the panel of a component's error with its reported band, between plus and minus ``limit`` at first."""
     return Strip(
         title, {"error": f"error.{component}"}, (-limit, limit), band=f"sigma.{component}", guides=(0.0,)
     )
 
 
 def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-    """Stretch limits about zero by the least factor 1, 2, 5, 10, ... that lets them hold low and high."""
+    """Return the stretch limits about zero by the least factor 1, 2, 5, 10, ... that lets them hold low and high."""
     lowest, highest = limits
     # A value on the far side of a limit at zero cannot be reached by stretching, and is cut off.
     needed = max(
@@ -123,11 +123,11 @@ class Picture:
         self.task: Any = model.task
 
     def records(self, state: Any) -> dict[str, float]:
-        """Values that the history keeps of a state after the action, beside errors, sigmas and actions."""
+        """Return the values that the history keeps of a state after the action, beside errors, sigmas and actions."""
         return {}
 
     def strips(self) -> Sequence[Strip]:
-        """Error of every component with its reported band, and the action."""
+        """Return the error of every component with its reported band, and the action."""
         shown = self.model.task.components[:MOST_COMPONENTS]
         errors = [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
@@ -156,7 +156,7 @@ class Picture:
         """Take note of a new episode, from its state after the first measurement."""
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Measurements, from and to, that every strip marks with a grey ground."""
+        """Return the measurements, from and to, that every strip marks with a grey ground."""
         return ()
 
     def arrange(self) -> None:
@@ -524,7 +524,7 @@ class EpisodePictures:
 
 
 def _alone(state: Any, lane: int) -> Any:
-    """Episode in one lane as a picture takes it: on the host, padded with itself."""
+    """Return the episode in one lane as a picture takes it: on the host, padded with itself."""
     return map_arrays(lambda values: host_array(values)[..., [lane] * round_up_lanes(1)], state)
 
 

@@ -222,22 +222,22 @@ def _import_name(name: str) -> ImportableName:
 
 
 def importable_name(cls: "type[Task]") -> str:
-    """Id by which another process finds an environment: of a user's with the module that registers it."""
+    """Return the id by which another process finds an environment: of a user's with the module that registers it."""
     return ImportableName(f"{cls.__module__}:{cls.id}") if cls.id in USER_TASKS else cls.id
 
 
 def short_name(id: str) -> str:
-    """Name of a Gymnasium id for files, and where the id is too long."""
+    """Return the name of a Gymnasium id for files, and where the id is too long."""
     return id.removeprefix("filtergym/").replace("/", "-")
 
 
 def bare_name(id: str) -> str:
-    """Gymnasium id without its namespace and version, as tables and pages call an environment."""
+    """Return the Gymnasium id without its namespace and version, as tables and pages call an environment."""
     return id.rpartition("/")[2].removesuffix("-v0")
 
 
 def parameter_names(cls: "type[Task]") -> list[str]:
-    """Names of the keywords that an environment takes besides control, scenario and reward."""
+    """Return the names of the keywords that an environment takes besides control, scenario and reward."""
     return [f.name for f in dataclasses.fields(cls.Parameters)]
 
 

@@ -108,17 +108,17 @@ class CompiledModel(Model):
         return function(self._plain, *parts)
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
-        """State of the filter at the start of the track."""
+        """Return the state of the filter at the start of the track."""
         if self.filter.in_python:
             return super().start_filter(initial, truth)
         return self.run(start_filter, initial, truth)[0]
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
-        """State of the filter when a measurement has come."""
+        """Return the state of the filter when a measurement has come."""
         return self.programs.filter_prediction(state, measurement, threads=self.threads)[0]
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
-        """State of the filter when the measurement is taken in."""
+        """Return the state of the filter when the measurement is taken in."""
         if self.filter.in_python:
             return super().update_filter(state, measurement, action, truth)
         return self.programs.filter_update(truth, state, measurement, action, threads=self.threads)[0]
@@ -130,12 +130,12 @@ class CompiledModel(Model):
         return self.run(Model.feedback, state, measurement)
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Episode at the start of the track."""
+        """Return the episode at the start of the track."""
         truth, initial = self.run(begin_world, uniforms, normals)
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Steps 1 and 2."""
+        """Return the steps 1 and 2."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
@@ -181,7 +181,7 @@ def _hashes(value: Any) -> bool:
 
 
 def _name_of(function: Callable[..., Any]) -> str:
-    """Name of a function, or of the class of an object that is called."""
+    """Return the name of a function, or of the class of an object that is called."""
     return getattr(function, "__qualname__", type(function).__name__)
 
 

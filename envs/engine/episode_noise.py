@@ -47,7 +47,7 @@ def _identities_of_seeds(seeds: tuple[int, ...]) -> numpy.ndarray:
 
 
 def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
-    """Identities of the first episodes of environments that are reset with these seeds, ``(2, N)`` uint64.
+    """Return the identities of the first episodes of environments that are reset with these seeds, ``(2, N)`` uint64.
 
     To seed a generator takes long, and competitors are compared on the same seeds, so the identities
     of the last blocks of seeds are kept.
@@ -56,7 +56,8 @@ def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
 
 
 def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Uniforms ``(layout.uniforms, N)`` and normals ``(layout.initial_normals, N)`` of the start of episodes.
+    """Return the uniforms ``(layout.uniforms, N)`` and normals ``(layout.initial_normals, N)`` of the start of
+    episodes.
 
     Args:
         identities: ``(2, N)`` uint64.
@@ -68,7 +69,7 @@ def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy
 
 
 def uniforms_of_seeds(seeds: Sequence[int], layout: NoiseLayout) -> numpy.ndarray:
-    """Uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of these seeds.
+    """Return the uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of these seeds.
 
     Args:
         seeds: as in :func:`identities_of_seeds`.
@@ -219,7 +220,7 @@ class EpisodeNoise:
         return self._ahead[self._slot - 1]
 
     def _numbers_ahead(self, lanes: numpy.ndarray, measurements: int) -> numpy.ndarray:
-        """Rows of the coming measurements of some lanes, ``(measurements, rows, lanes)``."""
+        """Return the rows of the coming measurements of some lanes, ``(measurements, rows, lanes)``."""
         t = self.measurement[lanes] + numpy.arange(1, measurements + 1)[:, None]
         return numbers(self.identities[:, lanes], t, self._layout.normals, self._layout.row_uniforms)
 

@@ -96,7 +96,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def observation(self, count: int) -> Array:
-        """Observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first; the caller may keep it."""
         ...
 
     def take_alone(self, action: Array) -> None:
@@ -104,11 +104,11 @@ class EpisodeStepper(Protocol):
         ...
 
     def first_reward(self, beside: Any) -> float:
-        """Mean of the rewards of the first lane, less those of what runs beside it, if anything does."""
+        """Return the mean of the rewards of the first lane, less those of what runs beside it, if anything does."""
         ...
 
     def observation_of_first(self) -> Array:
-        """Observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane; the caller may keep it."""
         ...
 
 
@@ -145,7 +145,7 @@ class ModelStepper:
         return start
 
     def _start(self, noise: EpisodeNoise) -> tuple[Array, Array]:
-        """Uniforms and normals of the start."""
+        """Return the uniforms and normals of the start."""
         task = self.model.task
         uniforms, normals = (task.xp.asarray(numbers, device=task.device) for numbers in noise.start())
         return uniforms, normals
@@ -222,12 +222,14 @@ class ModelStepper:
         return self._reports
 
     def first_reward(self, beside: "ModelStepper | None") -> float:
-        """Mean of the same of the first lane, where each is one number, less those of what runs beside it."""
+        """Return the mean of the same of the first lane, where each is one number, less those of what runs beside
+        it.
+        """
         others = [0.0] * len(self._reports) if beside is None else beside._reports
         return float(mean_of([a - b for a, b in zip(self._reports, others, strict=True)])[0])
 
     def observation_of_first(self) -> Array:
-        """Observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane; the caller may keep it."""
         return self.observation(1)[0]
 
     def observation_by_field(self) -> Array:
@@ -237,7 +239,7 @@ class ModelStepper:
         return self.shown
 
     def observation(self, count: int) -> Array:
-        """Observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first; the caller may keep it."""
         shown = self.observation_by_field()[:, :count].T
         # Contiguous, in memory of its own.
         return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
@@ -329,7 +331,7 @@ class Lanes:
             self._on_start(self.model.begin(*start))
 
     def _noise_of_some(self, count: int) -> EpisodeNoise:
-        """Noise of so many lanes that restart, in one of a few sizes."""
+        """Return the noise of so many lanes that restart, in one of a few sizes."""
         width = LANES
         while width < count:
             width *= 2
@@ -415,21 +417,21 @@ class Lanes:
         return answer
 
     def next_row(self) -> Array:
-        """Noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""
+        """Return the noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""
         self.noise.advance()
         return self.noise.row
 
     # --- what steps them
 
     def _by_functions(self) -> list[Any]:
-        """Steppers by the models' functions, without episodes."""
+        """Return the steppers by the models' functions, without episodes."""
         steppers = [ModelStepper(model, self.width) for model in self._models]
         if self.beside is not None:
             steppers[1].take(self._beside_action(self.width))
         return steppers
 
     def _beside_action(self, count: int) -> Array:
-        """Action of what runs beside, batch first."""
+        """Return the action of what runs beside, batch first."""
         assert self.beside is not None
         actions = [self.beside.action] * count
         discrete = isinstance(self.beside.action, int)
@@ -440,7 +442,7 @@ class Lanes:
         )
 
     def _reporting(self, report: Report) -> Sequence[Any]:
-        """Steppers that make a report, which hold the episodes from now on."""
+        """Return the steppers that make a report, which hold the episodes from now on."""
         if self._moving is self._steppers.get(report):
             return self._moving
         if report not in self._steppers and all(can_step(model, report) for model in self._models):
@@ -515,7 +517,7 @@ class Lanes:
     # --- copies, growth, gradients
 
     def _episodes(self) -> tuple[Any, ...]:
-        """Episodes of every task with what is shown of them; the arrays never change."""
+        """Return the episodes of every task with what is shown of them; the arrays never change."""
         return tuple((stepper.episode(), stepper.shown) for stepper in self._settle())
 
     def _load(self, episodes: tuple[Any, ...]) -> None:
@@ -555,5 +557,7 @@ class Lanes:
         return self.decisions >= self._lengths
 
     def observe(self) -> Array:
-        """Observation of every lane, batch first: ``(count, len(model.fields))``; the caller may keep it."""
+        """Return the observation of every lane, batch first: ``(count, len(model.fields))``; the caller may keep
+        it.
+        """
         return self._moving[0].observation(self.count)

@@ -28,7 +28,7 @@ class TrainingObjective(NamedTuple):
 
 
 def _unpack(like: Episode, state: Any) -> Episode:
-    """Episode whose numbers are the rows of an array, ``(rows, N)``."""
+    """Return the episode whose numbers are the rows of an array, ``(rows, N)``."""
     row = 0
 
     def leaf(array: numpy.ndarray) -> Any:
@@ -49,7 +49,7 @@ def _pack(episode: Episode) -> Any:
 def _forward(
     programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *teacher: Any
 ) -> Any:
-    """Episodes at the next measurement, reward, and observation."""
+    """Return the episodes at the next measurement, reward, and observation."""
     model = programs.traced
     after = model.act(_unpack(programs.later.episode, state), action)
     episode, own = model.measure(after, noise), OWN_REWARDS[reward.kind](model, after)
@@ -62,7 +62,8 @@ def _forward(
 def _backward(
     programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *others: Any
 ) -> Any:
-    """Gradients with respect to episodes and action, from those with respect to what :func:`_forward` returns.
+    """Return the gradients with respect to episodes and action, from those with respect to what :func:`_forward`
+    returns.
 
     The last three arguments are the latter; what stands before them is the teacher's.
     """

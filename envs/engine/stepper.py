@@ -27,7 +27,7 @@ from .programs import Report
 
 
 def mean_of(rewards: Sequence[Any]) -> Any:
-    """Mean over the measurements of one decision."""
+    """Return the mean over the measurements of one decision."""
     return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
 
 
@@ -343,7 +343,9 @@ class Stepper:
     def _bound_copies(
         self, now: int, noise: EpisodeNoise, reported: Sequence[numpy.ndarray], moving: list[Moving]
     ) -> list[Call]:
-        """Calls of a step that begins with one of the copies, for tables of which entries move: reports are added."""
+        """Return the calls of a step that begins with one of the copies, for tables of which entries move: reports
+        are added.
+        """
         calls = [call.copy() for call in self._calls[now]]
         if self._world_of is None:
             calls[-2].table[self._row_entry] = noise.address
@@ -394,7 +396,7 @@ class Stepper:
         return map_arrays(lambda i: answers[i], self._report_template), actions
 
     def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
-        """Memory of a policy before its first action."""
+        """Return the memory of a policy before its first action."""
         blank = memory_of(compiled_policy.outputs[1:] if compiled_policy else (), self.width)
         for array in blank:
             array[...] = 0.0
@@ -408,7 +410,9 @@ class Stepper:
         ]
 
     def first_reward(self, beside: "Stepper | None") -> float:
-        """Mean of these reports of the first lane, where each is one number, less those of what runs beside it."""
+        """Return the mean of these reports of the first lane, where each is one number, less those of what runs
+        beside it.
+        """
         if self._interval == 1:
             own: float = self._first_rewards.item(0)
             return own if beside is None else own - beside._first_rewards.item(0)
@@ -427,14 +431,14 @@ class Stepper:
         return self._shown.T
 
     def observation(self, count: int) -> numpy.ndarray:
-        """Observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first; the caller may keep it."""
         if count < MANY:
             return self._shown[:count].copy()
         self._given = True
         return self._shown[:count]
 
     def observation_of_first(self) -> numpy.ndarray:
-        """Observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane; the caller may keep it."""
         return self._first_shown.copy()
 
     def _show_in(self, memory: numpy.ndarray) -> None:
@@ -459,8 +463,8 @@ def _bound(draw: Call, sequences: list[CallSequence], shown: list[list[Call]]) -
 
 
 def _side_by_side(arrays: Sequence[Leaf], width: int, tile: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
-    """Memory of all numbers of some arrays, ``(numbers, tiles, tile)``, and the arrays in it,
-    ``(..., tiles, tile)``: those of a tile side by side.
+    """Return the memory of all numbers of some arrays, ``(numbers, tiles, tile)``, and the arrays in it, ``(...,
+    tiles, tile)``: those of a tile side by side.
     """
     starts = numpy.cumsum([0, *(leaf.rows for leaf in arrays)]).tolist()
     if tile == width:

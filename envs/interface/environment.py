@@ -123,7 +123,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), self._with_context({})
 
     def _single_observation(self) -> Any:
-        """Observation of the one episode."""
+        """Return the observation of the one episode."""
         if not self.privileged:
             return self._to_dtype(self.fleet.observe()[0])
         return {name: values[0] for name, values in self._observations().items()}

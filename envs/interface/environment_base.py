@@ -197,13 +197,13 @@ class EnvBase:
         )
 
     def _to_dtype(self, values: Array) -> Array:
-        """Numbers in the type that was asked for."""
+        """Return the numbers in the type that was asked for."""
         if self.options.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
 
     def _observations(self) -> Any:
-        """Observations of all lanes, batch first."""
+        """Return the observations of all lanes, batch first."""
         shown = self._to_dtype(self.fleet.observe())
         if not self.privileged:
             return shown
@@ -215,7 +215,7 @@ class EnvBase:
         }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Context of all lanes, batch first, and which of them has each part of it."""
+        """Return the context of all lanes, batch first, and which of them has each part of it."""
         found = []
         for (part,) in self.fleet.parts():
             context, xp = part.model.context(part.state), part.task.xp

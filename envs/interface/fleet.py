@@ -51,7 +51,7 @@ class EpisodeDistribution(NamedTuple):
         return alike and repr(plain(self.parameters)) == repr(plain(parameters))
 
     def draw_task(self, generator: numpy.random.Generator) -> int:
-        """Number of the task of the next episode; one task takes no random number."""
+        """Return the number of the task of the next episode; one task takes no random number."""
         if len(self.models) == 1:
             return 0
         chosen = int(numpy.searchsorted(numpy.cumsum(self.weights), generator.random(), side="right"))
@@ -149,12 +149,12 @@ class Fleet:
         return self._parts[self._part[lane]].model
 
     def identity_of(self, lane: int) -> numpy.ndarray:
-        """Identity of a lane's episode, ``(2, 1)``, see :mod:`.episode_noise`."""
+        """Return the identity of a lane's episode, ``(2, 1)``, see :mod:`.episode_noise`."""
         place = self._place[lane]
         return self._parts[self._part[lane]].noise.identities[:, place : place + 1].copy()
 
     def scenario_of(self, lane: int) -> str:
-        """Name of the scenario of a lane's episode."""
+        """Return the name of the scenario of a lane's episode."""
         return self._names[lane]
 
     @property
@@ -171,7 +171,7 @@ class Fleet:
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
-        """Lanes of a task, made when they are first asked for."""
+        """Return the lanes of a task, made when they are first asked for."""
         for part in self._parts:
             if part.model is model or part.model.task.parameters == model.task.parameters:
                 return part
@@ -260,7 +260,7 @@ class Fleet:
     # --- what lanes do
 
     def parts(self, *values: Array) -> list[tuple[Any, ...]]:
-        """Lanes of every task that is flown, each with what is meant for it of arrays ``(count, ...)``."""
+        """Return the lanes of every task that is flown, each with what is meant for it of arrays ``(count, ...)``."""
         return [
             (self._parts[i], *(v[source] for v in values))
             for i, source in zip(self._flying, self._sources, strict=True)
@@ -283,7 +283,7 @@ class Fleet:
         return self.gather([part.step_reward(own, kind) for part, own in self.parts(action)])
 
     def observe(self) -> Array:
-        """Observation of every lane, batch first."""
+        """Return the observation of every lane, batch first."""
         if self.whole is not None:
             return self.whole.observe()
         return self.gather([part.observe() for (part,) in self.parts()])
