@@ -31,7 +31,7 @@ class Moment(NamedTuple):
     xp: ModuleType
     """Array namespace."""
     context: Mapping[str, Array]
-    """What the world tells of the episode, see :meth:`.World.context`; of a recording none of it."""
+    """Context that the world reports of the episode, see :meth:`.World.context`; none of a recording."""
     state: Array
     """True values of the task's components, ``(C, N)``; NaN where a recording does not know them."""
     measurement: Any
@@ -42,7 +42,9 @@ class Moment(NamedTuple):
     """Standard deviations that are stated for their errors, ``(C, N)``."""
 
     def knows(self, *names: str) -> bool:
-        """Whether the context tells all of these, and each of something: of no commands there are no times."""
+        """Return whether the context has all of these names, none of them empty: without commands there are no
+        times.
+        """
         return all(name in self.context and 0 not in self.context[name].shape for name in names)
 
 

@@ -53,7 +53,7 @@ class LostTracks(NamedTuple):
     """When a track counts as lost, and why a filter lost it."""
 
     cost: float | None = None
-    """Mean cost of an episode beyond which its track counts as lost; None where that is not said."""
+    """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
     explain: Callable[[Any, Array, Array, Any], str] | None = None
     """From the task, the last valid mean ``(C, N)``, its covariance ``(C, C, N)`` and the measurement that the filter
     took in, of N lanes: a sentence on why it lost an episode there, empty where there is none."""
@@ -110,7 +110,7 @@ def action_meanings(task: Any) -> Mapping[str, str]:
 
 
 def lost_cost(task: Any) -> float | None:
-    """Mean cost of an episode beyond which its track counts as lost; None where that is not said."""
+    """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
     found = find_companion(task, LostTracks)
     return None if found is None else found.cost
 

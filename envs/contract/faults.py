@@ -45,16 +45,16 @@ def undisturbed(draws: Draws, parameters: Any) -> Array | None:
 class Disturbance(ABC):
     """One thing that a world may do to its sensors, with a name, draws, an effect and causes.
 
-    It is drawn with the episode, moves on with every measurement, and acts where a method says so: on the deviations of
-    the white errors, on errors, on what is read, or on the whole measurement. What it has drawn and where it stands is
-    its state, nested NamedTuples of arrays ``(..., N)``. By default nothing is drawn, nothing moves and nothing is
-    changed.
+    It is drawn with the episode, moves on with every measurement, and acts through the methods that it defines: on the
+    deviations of the white errors, on errors, on what is read, or on the whole measurement. What it has drawn and where
+    it stands is its state, nested NamedTuples of arrays ``(..., N)``. By default nothing is drawn, nothing moves and
+    nothing is changed.
 
     Args:
         task: with its parameters.
 
     Attributes:
-        name: under which the truth holds its state, and by which a reference says that it knows it.
+        name: under which the truth holds its state, and by which a reference declares that it knows it.
         causes: circumstances by which an evaluation splits costs.
         initial_normals: standard normal numbers that it takes at the start of the track.
         normals: standard normal numbers that it takes at each measurement.
@@ -262,7 +262,7 @@ def causes_of(kinds: Sequence[type[Disturbance]]) -> tuple[Cause, ...]:
 
 
 class Outliers(Disturbance):
-    """Measurements whose errors are larger than stated, each one on its own; nobody says so.
+    """Measurements whose errors are larger than stated, each one on its own, and which is not reported.
 
     Its state is the standard deviation of this measurement's errors over that of usual ones, ``(N,)``.
 
@@ -360,7 +360,8 @@ class ColouredErrorsState(NamedTuple):
 
 
 class ColouredErrors(Disturbance):
-    """Errors that last from measurement to measurement, beside the white ones, at a fixed interval; nobody says so.
+    """Errors that last from measurement to measurement, beside the white ones, at a fixed interval, which is not
+    reported.
 
     Args:
         task: with its parameters.

@@ -1,8 +1,8 @@
-"""What estimates.
+"""Filters, and the likelihood that they report.
 
-A **filter** starts where everyone starts, predicts to every measurement, updates with it, and reports mean and
-covariance. Everything that competes is one: a bank of filters that a policy steers, an estimator of a user,
-a learned estimator, a reference that is told more, a bound. So there is one rollout and one compilation for all.
+A **filter** starts at the initial estimate given to every filter, predicts to every measurement, updates with it, and
+reports mean and covariance. Everything that competes is one: a bank of filters that a policy steers, an estimator of a
+user, a learned estimator, a reference that is given more, a bound. So there is one rollout and one compilation for all.
 
 State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last axis, and are never changed in place.
 """
@@ -49,7 +49,7 @@ class Likelihood(NamedTuple):
     nis: Array = None
     """Normalised innovation squared, ``(N,)``; None where it is not known."""
     nis_degrees: Array = None
-    """Numbers of the measurement that it counts, ``(N,)``; likewise."""
+    """Degrees of freedom of the NIS, ``(N,)``; None where they are not known."""
 
     @classmethod
     def of(cls, values: Any) -> "Likelihood":
@@ -78,7 +78,7 @@ class Stated(NamedTuple):
     components: tuple[bool, ...]
     """Which components it estimates, ``(C,)``."""
     deviations: tuple[bool, ...]
-    """Of which it says how large its errors are, ``(C,)``."""
+    """Components whose errors it estimates, ``(C,)``."""
 
 
 class EstimateState(NamedTuple):
@@ -153,7 +153,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         """
 
     def step(self, state: State, given: FilterInput) -> State:
-        """Predict to a measurement and take it in, where nobody acts between."""
+        """Predict to a measurement and take it in, without an action in between."""
         return self.update(self.predict(state, given.measurement), given)
 
     def mean(self, state: State) -> Array:
@@ -182,7 +182,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
         ``mode_probability``.
 
-        How well the measurement was predicted is told by ``log_likelihood`` (log-density of the measurement as it was
+        The quality of the prediction is reported by ``log_likelihood`` (log-density of the measurement as it was
         predicted, NaN where nothing was received), ``nis``, the normalised innovation squared, and ``nis_degrees``, its
         dimension. By default those of the state's ``likelihood``, if it has one.
         """

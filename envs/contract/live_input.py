@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .task import Task
 
 LARGEST = 1e15
-"""Of what a sensor says: nothing in SI units is larger here, and its square is still a number."""
+"""Largest reading of a sensor: nothing in SI units is larger here, and its square is still a number."""
 Memory = dict[str, Any]
 """What an input remembers of the measurements before: values by name."""
 
@@ -31,12 +31,12 @@ class LiveInput:
     Args:
         task: on NumPy arrays.
         initial: an initial estimate, for its names and shapes.
-        measurement: a measurement, likewise.
+        measurement: a measurement, for its shapes and types.
         tracks: how many come side by side, N.
 
     Attributes:
         values: names of what it takes at a measurement, and what they are.
-        start_values: likewise at the start, beside mean and covariance.
+        start_values: names and descriptions of the values at the start, beside mean and covariance.
         lanes: shape of the axis of tracks: ``(N,)``, or empty of one track.
     """
 
@@ -141,7 +141,7 @@ class LiveInput:
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 
     def _read_finite(self, given: Mapping[str, Any], name: str, like: numpy.ndarray, what: str) -> Any:
-        """Return a value as :meth:`read` does, rounded as the type of an array says.
+        """Return a value as :meth:`read` does, rounded to the type of an array.
 
         Raises:
             ValueError: for what is missing or not finite.

@@ -76,7 +76,7 @@ def check_deviations(readings: Readings, name: str, values: Any) -> None:
 
 
 NO_DEVIATIONS = "no column states deviations"
-"""How whoever assumes deviations begins to say so."""
+"""First words of the source of assumed deviations."""
 UNITS = {"azimuth_sigma": "degrees"}
 """Of deviations that are no metres."""
 
@@ -116,16 +116,16 @@ class TrackLog(NamedTuple):
     start: float
     """Time of the start of the track, s, as in the table."""
     time: numpy.ndarray
-    """Of the measurements, likewise, ``(T,)``."""
+    """Recording of each measurement, ``(T,)``."""
     notes: tuple[str, ...] = ()
     """What was done to the table, a line each."""
     typical: Mapping[str, float] = {}
     """Parameters that are a typical size of what the table states of its errors, and may differ from track to track;
-    nobody has set them."""
+    the user has not set them."""
     deviations: Mapping[str, float] = {}
     """Typical deviations of what was measured, in the names and units of the columns that state them, or would."""
     deviations_from: str = ""
-    """Who says so, in words."""
+    """Source of the deviations, in words."""
 
 
 class Predicted(NamedTuple):
@@ -218,7 +218,7 @@ class LogSetup(NamedTuple):
     deviations: dict[str, float]
     """Of measurements that state none, in the names and units of the columns."""
     deviations_from: str
-    """Who says so."""
+    """Source of the deviations."""
     origin: dict[str, float]
     """Latitude and longitude, degrees, and usual altitude, m, around which positions were made metres; empty where they
     were metres."""

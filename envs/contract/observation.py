@@ -1,7 +1,7 @@
 """What an agent is shown, written once: a list of blocks gives fields, observation and decoding.
 
 A :class:`Block` is one quantity of the observation: a function of what the filters know, and a
-:class:`Compression` that says how it is shown. The base class of the banks derives the observation from the
+:class:`Compression` with which it is shown. The base class of the banks derives the observation from the
 list, and a :class:`Reader` that gives a quantity back: policies never undo a compression by hand.
 """
 
@@ -104,7 +104,7 @@ KEPT_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LO
 def linear_scale(
     factor: float, offset: float = 0.0, limits: tuple[float, float] = (-math.inf, math.inf)
 ) -> Compression:
-    """``factor (x - offset)``, where the unit of the field says what is left to say.
+    """``factor (x - offset)``, where the unit of the field describes the rest.
 
     Args:
         factor: above zero.

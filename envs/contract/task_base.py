@@ -60,7 +60,7 @@ class TaskBase(ABC):
     ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
     closes_loop: bool
     """Whether an estimate decides what is measured next: where :meth:`.Task.feedback` is written, unless ``set_up``
-    says otherwise of the parameters; never in a recording."""
+    has other parameters; never in a recording."""
     world: Any
     """The :class:`~.world.World`, simulated or replayed."""
     noise: NoiseLayout
@@ -140,7 +140,7 @@ class TaskBase(ABC):
         """Seconds from one measurement to the next, where all of them are that far apart, and the first that far from
         the start of the track; None where they come at times of their own, or the times are not known.
 
-        It is the parameter ``sampling_interval`` where there is one, unless a recording says otherwise.
+        It is the parameter ``sampling_interval`` where there is one, unless a recording has another.
         """
         seconds: float | None = self._sampling_interval()
         if seconds is not None and self.recording is not None:

@@ -38,8 +38,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     reading_field: ClassVar[str] = ""
     """Field of the measurement that sensors read with errors; empty: the received field."""
     stated_field: ClassVar[str] = ""
-    """Field that states how large these errors are, variances where its name says so, else deviations; empty where a
-    measurement does not say."""
+    """Field that states how large these errors are, variances where its name contains the word, else deviations;
+    empty where a measurement does not say."""
     elapsed_field: ClassVar[str] = ""
     """Field with the s since the last measurement that was received; empty where there is none."""
     cost_remedy: ClassVar[str] = ""

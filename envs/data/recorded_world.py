@@ -22,7 +22,7 @@ class Replayed(NamedTuple):
     """Where an episode is in the tables of a recording."""
 
     number: Array
-    """Of the recording, ``(N,)``, as a float; likewise all that follows."""
+    """Of the recording, ``(N,)``, as a float, like all that follows."""
     count: Array
     """Measurements so far."""
     first: Array
@@ -39,12 +39,13 @@ class RecordedArrays(NamedTuple):
     truth: numpy.ndarray | None
     seconds: numpy.ndarray
     first: numpy.ndarray
-    """Column of the first measurement of each recording, ``(E,)``; likewise of the last."""
+    """Column of the first measurement of each recording, ``(E,)``, and column of the last."""
     last: numpy.ndarray
 
 
 def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """What a task of NumPy says of a start of the track, and one measurement; eight episodes side by side.
+    """Return an example of the start of the track and of a measurement, from a task of NumPy; eight episodes side by
+    side.
 
     Args:
         task: on NumPy arrays.
@@ -65,7 +66,7 @@ def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
 
 def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """What a task of NumPy says of a start of the track, and one measurement; arguments as of :func:`measure_examples`.
+    """Return an example of the start of the track and of a measurement; arguments of :func:`measure_examples`.
 
     Raises:
         ValueError: if what is measured depends on what is estimated.
@@ -73,7 +74,7 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
     if task.closes_loop:
         raise ValueError(
             f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
-            "what the sensors said to one estimate is not what they would have said to another, and can be neither "
+            "readings depend on the estimate in the loop, so that they can be neither "
             "recorded nor replayed"
         )
     return measure_examples(task, names)
@@ -114,11 +115,11 @@ class _ForeignWorld(World[Task, Any, Any]):
         return self.simulated.mask_missing(measurement)
 
     def component_readings(self, measurement: Any) -> Array | None:
-        """What it says of the components, as in the task's own world."""
+        """Return the readings of the components, as in the task's own world."""
         return self.simulated.component_readings(measurement)
 
     def component_deviations(self, measurement: Any) -> Array | None:
-        """What is stated of the errors of that, likewise."""
+        """Return the stated deviations of these readings, as in the task's own world."""
         return self.simulated.component_deviations(measurement)
 
     def error_cost(self, error: Array) -> Array:
@@ -127,7 +128,7 @@ class _ForeignWorld(World[Task, Any, Any]):
 
 
 class RecordedWorld(_ForeignWorld):
-    """What the sensors said, in place of a task's own world.
+    """Recorded readings, in place of a task's own world.
 
     Args:
         task: of which.
@@ -162,7 +163,7 @@ class RecordedWorld(_ForeignWorld):
         return Replayed(number, 0.0 * number, first, last), initial
 
     def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
-        """Go on to the next measurement; at the end the last one is said again."""
+        """Go on to the next measurement; at the end the last one is repeated."""
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
 
@@ -210,7 +211,7 @@ class RecordedWorld(_ForeignWorld):
 
 @dataclass(frozen=True)
 class Feed:
-    """Stands in a task in a recording's place: what is measured comes from outside, and nobody knows the truth.
+    """Stands in a task in a recording's place: measurements come from outside, and the truth is unknown.
 
     Args:
         regular: whether every measurement comes, one sampling interval after the one before.
@@ -243,7 +244,7 @@ class Feed:
 
 
 class Unknown(NamedTuple):
-    """Truth that nobody knows."""
+    """Unknown truth."""
 
 
 class LiveWorld(_ForeignWorld):
@@ -255,7 +256,7 @@ class LiveWorld(_ForeignWorld):
 
     Attributes:
         initial: an initial estimate, for its names, shapes and types.
-        measurement: a measurement, likewise.
+        measurement: a measurement, for its shapes and types.
     """
 
     def __init__(self, task: Task, second_sensor: bool) -> None:
@@ -283,7 +284,7 @@ class LiveWorld(_ForeignWorld):
         return fill_arrays(like, parts.__getitem__, self.xp)
 
     def state(self, truth: Unknown) -> Array:
-        """Raise ValueError: nobody knows it."""
+        """Raise ValueError: the truth is unknown."""
         raise ValueError(
             "the truth of what comes from outside is not known, so there is no error and no cost"
         )

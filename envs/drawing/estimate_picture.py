@@ -52,7 +52,7 @@ class EstimatePicture(Picture):
         """Return what the history keeps of a measurement.
 
         Args:
-            track: of the episode, as :meth:`.Model.picture_track` says it of one measurement, ``(K, ...)``.
+            track: of the episode, as :meth:`.Model.picture_track` returns it of one measurement, ``(K, ...)``.
             k: number of the measurement, from 0 on.
         """
         mean, P = track["estimate"][k], track["covariance"][k]
@@ -75,7 +75,7 @@ class EstimatePicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """No: nobody is shown one."""
+        """Return False: there is none to show."""
         return False
 
     def open(self, figure: Figure) -> None:

@@ -101,7 +101,7 @@ def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, 
 class Picture:
     """What is drawn of a task's episode.
 
-    This base class draws any task. A subclass says what it adds to the history (:meth:`records`), which
+    This base class draws any task. A subclass declares its additions to the history (:meth:`records`), which
     strips are drawn (:meth:`strips`), and may draw panels of its own into the figure's left part
     (:meth:`open`, :meth:`begin`, :meth:`draw`).
 
@@ -281,7 +281,7 @@ class EpisodePicture:
         self.mode = mode
         self.frames_per_second = frames_per_second
         self.caption = ""
-        """What the title says beside environment, scenario and control, such as the policy's name."""
+        """Part of the title beside environment, scenario and control, such as the policy's name."""
         self.picture: Picture = picture_of(model) if picture is None else picture
         self.history: dict[str, list[float]] = {}
         self.observations: list[numpy.ndarray] = []
@@ -536,7 +536,7 @@ def _moving(axes: Axes) -> list[Artist]:
 
 
 class _WindowError(Exception):
-    """A window cannot be opened; says why, and what to check."""
+    """A window cannot be opened; the message has the reason and the remedy."""
 
 
 def _missing_display() -> str:
@@ -544,7 +544,7 @@ def _missing_display() -> str:
     from matplotlib.backends.registry import BackendFilter, backend_registry
 
     try:
-        # Without a display pyplot falls back to "agg" when imported, or refuses, whatever MPLBACKEND says.
+        # Without a display pyplot falls back to "agg" when imported, or refuses, regardless of MPLBACKEND.
         from matplotlib import pyplot
 
         backend = str(pyplot.get_backend())

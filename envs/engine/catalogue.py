@@ -1,7 +1,7 @@
 """Which environments there are, and the modules that users name.
 
-Every folder in ``envs/`` that says an ``ID`` is an environment; its ``task.py`` says the class, ``TASK``, which is
-imported when somebody asks for it. Nothing else needs to know about it. A user's own are added by
+Every folder in ``envs/`` that defines an ``ID`` is an environment; its ``task.py`` defines the class, ``TASK``, which
+is imported when somebody asks for it. Nothing else needs to know about it. A user's own are added by
 :mod:`.registration`; :mod:`.scenario_choice` makes a task from names and keywords.
 """
 
@@ -65,7 +65,7 @@ def folders() -> dict[str, str]:
     return {package.ID: name for name, package in packages.items() if hasattr(package, "ID")}
 
 
-class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (a name says what it is)
+class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (the name describes it)
     """A keyword that an environment does not take: a TypeError as of any function, which clients look for who try
     whether an environment takes one, and a ValueError as for every other wrong name.
     """
@@ -87,7 +87,7 @@ def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None
 _SEARCH_FOLDERS: list[str] = []
 """Folders in which modules that a user names are looked for, after ``sys.path``."""
 FOUND_IN: list[str] = []
-"""Those of them in which one was found; other processes are told, see :mod:`..evaluation.parallel`."""
+"""Those of them in which one was found; other processes receive them, see :mod:`..evaluation.parallel`."""
 
 
 @contextmanager
@@ -131,7 +131,7 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
         with on_path(_SEARCH_FOLDERS):
             found = importlib.import_module(module)
     except Exception as error:  # a module is a program: it can raise anything
-        # A ValueError says all that there is to say.
+        # A ValueError is complete.
         line = "" if isinstance(error, ValueError) else own_line(error)
         raise ValueError(f"{refusal}: {type(error).__name__}: {error}{line}") from error
     places = (*getattr(found, "__path__", ()), getattr(found, "__file__", None) or "")

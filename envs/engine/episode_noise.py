@@ -185,7 +185,7 @@ class EpisodeNoise:
     def call_of_each(self) -> Call:
         """Return what goes on to the next measurement and makes its numbers at :attr:`address`.
 
-        It is for whoever goes on over several in native code, and is run at least once.
+        It serves native code that runs over several measurements, and is run at least once.
         """
         if self._due:
             _ = self.row

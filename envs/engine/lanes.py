@@ -311,13 +311,13 @@ class Lanes:
             lanes: in which, ascending; default: all.
         """
         task = self.task
-        everyone = lanes is None or len(lanes) == self.count
-        index = numpy.arange(self.count) if lanes is None or everyone else numpy.asarray(lanes)
+        is_whole = lanes is None or len(lanes) == self.count
+        index = numpy.arange(self.count) if lanes is None or is_whole else numpy.asarray(lanes)
         if not self._moving and self._report is not None:
             self._reporting(self._report)
         self._moving = self._moving or self._by_functions()
         own, *beside = self._moving
-        if everyone:
+        if is_whole:
             start = own.begin(identities, self.noise, beside)
         else:
             noise = self._noise_of_some(len(index))
@@ -405,7 +405,7 @@ class Lanes:
             measurements: after which they are left, a multiple of the decision interval; default: those of an episode.
 
         Returns:
-            Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of the policy.
+            Reports, arrays ``(measurements, ..., width)``, and the actions of the policy in the same form.
         """
         (stepper,) = self._reporting(report)
         assert isinstance(stepper, Stepper)

@@ -196,7 +196,7 @@ class Programs:
 
     @_ComputedOnce
     def unseen_predictions(self) -> tuple[Specialised, Specialised]:
-        """The filter at the first measurement and at later ones, where nobody looks at what it shows."""
+        """The filter at the first measurement and at later ones, where its observation is not used."""
         states = self.start[1].example()[0], self.first.update.example()[0]
         predict, measurement = self.function(_predict_unseen), self.later.episode.measurement
         return predict.specialise(states[0], measurement), predict.specialise(states[1], measurement)

@@ -16,7 +16,7 @@
   difference of small costs, and the logarithm of the ratio of large ones. So a few wild episodes, which rule the mean
   of the cost, do not hide what an action changes in all others.
 
-:attr:`.Reward.kind` of the task says which is the default.
+:attr:`.Reward.kind` of the task is the default.
 
 The counted cost is the cost, or the part of it that :meth:`.World.counted_cost` leaves. What an evaluation compares is
 the whole cost, neither compressed nor in another unit.
@@ -75,7 +75,7 @@ LIKELIHOOD_WEIGHTS = {"cost": 0.0, "cost-and-likelihood": 1.0}
 
 
 def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance: Array) -> Array:
-    """Return the expected reward, up to a constant, if the truth is distributed as a teacher says, ``(N,)``.
+    """Return the expected reward, up to a constant, if the truth has the distribution of a teacher, ``(N,)``.
 
     With d = x - m, the student's estimate less the teacher's, and their covariances P and S, the log-density is
     expected to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A cost is a square of errors, and adds that of the teacher's own

@@ -98,9 +98,9 @@ class Rollout:
 
     Attributes:
         action: of every measurement, ``(measurements, A, width)``, to be written before it is flown.
-        noise: likewise, ``(measurements, row width, width)``.
-        teacher: likewise, means ``(measurements, C, width)`` and covariances ``(measurements, C C, width)`` of a
-            teacher; nothing where there is none.
+        noise: of every measurement, ``(measurements, row width, width)``.
+        teacher: of every measurement, means ``(measurements, C, width)`` and covariances ``(measurements, C C, width)``
+            of a teacher; nothing where there is none.
         reward: of the last action, ``(width,)``.
         shown: last observation, ``(fields, width)``.
         reward_adjoint: gradient with respect to the reward, ``(width,)``, to be written.

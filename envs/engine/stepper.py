@@ -45,8 +45,8 @@ class Stepper:
         model: compiled.
         report: made of every episode after the action.
         width: lanes, a multiple of eight.
-        world_of: a stepper of the same task, both filters in an open loop. Its world is this one's too, and nobody
-            looks at what this one shows. Whatever is done with both is done with it first.
+        world_of: a stepper of the same task, both filters in an open loop. Its world is this one's too, and the
+            observation of this one is not used. Each call on both is made on it first.
 
     Attributes:
         action: applied at every step, ``(..., width)``.
@@ -362,8 +362,8 @@ class Stepper:
                 an action and the memory; a second run of the same episodes goes on. None: the action stays as it is.
 
         Returns:
-            The report on every measurement, in arrays ``(steps, ..., width)``, and the actions, likewise; None where
-            there is no policy.
+            The report on every measurement, in arrays ``(steps, ..., width)``, and the actions in the same form; None
+            where there is no policy.
         """
         if self._given:
             self._show_in(self._shown.copy())

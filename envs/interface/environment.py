@@ -37,7 +37,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
             given out.
-        context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
+        context: whether ``info["context"]`` holds what was drawn for the episode and what of it holds now
             (:meth:`.Task.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
             and of what is "privileged", the context and the error after the last action in units of its reported

@@ -3,9 +3,8 @@
 A task has one set of parameters. As long as all episodes are of one, the fleet is that task's
 :class:`~.lanes.Lanes`, and every call goes straight to them. Where scenarios are mixed, or a reset names another
 scenario or other parameters, every distinct set has a task and lanes of its own. A lane's next episode gets a free
-place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. A place that nobody
-has is stepped all the same and never looked at: a step costs what as many environments of each task cost as ever flew
-it at once.
+place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. An unused place is
+stepped all the same: a step costs as much as the largest number of environments of each task that ever flew it at once.
 
 What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the identity
 of the episode, see :mod:`.episode_noise`. So sub-environment i of N equals the single environment with the same seed,
@@ -44,7 +43,7 @@ class EpisodeDistribution(NamedTuple):
 
     def is_of(self, scenario: Any, parameters: Mapping[str, Any]) -> bool:
         """Whether it was made of these."""
-        if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long to be told
+        if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long for a message
             alike = scenario is self.scenario
         else:
             alike = repr(plain(self.scenario)) == repr(plain(scenario))
@@ -183,7 +182,7 @@ class Fleet:
         return part
 
     def _arrange(self) -> None:
-        """Forget lanes that nobody needs, and note where everybody is."""
+        """Remove unused lanes, and store the place of every environment."""
         needed = [
             model.task.parameters for distribution in self._distributions for model in distribution.models
         ]
@@ -201,7 +200,7 @@ class Fleet:
         for i in self._flying:
             own = numpy.flatnonzero(self._part == i)
             self._where[own] += first
-            # A place that nobody has takes the action of whoever comes first.
+            # An unused place takes the action of the first environment.
             source = numpy.full(self._parts[i].count, own[0])
             source[self._place[own]] = own
             self._sources.append(source)

@@ -15,7 +15,7 @@ from ..engine.lanes import Lanes
 class LatePicture:
     """The picture of one episode, which is flown again when somebody looks.
 
-    Libraries ask for a render mode of environments that nobody watches (Stable-Baselines3's ``make_vec_env`` always),
+    Libraries ask for a render mode of environments that are not shown (Stable-Baselines3's ``make_vec_env`` always),
     and keeping what is drawn takes far longer than a step. So only the actions are kept: they and its identity fix an
     episode.
 

@@ -31,8 +31,8 @@ def step_report(kind: str, errors: bool = False, details: bool = False, episode:
     Args:
         kind: of reward, one of :data:`.reward.OWN_REWARDS`.
         errors: whether error and covariance are asked about.
-        details: likewise.
-        episode: likewise.
+        details: whether ``info`` holds the details of the measurement.
+        episode: whether ``info`` holds the statistics of the episode.
     """
     reward = OWN_REWARDS[kind]
 
