@@ -26,7 +26,7 @@ RESERVED = ("all", "start", "other")
 
 
 class Moment(NamedTuple):
-    """What causes are computed from, at one measurement of N episodes."""
+    """State of N episodes at one measurement, from which causes are computed."""
 
     xp: ModuleType
     """Array namespace."""
@@ -105,7 +105,7 @@ def context_flag(name: str) -> Callable[[Moment], Array | None]:
 
 
 def _is_missed(moment: Moment) -> Array | None:
-    """Whether something that is available at other times is not, ``(N,)``."""
+    """Return whether something that is available at other times is not, ``(N,)``."""
     available = getattr(moment.measurement, "available", None)
     if available is None:
         return None
@@ -116,7 +116,7 @@ def _is_missed(moment: Moment) -> Array | None:
 
 
 def _is_outlier(moment: Moment) -> Array | None:
-    """Whether the error of a reading is beyond ``LARGE_ERROR`` stated deviations, ``(N,)``."""
+    """Return whether the error of a reading is beyond ``LARGE_ERROR`` stated deviations, ``(N,)``."""
     if moment.readings is None or moment.deviations is None:
         return None
     error = moment.xp.abs(moment.readings - moment.state)

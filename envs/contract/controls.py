@@ -1,4 +1,4 @@
-"""What an action means to a bank of filters: mode, weights, evidence; or factors of a filter's settings."""
+"""Controls of a bank of filters: mode, weights, evidence; or factors of a filter's settings."""
 
 import math
 from abc import abstractmethod
@@ -67,11 +67,11 @@ class SteerableFilter(Filter[TaskT, Measurement, State]):
     a new policy explores, costs a twentieth at most."""
 
     def heeds(self, measurement: Measurement) -> Array:
-        """One where an action does something, zero where nothing is measured, ``(N,)``."""
+        """Return one where an action has an effect, zero where nothing is measured, ``(N,)``."""
         return 1.0
 
     def examine(self, state: State, measurement: Measurement) -> Any:
-        """What it makes of a measurement without an action, of which a bank shows something; here its state after it.
+        """Return the result of a measurement without an action, from which a bank is observed; here the state after it.
 
         Args:
             state: after :meth:`predict`.
@@ -129,9 +129,9 @@ class SettingsBank(Bank[Any, Any, Any]):
         return state._replace(own=own, action=shown)
 
     def mean(self, state: Any) -> Array:
-        """That of the filter."""
+        """Return that of the filter."""
         return self.own.mean(state.own)
 
     def covariance(self, state: Any) -> Array:
-        """That of the filter."""
+        """Return that of the filter."""
         return self.own.covariance(state.own)

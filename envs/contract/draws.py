@@ -126,5 +126,5 @@ class StepSignal(NamedTuple):
 
 
 def within(time: Array, window: Array) -> Array:
-    """Whether a time lies in a window: not before its first row, but before its second one, ``(N,)``."""
+    """Return whether a time lies in a window: not before its first row, but before its second one, ``(N,)``."""
     return (time >= window[0]) & (time < window[1])

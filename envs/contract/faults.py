@@ -1,4 +1,4 @@
-"""What a world may do to its sensors: the parts that it lists, and the errors that more than one environment has."""
+"""Disturbances of sensors: the parts that a world lists, and the errors that more than one environment has."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +12,7 @@ from .task_base import TaskBase
 
 
 class DisturbanceInput(NamedTuple):
-    """A measurement, as a disturbance meets it."""
+    """A measurement on its way through the disturbances."""
 
     number: Array
     """Of the measurement, from 1 on, ``(N,)``."""
@@ -43,7 +43,7 @@ def undisturbed(draws: Draws, parameters: Any) -> Array | None:
 
 
 class Disturbance(ABC):
-    """One thing that a world may do to its sensors, with a name, draws, an effect and causes.
+    """A disturbance of sensors, with a name, draws, an effect and causes.
 
     It is drawn with the episode, moves on with every measurement, and acts through the methods that it defines: on the
     deviations of the white errors, on errors, on what is read, or on the whole measurement. What it has drawn and where
@@ -73,7 +73,7 @@ class Disturbance(ABC):
 
     @classmethod
     def is_in(cls, parameters: Any) -> bool:
-        """Whether a task of these parameters has it; by default every one has."""
+        """Return whether a task of these parameters has it; by default every one has."""
         return True
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Any:
@@ -248,11 +248,11 @@ class Disturbances:
         return changed, measurement
 
     def context(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """What all report of what was drawn."""
+        """Return the draws that all report."""
         return {name: v for part in self.parts for name, v in part.context(states[part.name]).items()}
 
     def records(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """What all report for an evaluation to keep."""
+        """Return the records of all."""
         return {name: v for part in self.parts for name, v in part.records(states[part.name]).items()}
 
 
@@ -306,12 +306,12 @@ class Glint(Outliers):
 
     @classmethod
     def is_in(cls, parameters: Any) -> bool:
-        """Whether any measurement may be one."""
+        """Return whether any measurement may be one."""
         return bool(parameters.glint_probability > 0.0)
 
     @staticmethod
     def limits(parameters: Any) -> tuple[float, float]:
-        """Those of glint."""
+        """Return the limits of glint."""
         return parameters.glint_probability, parameters.glint_factor
 
     def change_errors(self, state: Array, errors: Array) -> Array:
@@ -403,7 +403,7 @@ class ColouredErrors(Disturbance):
         return ColouredErrorsState(deviation, state.process._replace(kick=kick), level)
 
     def advance(self, state: ColouredErrorsState, step: DisturbanceInput) -> ColouredErrorsState:
-        """Let them wander."""
+        """Advance the errors by a measurement."""
         return (
             state._replace(level=state.process.advance(state.level, step.normals)) if self.normals else state
         )

@@ -42,7 +42,7 @@ class FilterInput(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """How well a filter has predicted a measurement."""
+    """Likelihood of a measurement under its prediction."""
 
     log_likelihood: Array
     """Log-density of the measurement as it was predicted, in nats, ``(N,)``; NaN where nothing was received."""
@@ -63,7 +63,7 @@ class Likelihood(NamedTuple):
 
     @classmethod
     def told(cls, records: Mapping[str, Array]) -> "Likelihood":
-        """What the records of a filter tell of it, see :meth:`Filter.records`; None for the rest."""
+        """Return the likelihood in the records of a filter, see :meth:`Filter.records`; None for missing parts."""
         return cls(*(records.get(name) for name in cls._fields))
 
     def fill_unknown(self, like: Array) -> "Likelihood":
@@ -73,7 +73,7 @@ class Likelihood(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """What is stated by a filter that does not always state everything; the rest is NaN."""
+    """Estimate of a filter that does not always report all of it; the rest is NaN."""
 
     components: tuple[bool, ...]
     """Which components it estimates, ``(C,)``."""
@@ -90,7 +90,7 @@ class EstimateState(NamedTuple):
 
 
 class Filter(ABC, Generic[TaskT, Measurement, State]):
-    """What estimates, batch last: arrays of N episodes are ``(..., N)``. Policies have the batch first.
+    """A filter, batch last: arrays of N episodes are ``(..., N)``. Policies have the batch first.
 
     Args:
         task: the estimation problem, with the constants that world and filter share.
@@ -116,17 +116,17 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """What the action may be; here there is none to choose."""
+        """Action space; here without a choice."""
         return gymnasium.spaces.Discrete(1)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What an agent is shown, of this state and the measurement, in order."""
+        """Observation blocks of this state and the measurement, in order."""
         return ()
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """What else a policy can read from an observation."""
+        """Further quantities that a policy can read from an observation."""
         return ()
 
     @abstractmethod
@@ -205,12 +205,12 @@ class Bank(Filter[TaskT, Measurement, State]):
     @property
     @abstractmethod
     def action_space(self) -> gymnasium.Space[Any]:
-        """What the action may be."""
+        """Action space."""
 
     @property
     @abstractmethod
     def blocks(self) -> Sequence[Block]:
-        """What the agent is shown, of this state and the measurement, in order."""
+        """Observation blocks of this state and the measurement, in order."""
 
     @abstractmethod
     def predict(self, state: State, measurement: Measurement) -> State:

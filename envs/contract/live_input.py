@@ -137,7 +137,7 @@ class LiveInput:
         return type(self.initial)(**found), {"time": time, "count": self.same_of_all(0.0)}
 
     def same_of_all(self, number: float, shape: tuple[int, ...] = ()) -> Any:
-        """One number in every place, ``(*shape, N)``, of one track ``shape``."""
+        """Return one number in every place, ``(*shape, N)``, of one track ``shape``."""
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 
     def _read_finite(self, given: Mapping[str, Any], name: str, like: numpy.ndarray, what: str) -> Any:
@@ -209,7 +209,7 @@ class LiveValues:
         self.values = values
 
     def has(self, *names: str) -> bool:
-        """Whether all of these are given."""
+        """Return whether all of these are given."""
         return all(self.values.get(name) is not None for name in names)
 
     def __getitem__(self, name: str) -> numpy.ndarray:
@@ -233,7 +233,7 @@ class LiveValues:
 
 
 class LiveReader(NamedTuple):
-    """How values that come one by one become measurements of a problem."""
+    """Conversion of single values to measurements of a problem."""
 
     input: type[LiveInput] = LiveInput
 

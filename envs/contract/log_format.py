@@ -1,4 +1,4 @@
-"""What sensors report, as rows of a table and as values that come live, and what an environment makes of a table."""
+"""Readings of sensors as rows of a table and as live values, and the reading of a table."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Column(NamedTuple):
 
     @property
     def live_text(self) -> str:
-        """What it is where it comes live."""
+        """Description of the live value."""
         return self.live or self.text
 
 
@@ -36,7 +36,7 @@ class Readings(Protocol):
     """Numbers by the names of their columns: n rows of a table, or what came for n tracks."""
 
     def has(self, *names: str) -> bool:
-        """Whether all of these are given."""
+        """Return whether all of these are given."""
         ...
 
     def __getitem__(self, name: str) -> numpy.ndarray:
@@ -44,7 +44,7 @@ class Readings(Protocol):
         ...
 
     def place(self, number: int) -> str:
-        """Where a number stands, such as "row 12"."""
+        """Return the place of a number, such as "row 12"."""
         ...
 
 
@@ -82,7 +82,7 @@ UNITS = {"azimuth_sigma": "degrees"}
 
 
 def is_assumed(words: str) -> bool:
-    """Whether words say of deviations that no column states them."""
+    """Return whether words say of deviations that no column states them."""
     return words.startswith(NO_DEVIATIONS)
 
 
@@ -138,7 +138,7 @@ class Predicted(NamedTuple):
 
 
 class PlainRows(NamedTuple):
-    """How the rows of a table are measurements as they stand, where no more is done to them: the ``Measurement`` has
+    """Rows of a table that are measurements without a conversion: the ``Measurement`` has
     ``values`` and ``available``, and perhaps ``interval`` and ``inputs``.
     """
 
@@ -155,7 +155,7 @@ class PlainRows(NamedTuple):
 
 
 class PlotRows(NamedTuple):
-    """How the rows of a table are plots of a track, which starts from the first two of them."""
+    """Rows of a table that are plots of a track, which starts from the first two of them."""
 
     farthest: float
     """m from the origin."""
@@ -207,7 +207,7 @@ class LogFormat:
 
 
 class LogSetup(NamedTuple):
-    """How the log was read that a filter is advised for: what one needs to feed the filter in the same way."""
+    """Reading of the log for which a filter is advised, so that the filter can be run on the same input."""
 
     interval: float
     """Median time between measurements, s: the filter was judged with a missed scan wherever more time passes."""
@@ -235,7 +235,7 @@ class LogSetup(NamedTuple):
 
     @property
     def plane(self) -> PlaneOrigin | None:
-        """That origin."""
+        """Origin of the plane."""
         return PlaneOrigin(**self.origin) if self.origin else None
 
     @property

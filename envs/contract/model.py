@@ -1,4 +1,4 @@
-"""What runs: a task with a filter in the loop.
+"""The model of an environment: a task with a filter in the loop.
 
 The engine, the Gymnasium classes and every evaluation step a :class:`Model`. Its methods are the clock of the task, see
 :mod:`.task`; on NumPy and torch they are the functions of world and filter one after another, and
@@ -71,7 +71,7 @@ class Model:
 
     @property
     def backend(self) -> str:
-        """What computes its steps: "numpy", "torch", or "compiled"."""
+        """Code that computes its steps: "numpy", "torch", or "compiled"."""
         return "torch" if "torch" in self.task.xp.__name__ else "numpy"
 
     def columns(self, names: Sequence[str]) -> list[int]:
@@ -144,7 +144,7 @@ class Model:
         return self.filter.update(state, FilterInput(measurement, truth, action))
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """What a filter gives back to the world, see :meth:`.Task.feedback`; None in an open loop."""
+        """Return the feedback of a filter to the world, see :meth:`.Task.feedback`; None in an open loop."""
         if not self.task.closes_loop:
             return None
         own = self.filter.feedback(state, measurement)
@@ -187,12 +187,12 @@ class Model:
         return self.filter.mean(episode.filter)
 
     def context(self, episode: Episode) -> dict[str, Array]:
-        """What was drawn for the episode, and what of it holds now: arrays of floats ``(..., N)``."""
+        """Return the draws of the episode, and those in force now: arrays of floats ``(..., N)``."""
         context = self.task.world.context(episode.truth)
         return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
 
     def moment(self, episode: Episode) -> Moment:
-        """What causes are computed from."""
+        """Return the moment from which causes are computed."""
         world, measurement = self.task.world, episode.measurement
         return Moment(
             self.task.xp,
@@ -204,7 +204,7 @@ class Model:
         )
 
     def causes(self, episode: Episode) -> Array:
-        """Which causes of the task hold, ``(N,)``, see :func:`.causes.cause_number`."""
+        """Return the causes of the task that hold, ``(N,)``, see :func:`.causes.cause_number`."""
         return cause_number(Causes.of(self.task).causes, self.moment(episode))
 
     def cost(self, episode: Episode) -> Array:
@@ -224,7 +224,7 @@ class Model:
         return self.filter.covariance(episode.filter)
 
     def track(self, episode: Episode) -> dict[str, Array]:
-        """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
+        """Return the data of a picture: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
         ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
         """
         measured = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
@@ -248,7 +248,7 @@ class Model:
         return {"truth": truth, **estimate}
 
     def records(self, episode: Episode) -> dict[str, Array]:
-        """What else an evaluation keeps of each measurement."""
+        """Return the further records of each measurement."""
         kept = {
             **self.filter.records(episode.filter, episode.measurement),
             **self.task.world.records(episode.truth),

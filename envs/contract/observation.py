@@ -1,4 +1,4 @@
-"""What an agent is shown, written once: a list of blocks gives fields, observation and decoding.
+"""Observations: a list of blocks gives fields, observation and decoding.
 
 A :class:`Block` is one quantity of the observation: a function of what the filters know, and a
 :class:`Compression` with which it is shown. The base class of the banks derives the observation from the
@@ -32,7 +32,7 @@ class Field(NamedTuple):
 
 
 class Compression(NamedTuple):
-    """How a value is shown, and how it is read back."""
+    """Compression of a value, and its inverse."""
 
     text: str
     """Put in front of the description of a block."""
@@ -59,7 +59,7 @@ PLAIN = Compression("", None, None)
 
 
 def within(low: float, high: float) -> Compression:
-    """As it is, where that cannot lie outside these limits."""
+    """Return no compression, for values that cannot lie outside these limits."""
     return Compression("", None, None, (low, high))
 
 
@@ -136,7 +136,7 @@ class Block(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """What can be computed from an observation, such as an innovation in metres."""
+    """Quantity that can be computed from an observation, such as an innovation in metres."""
 
     name: str
     unit: str
@@ -190,7 +190,7 @@ class Blocks:
         self._values = [block.value for block in self.blocks]
 
     def observe(self, state: Any, measurement: Any) -> Array:
-        """What is shown, ``(fields, N)``."""
+        """Return the observation, ``(fields, N)``."""
         xp = self.xp
         values = []
         for function in self._values:
@@ -254,7 +254,7 @@ class Blocks:
 
 
 class DecisionMeans:
-    """The fields that are shown as their means over the measurements for which a decision holds.
+    """Fields of the observation that are means over the measurements for which a decision holds.
 
     Args:
         fields: of the observation.
@@ -482,7 +482,7 @@ def last_weight_block(
 def availability_block(
     text: str = "1 where a value was received", parts: Sequence[str] = (), over_interval: Interval = "last"
 ) -> Block:
-    """Whether a measurement was received, its ``available``."""
+    """Return whether a measurement was received, its ``available``."""
     return Block(
         "available",
         lambda _, measurement: measurement.available,

@@ -23,7 +23,7 @@ import numpy
 
 @dataclasses.dataclass(frozen=True)
 class ParameterLimits:
-    """What must hold for a value beside its type; for each number where the value is a sequence."""
+    """Limits of a value beside its type; of each number where the value is a sequence."""
 
     above: float | None = None
     at_least: float | None = None
@@ -43,7 +43,7 @@ def parameter(default: Any, **limits: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class TaskParameters:
-    """What every task has. Subclasses may give other defaults, and check in :meth:`check` what one field's limits
+    """Parameters of every task. Subclasses may give other defaults, and check in :meth:`check` what one field's limits
     cannot say.
     """
 

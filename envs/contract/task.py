@@ -97,7 +97,7 @@ class PaperPolicy(NamedTuple):
 
 
 class Reward(NamedTuple):
-    """What an estimate costs, and how agents are rewarded for it."""
+    """Cost of an estimate, and the reward for it."""
 
     cost: str
     """What the cost is and its unit, in words."""
@@ -134,7 +134,7 @@ class Task(TaskBase):
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     reward: ClassVar[Reward]
-    """What an estimate costs, and how agents are rewarded for it."""
+    """Cost of an estimate, and the reward for it."""
     components: tuple[Component, ...]
     """What is estimated. This and the two attributes below may be set for each instance."""
     modes: tuple[str, ...] = ()
@@ -193,8 +193,8 @@ def field_texts(cls: type) -> dict[str, str]:
 
 
 def field_words(cls: type) -> dict[str, str]:
-    """The same of a single track in which the field exists: without shapes such as ``(2, N)``, and without a clause on
-    where it is None.
+    """Return the words for a single track in which the field exists: without shapes such as ``(2, N)``, and without a
+    clause on where it is None.
     """
     found = {}
     for name, text in field_texts(cls).items():

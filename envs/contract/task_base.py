@@ -1,4 +1,4 @@
-"""What follows from the declaration of a task: its constants, arrays, episodes and random numbers."""
+"""Derived parts of a task: its constants, arrays, episodes and random numbers."""
 
 import functools
 import importlib
@@ -16,7 +16,7 @@ from .observation import Array
 
 
 class NoiseLayout(NamedTuple):
-    """How many random numbers an episode takes.
+    """Numbers of random numbers of an episode.
 
     At its start these are ``uniforms`` numbers between 0 and 1 for the scenario and ``initial_normals`` standard normal
     ones for the start of the track, then one row for each measurement: ``normals`` standard normal numbers followed by
@@ -30,7 +30,8 @@ class NoiseLayout(NamedTuple):
 
 
 class TaskBase(ABC):
-    """What is computed of a task that is declared: its parameters on arrays, its world, and how its episodes run.
+    """Parts that are computed from the declaration of a task: its parameters on arrays, its world, and how its episodes
+    run.
 
     An author writes none of it; the declaration is :class:`~.task.Task`.
 
@@ -96,7 +97,7 @@ class TaskBase(ABC):
 
     @abstractmethod
     def _writes_feedback(self) -> bool:
-        """Whether the declaration gives something back to the world."""
+        """Return whether the declaration gives something back to the world."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Share the task: nothing in it changes."""
@@ -148,7 +149,7 @@ class TaskBase(ABC):
         return seconds
 
     def _sampling_interval(self) -> float | None:
-        """What the parameters say of the time between measurements, s; None where it differs."""
+        """Return the time between measurements by the parameters, s; None where it differs."""
         return getattr(self.parameters, "sampling_interval", None)
 
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:

@@ -1,4 +1,4 @@
-"""What is, and what the sensors say: the half of a task that is simulated, or replayed."""
+"""Truth and sensors: the half of a task that is simulated, or replayed."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,7 +16,7 @@ Measurement = TypeVar("Measurement")
 
 
 class World(ABC, Generic[TaskT, Truth, Measurement]):
-    """What is, and what the sensors say.
+    """Truth and sensors.
 
     Args:
         task: whose world it is, with the constants that both halves share.
@@ -133,7 +133,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.xp.sqrt(getattr(measurement, self.stated_field))
 
     def error_cost(self, error: Array) -> Array:
-        """What an error of the estimate costs where nothing else matters, ``(N,)``; :meth:`cost` then need not be
+        """Return the cost of an error of the estimate alone, ``(N,)``; :meth:`cost` then need not be
         written, and recordings of the task can be judged.
 
         Args:

@@ -40,7 +40,7 @@ SECONDS_OF_MEGABYTE = 0.5
 
 
 class ReadingLimits(NamedTuple):
-    """What reading one file may take."""
+    """Limits of reading one file."""
 
     memory: int
     """Bytes."""
@@ -109,7 +109,7 @@ def _size(count: int) -> str:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder of this name; not for a name that no folder can have."""
+    """Return whether there is a folder of this name; not for a name that no folder can have."""
     try:
         return path.is_dir()
     except (OSError, ValueError):  # a name that no file can have
@@ -183,7 +183,7 @@ _WARNED: list[bool] = []
 
 
 def _warn_without_limit() -> None:
-    """Say once where the system cannot limit the memory of a process."""
+    """Warn once where the system cannot limit the memory of a process."""
     if sys.platform != "linux" and not _WARNED:
         _WARNED.append(True)
         warnings.warn(

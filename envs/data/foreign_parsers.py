@@ -482,7 +482,7 @@ class _WithoutPandas:
 
 
 def _limit(memory: int, seconds: int) -> None:
-    """Let this process have no more memory than it has now and ``memory`` bytes, ``seconds`` of processor time, and
+    """Limit this process to it has now and ``memory`` bytes, ``seconds`` of processor time, and
     write no file.
     """
     try:
@@ -534,7 +534,7 @@ def _answer(handle: int, head: Any, arrays: Sequence[Any] = ()) -> None:
 
 
 def main() -> None:
-    """Answer the request in the first argument."""
+    """Parse the file of the request in the first argument."""
     request = json.loads(sys.argv[1])
     # Libraries print what they find strange: the answer has a channel of its own.
     answers = os.dup(1)

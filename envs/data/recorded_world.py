@@ -19,7 +19,7 @@ from ..contract.world import World
 
 
 class Replayed(NamedTuple):
-    """Where an episode is in the tables of a recording."""
+    """Place of an episode in the tables of a recording."""
 
     number: Array
     """Of the recording, ``(N,)``, as a float, like all that follows."""
@@ -100,7 +100,7 @@ def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
 
 
 class _ForeignWorld(World[Task, Any, Any]):
-    """What real sensors say, in place of a task's own world.
+    """Readings of real sensors, in place of a task's own world.
 
     Attributes:
         simulated: the task's own world, which knows what an error costs.
@@ -123,7 +123,7 @@ class _ForeignWorld(World[Task, Any, Any]):
         return self.simulated.component_deviations(measurement)
 
     def error_cost(self, error: Array) -> Array:
-        """What it costs in the task's own world."""
+        """Return the cost in the task's own world."""
         return self.simulated.error_cost(error)
 
 
@@ -168,7 +168,7 @@ class RecordedWorld(_ForeignWorld):
         return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
 
     def all_observations(self) -> tuple[Array | None, Array | None]:
-        """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
+        """Return the readings of the components in all measurements of all episodes, and its stated deviation,
         ``(C, measurements)``; None where it is no component.
         """
         columns = self.xp.arange(self.tables.seconds.shape[-1])
@@ -178,7 +178,7 @@ class RecordedWorld(_ForeignWorld):
         )
 
     def _column(self, truth: Replayed) -> Array:
-        """Of the measurement at hand."""
+        """Return the column of the present measurement."""
         xp = self.xp
         return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
 
@@ -187,7 +187,7 @@ class RecordedWorld(_ForeignWorld):
         return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
 
     def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
-        """A NamedTuple of arrays as one that was measured, from the tables."""
+        """Return a NamedTuple of arrays of the tables, in the form of another."""
         return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
 
     def state(self, truth: Replayed) -> Array:
@@ -205,7 +205,7 @@ class RecordedWorld(_ForeignWorld):
         return {"seconds": self._at(self.tables.seconds, self._column(truth))}
 
     def context(self, truth: Replayed) -> dict[str, Array]:
-        """Which recording it is."""
+        """Return the number of the recording."""
         return {"recording": truth.number}
 
 
@@ -231,7 +231,9 @@ class Feed:
     has_whole_truth: ClassVar[bool] = False
 
     def has_interval(self, seconds: float) -> bool:
-        """Whether measurements come that many seconds apart; where times do not matter to the filters, they do."""
+        """Return whether measurements come that many seconds apart; where times do not matter to the filters, they
+        do.
+        """
         return True
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
@@ -248,7 +250,7 @@ class Unknown(NamedTuple):
 
 
 class LiveWorld(_ForeignWorld):
-    """What comes from outside, in place of a task's own world: numbers of a measurement stand in place of its noise.
+    """Live measurements in place of a task's own world: numbers of a measurement stand in place of its noise.
 
     Args:
         task: whose world it is.
@@ -275,7 +277,9 @@ class LiveWorld(_ForeignWorld):
         return truth, self._fill(self.measurement, noise)
 
     def _fill(self, like: Any, numbers: Array) -> Any:
-        """A NamedTuple of arrays as another, of their numbers one array after the other, ``(numbers, N)``."""
+        """Return a NamedTuple of arrays in the form of another, of their numbers one array after the other,
+        ``(numbers, N)``.
+        """
         parts, first = {}, 0
         for name, array in named_arrays(like):
             last = first + math.prod(array.shape[:-1])

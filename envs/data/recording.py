@@ -153,7 +153,7 @@ class Recording(ScenarioData):
 
     @functools.cached_property
     def truth_known(self) -> numpy.ndarray:
-        """Which components of the truth are known at some measurement of every episode, booleans, ``(C,)``.
+        """Return whether each component of the truth is known at some measurement of every episode, ``(C,)``.
 
         The truth must not be None.
         """
@@ -171,7 +171,7 @@ class Recording(ScenarioData):
         return bool(numpy.isfinite(self.truth[there]).all())
 
     def has_interval(self, seconds: float) -> bool:
-        """Whether measurements come that many seconds apart, the first that far from the start of the track."""
+        """Return whether measurements come that many seconds apart, the first that far from the start of the track."""
         times = seconds * numpy.arange(1, self.seconds.shape[1] + 1)
         late = numpy.abs(self.seconds - times)
         # NaN beyond the end of a shorter episode. Times in a file are rounded.
@@ -295,7 +295,7 @@ class Recording(ScenarioData):
 
     @property
     def dataset(self) -> Any:
-        """As it stands in a file, an :class:`xarray.Dataset`."""
+        """Return the content of the file, an :class:`xarray.Dataset`."""
         return _dataset_of(self)
 
     def write(self, path: Any) -> None:

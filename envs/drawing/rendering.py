@@ -99,7 +99,7 @@ def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, 
 
 
 class Picture:
-    """What is drawn of a task's episode.
+    """Picture of an episode.
 
     This base class draws any task. A subclass declares its additions to the history (:meth:`records`), which
     strips are drawn (:meth:`strips`), and may draw panels of its own into the figure's left part
@@ -146,7 +146,7 @@ class Picture:
         return [*errors, Strip(f"action, {self.model.control}", named, limits, steps=discrete)]
 
     def shows_observation(self) -> bool:
-        """Whether a last strip shows every component of the observation as a colour."""
+        """Return whether a last strip shows every component of the observation as a colour."""
         return True
 
     def open(self, figure: Figure) -> None:
@@ -540,7 +540,7 @@ class _WindowError(Exception):
 
 
 def _missing_display() -> str:
-    """Say what keeps matplotlib from opening a window, and what to do; empty where nothing is known to."""
+    """Return why matplotlib cannot open a window, and the remedy; empty where no reason is known."""
     from matplotlib.backends.registry import BackendFilter, backend_registry
 
     try:

@@ -1,4 +1,4 @@
-"""What computes the steps of a task: code compiled for the processor, NumPy, or torch on a device."""
+"""Backends, which compute the steps of a task: code compiled for the processor, NumPy, or torch on a device."""
 
 from types import ModuleType
 from typing import Any

@@ -1,4 +1,4 @@
-"""Which environments there are, and the modules that users name.
+"""Catalogue of the environments, and the modules that users name.
 
 Every folder in ``envs/`` that defines an ``ID`` is an environment; its ``task.py`` defines the class, ``TASK``, which
 is imported when somebody asks for it. Nothing else needs to know about it. A user's own are added by
@@ -72,7 +72,7 @@ class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (the name describes 
 
 
 def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
-    """Say which name is unknown and what was probably meant."""
+    """Return an error for an unknown name, with the nearest known one."""
     return ValueError(f"unknown {kind} {quote_shortened(name)}: {_meant(name, valid)}")
 
 
@@ -92,7 +92,7 @@ FOUND_IN: list[str] = []
 
 @contextmanager
 def modules_from(folder: str) -> Iterator[None]:
-    """Let modules that a user names be found in a folder, too, and nothing else: a file there is no library."""
+    """Find modules that a user names in a folder, too, and no others: a file there is no library."""
     _SEARCH_FOLDERS.append(folder)
     try:
         yield
@@ -103,7 +103,7 @@ def modules_from(folder: str) -> Iterator[None]:
 
 @contextmanager
 def on_path(folders: Iterable[str]) -> Iterator[None]:
-    """Let folders stand at the end of ``sys.path`` for a while, where none of them hides a library."""
+    """Put folders at the end of ``sys.path`` for a while, where none of them hides a library."""
     further = [folder for folder in folders if folder not in sys.path]
     sys.path.extend(further)
     try:

@@ -25,7 +25,7 @@ from .programs import PROGRAM_CACHE_SIZE, Programs, Report, begin_world, start_f
 
 
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Let a method of a model run as code of the processor."""
+    """Compile a method of a model."""
 
     @functools.wraps(method)
     def run(self: "CompiledModel", episode: Episode) -> Any:
@@ -71,7 +71,7 @@ class CompiledModel(Model):
 
     @property
     def backend(self) -> str:
-        """What computes its steps."""
+        """Name of the backend."""
         return "compiled"
 
     def under(self, control: str) -> Model:
@@ -124,7 +124,7 @@ class CompiledModel(Model):
         return self.programs.filter_update(truth, state, measurement, action, threads=self.threads)[0]
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """What a filter gives back to the world."""
+        """Return the feedback of a filter to the world."""
         if self.filter.in_python:
             return super().feedback(state, measurement)
         return self.run(Model.feedback, state, measurement)
@@ -197,12 +197,12 @@ def warn_of(what: str, error: BaseException) -> None:
 
 
 def share_world(model: Any, other: Any) -> bool:
-    """Whether two compiled models are of one task, and neither filter gives anything back to its world."""
+    """Return whether two compiled models are of one task, and neither filter gives anything back to its world."""
     return model.task is other.task and model.programs.is_open_loop and other.programs.is_open_loop
 
 
 def can_step(model: Any, report: Report) -> bool:
-    """Whether a model's steps are compiled, and a report on them can be."""
+    """Return whether a model's steps are compiled, and a report on them can be."""
     if not isinstance(model, CompiledModel) or model.filter.in_python or report in model.programs.refused:
         return False
     try:

@@ -128,7 +128,7 @@ class EpisodeNoise:
         return numpy.concatenate([draw_identity(generators[lane]) for lane in lanes]).reshape(-1, 2).T
 
     def put(self, identities: numpy.ndarray) -> None:
-        """Let the first lanes have episodes of these identities, ``(2, lanes)``, before their start; the others are
+        """Put episodes of these identities, ``(2, lanes)``, into the first lanes before their start; the others are
         padding.
         """
         self.identities[:, : identities.shape[1]] = identities
@@ -160,7 +160,7 @@ class EpisodeNoise:
         return memory[normals:], memory[:normals]
 
     def take(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:
-        """Go on in some lanes with the first episodes of others."""
+        """Continue in some lanes with the first episodes of others."""
         self.identities[:, lanes] = other.identities[:, : len(lanes)]
         self.measurement[lanes] = other.measurement[: len(lanes)]
         if self._ahead is not None:
@@ -169,7 +169,7 @@ class EpisodeNoise:
     # --- their numbers
 
     def advance(self) -> None:
-        """Go on to the next measurement."""
+        """Advance to the next measurement."""
         if self._due:
             _ = self.row
         self._due, self._row = True, None
@@ -242,7 +242,7 @@ class EpisodeNoise:
         return copy.deepcopy({name: getattr(self, name) for name in _STATE_ATTRIBUTES})
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go on from a snapshot of the same task and as many lanes."""
+        """Continue from a snapshot of the same task and as many lanes."""
         self.__dict__.update(copy.deepcopy(snapshot))
         self._forget()
 

@@ -50,7 +50,7 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
 
 
 class EpisodeStepper(Protocol):
-    """What steps the episodes of a model: :class:`.Stepper` or :class:`ModelStepper`.
+    """Protocol of the steppers of a model: :class:`.Stepper` and :class:`ModelStepper`.
 
     ``others`` are steppers of the same kind, width and task. What is done with the first one is done with them beside
     it, on the same noise.
@@ -67,7 +67,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def load(self, episode: Episode, shown: Array = None) -> None:
-        """Go on from other episodes; what they show, ``(fields, width)``, is observed from them unless it is given."""
+        """Continue from other episodes; their observation, ``(fields, width)``, is computed unless it is given."""
         ...
 
     def episode(self) -> Episode:
@@ -79,7 +79,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def decide(self, noise: EpisodeNoise, others: Any) -> None:
-        """Answer all measurements of a decision by the action, and report on each."""
+        """Take in all measurements of a decision with the action, and report on each."""
         ...
 
     def reports(self) -> list[Any]:
@@ -92,7 +92,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def observation_by_field(self) -> Array:
-        """What is shown, ``(fields, width)``, until the next decision."""
+        """Return the observation, ``(fields, width)``, valid until the next decision."""
         ...
 
     def observation(self, count: int) -> Array:
@@ -151,7 +151,7 @@ class ModelStepper:
         return uniforms, normals
 
     def load(self, episode: Episode, shown: Array = None) -> None:
-        """Go on from other episodes; what they show is observed from them unless it is given."""
+        """Continue from other episodes; their observation is computed unless it is given."""
         self._episode, self.shown = episode, shown
 
     def begin_some(
@@ -195,7 +195,7 @@ class ModelStepper:
         self.take(action[None])
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
-        """Answer all measurements of a decision by the action, see :meth:`.Stepper.decide`."""
+        """Take in all measurements of a decision with the action, see :meth:`.Stepper.decide`."""
         means = DecisionMeans(self.model.fields, self.model.task.decision_interval)
         total: Any = 0.0
         for each in (self, *others):
@@ -233,7 +233,7 @@ class ModelStepper:
         return self.observation(1)[0]
 
     def observation_by_field(self) -> Array:
-        """What is shown, ``(fields, width)``."""
+        """Return the observation, ``(fields, width)``."""
         if self.shown is None:
             self.shown = self.model.observe(self._episode)
         return self.shown
@@ -463,7 +463,7 @@ class Lanes:
         return after
 
     def _settle(self) -> list[ModelStepper]:
-        """Let the models' functions step the episodes, in arrays of their own; returns what does."""
+        """Return steppers that run the episodes by the functions of the models, in arrays of their own."""
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
@@ -535,7 +535,7 @@ class Lanes:
         return {"count": self.count, "episodes": self._episodes(), "noise": self.noise.snapshot(), **kept}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go on from a snapshot of lanes of the same task.
+        """Continue from a snapshot of lanes of the same task.
 
         Raises:
             ValueError: if their number differs.
@@ -548,7 +548,7 @@ class Lanes:
         self._load(snapshot["episodes"])
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
+        """Shorten the episodes that have just begun in some lanes by so many decisions, to one at least."""
         self.decisions[list(lanes)] = numpy.minimum(decisions, self._lengths[list(lanes)] - 1)
 
     @property

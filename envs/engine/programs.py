@@ -1,4 +1,4 @@
-"""What is traced and compiled of a model: the parts of a step, and its reports.
+"""Compiled programs of a model: the parts of a step, and its reports.
 
 A step has four parts. Apart, because scenarios differ in the world, controls in the action and callers in the report:
 what is long, world and filter, is compiled once for all of them.
@@ -85,7 +85,7 @@ class _ComputedOnce:
 
 
 class Programs:
-    """What is traced of a task, for all that have its parameters.
+    """Traced programs of a task, shared by all models with its parameters.
 
     Args:
         traced: the task on traced arrays.
@@ -139,19 +139,19 @@ class Programs:
 
     @_ComputedOnce
     def filter_update(self) -> CompiledFunction:
-        """The filter with the measurement; a part of it that stays is not written again."""
+        """Return the program of the filter update; a part of it that stays is not written again."""
         return self.function(_update, unchanged=None)
 
     @_ComputedOnce
     def world_advance(self) -> CompiledFunction:
-        """The world; a part of the truth that stays is not written again."""
+        """Return the program of the world; a part of the truth that stays is not written again."""
         if self._of_world is not self:
             return self._of_world.world_advance
         return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
 
     @_ComputedOnce
     def filter_prediction(self) -> CompiledFunction:
-        """The filter at the next measurement."""
+        """Return the program of the filter prediction."""
         return self.function(_predict, turned=True)
 
     @_ComputedOnce
@@ -196,7 +196,7 @@ class Programs:
 
     @_ComputedOnce
     def unseen_predictions(self) -> tuple[Specialised, Specialised]:
-        """The filter at the first measurement and at later ones, where its observation is not used."""
+        """Return the filter predictions at the first and at later measurements, without an observation."""
         states = self.start[1].example()[0], self.first.update.example()[0]
         predict, measurement = self.function(_predict_unseen), self.later.episode.measurement
         return predict.specialise(states[0], measurement), predict.specialise(states[1], measurement)
@@ -226,7 +226,7 @@ class Programs:
         return Parts(update, advance, predict, Episode(following, measurement, predicted))
 
     def report_program(self, report: Report) -> Specialised:
-        """A report on an episode.
+        """Return the program of a report.
 
         Raises:
             NotTraceable: if it is no straight line of arithmetic.

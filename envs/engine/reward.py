@@ -119,7 +119,7 @@ REWARDS = tuple(kind for kind in OWN_REWARDS if kind != "none")
 
 
 class RewardBaseline(NamedTuple):
-    """What runs beside every episode on the same noise, for rewards that are relative."""
+    """Baseline beside every episode on the same noise, for relative rewards."""
 
     model: Model
     """The same task, under a control."""

@@ -19,7 +19,7 @@ from .reward import OWN_REWARDS, teacher_reward
 
 
 class TrainingObjective(NamedTuple):
-    """What the gradient is of."""
+    """Function whose gradient is computed."""
 
     kind: str
     """Of reward."""
@@ -160,11 +160,11 @@ class Rollout:
         self._flown += 1
 
     def backward_from_here(self) -> None:
-        """Let the gradient with respect to the episodes as they are now be zero."""
+        """Set the gradient with respect to the present episodes to zero."""
         self._backward[0].arrays[self._adjoint][...] = 0.0
 
     def backward(self, measurement: int) -> None:
-        """Go back over a measurement, the last one first."""
+        """Propagate the gradient back over a measurement, the last one first."""
         backward = self._backward[0]
         backward.table[self._addresses] = self._places[measurement]
         backward(0, self._width)

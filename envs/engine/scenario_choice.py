@@ -1,4 +1,4 @@
-"""How a task is made from names and keywords: what a user may give as scenario."""
+"""Choice of a task by names and keywords, and of its scenario."""
 
 import math
 import re

@@ -159,7 +159,7 @@ class Stepper:
         self._action_place, self._report_place = len(update.inputs) - 1, len(tell.inputs)
 
     def load(self, episode: Episode, shown: Array = None) -> None:
-        """Go on from other episodes, which show what is given, ``(fields, width)``."""
+        """Continue from other episodes with this observation, ``(fields, width)``."""
         own = zip(self._copies[self._now], leaves(episode), strict=True)
         for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values.reshape(memory.shape)
@@ -268,7 +268,7 @@ class Stepper:
         self._first_action[...] = action
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
-        """Answer all measurements of a decision by the action, and report on each; others do so beside it.
+        """Take in all measurements of a decision with the action, and report on each; others do so beside it.
 
         A tile of lanes goes through all of it, with the others, as one native call.
         """
@@ -334,7 +334,7 @@ class Stepper:
     def _tiled(
         self, turns: Sequence[Sequence[Call]], others: "Sequence[Stepper]" = ()
     ) -> list[tuple[Call, int, int]]:
-        """Where calls have arrays of the first tile of lanes, as :class:`.CallSequence` takes it."""
+        """Return the places of arrays of the first tile of lanes in the calls, as :class:`.CallSequence` takes it."""
         apart = {id(array): hop for each in (self, *others) for array, hop in each._apart}
         calls = [call for turn in turns for call in turn]
         places = [(call, place, apart.get(id(a), 0)) for call in calls for place, a in enumerate(call.arrays)]
@@ -353,7 +353,7 @@ class Stepper:
         return calls
 
     def run(self, noise: EpisodeNoise, steps: int, compiled_policy: Specialised | None) -> tuple[Any, Any]:
-        """Go through many measurements without going back to Python between them.
+        """Run over many measurements without returning to Python between them.
 
         Args:
             noise: of the measurements.
@@ -427,7 +427,7 @@ class Stepper:
         return self.reported[0] if self._interval > 1 else self.reported[0].copy()
 
     def observation_by_field(self) -> numpy.ndarray:
-        """What is shown, ``(fields, width)``, until the next step."""
+        """Return the observation, ``(fields, width)``, valid until the next step."""
         return self._shown.T
 
     def observation(self, count: int) -> numpy.ndarray:
@@ -447,7 +447,7 @@ class Stepper:
 
 
 class _Bound(NamedTuple):
-    """What is run as one native call, from either of the two copies of the episodes."""
+    """One native call, from either of the two copies of the episodes."""
 
     draw: Call
     """What makes the noise of a measurement."""

@@ -170,7 +170,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
 
     @property
     def picture(self) -> "EpisodePicture | None":
-        """What keeps and draws the episode, up to date; None without a render mode."""
+        """Picture of the episode, up to date; None without a render mode."""
         return None if self._late is None else self._late.picture
 
     def render(self) -> numpy.ndarray | None:

@@ -29,7 +29,7 @@ ROOM = 8
 
 
 class EpisodeDistribution(NamedTuple):
-    """What the coming episodes of a lane are drawn from."""
+    """Distribution of the coming episodes of a lane."""
 
     scenario: Any
     """As it was asked for."""
@@ -42,7 +42,7 @@ class EpisodeDistribution(NamedTuple):
     """Which sum to one."""
 
     def is_of(self, scenario: Any, parameters: Mapping[str, Any]) -> bool:
-        """Whether it was made of these."""
+        """Return whether it was made of these."""
         if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long for a message
             alike = scenario is self.scenario
         else:
@@ -300,7 +300,7 @@ class Fleet:
         return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
+        """Shorten the episodes that have just begun in some lanes by so many decisions, to one at least."""
         for lane, by in zip(lanes, decisions, strict=True):
             self._parts[self._part[lane]].shorten([int(self._place[lane])], by)
 
@@ -320,7 +320,7 @@ class Fleet:
         return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go on from a snapshot of lanes of the same tasks.
+        """Continue from a snapshot of lanes of the same tasks.
 
         Raises:
             ValueError: if their number differs.

@@ -1,4 +1,4 @@
-"""What no policy can know, for critics in training: the episode's context, and how wrong the estimate is.
+"""Privileged information for critics in training: the episode's context, and how wrong the estimate is.
 
 A critic may be given more than the policy that it judges (asymmetric actor and critic; Pinto et al., 2018): it is
 needed in training only. The environment keeps the two apart and declares in its metadata that it is privileged.

@@ -1,4 +1,4 @@
-"""What an environment asks about every measurement, after the action."""
+"""Report of an environment on every measurement, after the action."""
 
 import functools
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from ..engine.reward import OWN_REWARDS
 
 
 class StepReport(NamedTuple):
-    """What is asked about, lanes last; the rest is None."""
+    """Requested quantities, lanes last; the others are None."""
 
     reward: Array
     """``(N,)``; of a relative reward before the reference's is taken away."""
