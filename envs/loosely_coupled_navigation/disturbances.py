@@ -34,7 +34,7 @@ def _is_unreported(moment: Moment) -> Array | None:
 
 
 def _within(window: str, phrase: str) -> Cause:
-    """Cause that holds in a window of the context."""
+    """Return the cause that holds in a window of the context."""
 
     def holds(moment: Moment) -> Array | None:
         return within(moment.measurement.number, moment.context[window]) if moment.knows(window) else None
@@ -43,7 +43,7 @@ def _within(window: str, phrase: str) -> Cause:
 
 
 def number_at(time: Array, parameters: LooselyCoupledNavigationParameters) -> Array:
-    """Number of the measurement nearest to a time in s."""
+    """Return the number of the measurement nearest to a time in s."""
     return namespace(time).round(time / parameters.sampling_interval)
 
 
@@ -233,7 +233,7 @@ class Jamming(_Hidden):
         return self.xp.where(jammed, state.strength * deviations, deviations)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Window and strength."""
+        """Return the window and strength."""
         return {**super().context(state), "jamming_gain": state.strength}
 
 
@@ -258,7 +258,7 @@ class Spoofing(_Hidden):
         return state, reading + self.pull(state) if self.probability else reading
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Window and rate."""
+        """Return the window and rate."""
         return {**super().context(state), "spoofing_rate": state.strength}
 
 

@@ -166,7 +166,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return FaultState(initial.mean, initial.covariance, memory, Likelihood.unknown(none))
 
     def give_birth(self, free: Hypotheses) -> Hypotheses:
-        """Hypotheses of all noises but the modelled ones that are pulled from here on, ``(J - 1, 1)``."""
+        """Return the hypotheses of all noises but the modelled ones that are pulled from here on, ``(J - 1, 1)``."""
         xp = self.xp
         none = 0.0 * free.weights[1:]
         P = faults.FaultCovariance(
@@ -181,13 +181,15 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
 
     def since_onset(self, number: Array) -> Array:
-        """Measurements since the onset of each hypothesis of a pull, ``(B, N)``, at the number of a measurement."""
+        """Return the measurements since the onset of each hypothesis of a pull, ``(B, N)``, at the number of a
+        measurement.
+        """
         cycle = 1.0 * self.spacing * self.prior.onsets
         since = number - self.onsets
         return since - cycle * self.xp.floor(since / cycle)
 
     def age(self, number: Array) -> Array:
-        """Age of each pull, s, ``(B, N)``: a pull begins in the middle between two hypotheses."""
+        """Return the age of each pull, s, ``(B, N)``: a pull begins in the middle between two hypotheses."""
         return self.interval * (self.since_onset(number) + 0.5 * (self.spacing + 1))
 
     def change(self, free: Hypotheses, pulled: Hypotheses, number: Array) -> tuple[Hypotheses, Hypotheses]:
@@ -264,8 +266,8 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
     def apply_factors(
         self, predicted: Memory, measurement: Measurement, logarithms: Array
     ) -> tuple[Memory, Weighing]:
-        """Hypotheses with the noises of a step multiplied by factors of these logarithms, ``(6, N)``, and how a fix
-        weighs them with all factors.
+        """Return the hypotheses with the noises of a step multiplied by factors of these logarithms, ``(6, N)``,
+        and how a fix weighs them with all factors.
         """
         xp = self.xp
         receiver, *noises = xp.exp(logarithms[3:])
@@ -451,12 +453,12 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
 
 
 def _exponential(power: Any) -> Any:
-    """Exponential of a number, or of each of an array."""
+    """Return the exponential of a number, or of each of an array."""
     return math.exp(power) if isinstance(power, int | float) else namespace(power).exp(power)
 
 
 def _flat(h: Hypotheses) -> list[Array]:
-    """Arrays of a covariance in a row."""
+    """Return the arrays of a covariance in a row."""
     return [*h.covariance.ins, h.covariance.cross, h.covariance.faults]
 
 
@@ -487,7 +489,7 @@ def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.Fau
 
 
 def add_noise(h: Hypotheses, steps: Sequence[faults.FaultCovariance], factors: Sequence[Array]) -> Hypotheses:
-    """Predicted hypotheses with the noises of a step multiplied, each by its factor, ``(N,)``."""
+    """Return the predicted hypotheses with the noises of a step multiplied, each by its factor, ``(N,)``."""
     inertial, wandering = steps
     more, further = (factor - 1.0 for factor in factors)
     ins = (P + more * Q for P, Q in zip(h.covariance.ins, inertial.ins, strict=True))

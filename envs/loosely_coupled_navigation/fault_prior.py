@@ -78,8 +78,9 @@ a few percent less, and errs by nearly twice the variance that it states (ANEES 
 
 
 def spread_points(points: int, dimensions: int) -> numpy.ndarray:
-    """Points that fill the unit cube evenly, ``(points, dimensions)``: the Kronecker sequence of the powers of the
-    root of ``x^(d + 1) = x + 1`` (Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
+    """Return the points that fill the unit cube evenly, ``(points, dimensions)``: the Kronecker sequence of the
+    powers of the root of ``x^(d + 1) = x + 1`` (Roberts, "The unreasonable effectiveness of quasirandom
+    sequences", 2018).
     """
     root = 2.0
     for _ in range(60):
@@ -106,7 +107,7 @@ class Noises(NamedTuple):
 
 
 def draw_noises(prior: FaultPrior, p: LooselyCoupledNavigationParameters) -> Noises:
-    """Points of noises, the modelled one first, ``(J,)`` each."""
+    """Return the points of noises, the modelled one first, ``(J,)`` each."""
     interval = p.sampling_interval
     unit = spread_points(prior.points, 5).T
 

@@ -117,7 +117,9 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         )
 
     def group(self, weights: Array, age: Array) -> Array:
-        """Probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``, and of the age of pulls, s."""
+        """Return the probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``, and of the age of
+        pulls, s.
+        """
         xp, points, onsets = self.xp, self.own.prior.points, self.own.prior.onsets
         free = weights[: 1 + points]
         pulled = xp.reshape(weights[1 + points :], (points, onsets, weights.shape[-1]))

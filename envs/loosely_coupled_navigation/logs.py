@@ -38,7 +38,7 @@ def measure(
     sigma: numpy.ndarray,
     p: Any,
 ) -> dict[str, numpy.ndarray]:
-    """Arrays of a measurement, of n rows of a table or of n tracks; a fix of some axes is none.
+    """Return the arrays of a measurement, of n rows of a table or of n tracks; a fix of some axes is none.
 
     Args:
         number: of the measurement, ``(n,)``.

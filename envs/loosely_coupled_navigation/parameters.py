@@ -211,6 +211,6 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         )
 
     def prior_covariance(self, none: Array) -> ins_gnss.AugmentedCovariance:
-        """Covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
+        """Return the covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
         drift, coloured = none + self.drift**2, none + self.coloured**2
         return ins_gnss.AugmentedCovariance(none, none, none, drift, none, coloured)

@@ -71,8 +71,8 @@ class Clutter(Disturbance):
         )
 
     def count(self, uniform: Array, density: Array) -> Array:
-        """Poisson number of false plots in the window, one less than slots at most, by the inverse of its cumulative
-        distribution, ``(N,)``.
+        """Return the Poisson number of false plots in the window, one less than slots at most, by the inverse of
+        its cumulative distribution, ``(N,)``.
         """
         mean = density * self.parameters.window_area
         term = self.xp.exp(-mean)
@@ -128,8 +128,8 @@ class Clutter(Disturbance):
         )
 
     def predict(self, track: ReportedTrack, interval: Array, elapsed: Array) -> tuple[Array, Array]:
-        """Position that is expected, ``(2, N)``, and its covariance, ``(2, 2, N)``: at constant velocity, but for an
-        acceleration of ``gate_acceleration`` since the last plot.
+        """Return the position that is expected, ``(2, N)``, and its covariance, ``(2, 2, N)``: at constant
+        velocity, but for an acceleration of ``gate_acceleration`` since the last plot.
         """
         P, T = track.covariance, interval
         centre = track.mean[:2] + T * track.mean[2:]
@@ -139,7 +139,7 @@ class Clutter(Disturbance):
         return centre, carried + left * identity
 
     def context(self, state: ClutterState) -> dict[str, Array]:
-        """False plots per square kilometre."""
+        """Return the false plots per square kilometre."""
         return {"clutter_density": 1e6 * state.density}
 
     def records(self, state: ClutterState) -> dict[str, Array]:

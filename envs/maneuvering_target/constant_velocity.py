@@ -28,7 +28,8 @@ class ConstantVelocityModel:
         self.identity: Array = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
 
     def motion(self, T: Array) -> tuple[Array, Array]:
-        """Transition matrix, and covariance of the process noise by an acceleration of 1 m/s^2, over intervals.
+        """Return the transition matrix, and covariance of the process noise by an acceleration of 1 m/s^2, over
+        intervals.
 
         Args:
             T: s, ``(N,)``.
@@ -54,8 +55,9 @@ class ConstantVelocityModel:
     def update_estimate(
         self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
     ) -> kalman.Update:
-        """Kalman's update of a predicted mean and covariance with the measured position, or these themselves, which say
-        nothing of how likely they are; H is that of the position unless another one is given.
+        """Return Kalman's update of a predicted mean and covariance with the measured position, or these
+        themselves, which say nothing of how likely they are; H is that of the position unless another one is
+        given.
         """
         H = self.H if H is None else H
         result = kalman.update(*predicted, measurement.position, H, self.identity * measurement.variance)

@@ -48,12 +48,13 @@ class Course(ABC):
 
     @abstractmethod
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
-        """Motion at a scan from that at the one before, both on time."""
+        """Return the motion at a scan from that at the one before, both on time."""
 
     def motion_at_early_scan(
         self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Motion at a scan that comes early by a share of the scan period; here :meth:`advance` knows every time.
+        """Return the motion at a scan that comes early by a share of the scan period; here :meth:`advance` knows every
+        time.
 
         Args:
             flight: of :meth:`begin`.
@@ -95,7 +96,7 @@ class Course(ABC):
 
 
 def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
-    """Motion after a time (s) on a circle, or a straight line, at constant speed; ``turn`` in rad/s."""
+    """Return the motion after a time (s) on a circle, or a straight line, at constant speed; ``turn`` in rad/s."""
     state = coordinated_turn.propagate(task.xp.concat([*motion, turn[None]]), time)
     return state[:2], state[2:4]
 
@@ -145,7 +146,7 @@ class Maneuvered(Course):
     def motion_at_early_scan(
         self, flight: Maneuvers, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Thrust is constant within a period, and so is the turn rate."""
+        """Return the thrust is constant within a period, and so is the turn rate."""
         T = self.parameters.sampling_interval
         time = T * (1.0 - early)
         turn, acceleration = (
@@ -181,7 +182,9 @@ class Maneuvered(Course):
         return ordered_sum(values[..., slot, :] for slot in range(values.shape[-2]))
 
     def context(self, flight: Maneuvers, scan: Array, time: Array) -> dict[str, Array]:
-        """First and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre; whether one is flown now."""
+        """Return the first and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre; whether one is
+        flown now.
+        """
         xp = self.xp
         # A manoeuvre that is not flown lies beyond the end.
         flown = flight.first <= self.parameters.horizon + 1
@@ -317,7 +320,7 @@ class Legs(NamedTuple):
 
 
 def _times(one: Array, other: Array) -> Array:
-    """Product of vectors ``(2, N)`` taken for complex numbers."""
+    """Return the product of vectors ``(2, N)`` taken for complex numbers."""
     return namespace(one).stack(
         [one[0] * other[0] - one[1] * other[1], one[0] * other[1] + one[1] * other[0]]
     )
@@ -354,7 +357,9 @@ class LegCourse(Course):
         return Legs(xp.stack(begins)), start
 
     def advance(self, flight: Legs, scan: Array, motion: Motion) -> Motion:
-        """Motion at a scan, or between two: any number. The legs say where it is then, whatever was before."""
+        """Return the motion at a scan, or between two: any number. The legs say where it is then, whatever was
+        before.
+        """
         now = self.parameters.sampling_interval * scan
         leg = StepSignal(flight.begins, flight.time[1:]).at(now, self.xp)
         return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
@@ -403,7 +408,7 @@ class Table(Course):
         return on_time
 
     def _states(self, column: Array) -> Motion:
-        """States in a column of the table, a float, ``(2, N)`` each."""
+        """Return the states in a column of the table, a float, ``(2, N)`` each."""
         row = self.xp.astype(column, self.xp.int64)
         return self.table[:2, row], self.table[2:, row]
 
@@ -438,7 +443,7 @@ class TableOfSeveral(Table):
         return self._states(self.xp.minimum(flight.first + scan, flight.last))
 
     def context(self, flight: Tracks, scan: Array, time: Array) -> dict[str, Array]:
-        """Number of the flight."""
+        """Return the number of the flight."""
         return {"flight": flight.number}
 
 

@@ -105,7 +105,7 @@ class HypothesesBank(SettingsBank, RadarBank):
         return HypothesesState(own, own.likelihood, action, none, none, groups, groups, none[0])
 
     def group(self, probabilities: Array) -> Array:
-        """Probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``."""
+        """Return the probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``."""
         return self.xp.stack(
             [ordered_sum(probabilities[h] for h in members) for members in self.groups.values()]
         )

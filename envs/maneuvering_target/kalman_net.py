@@ -84,12 +84,14 @@ STANDING = 1e-3
 
 
 def speed_of(velocity: Array, least: float = STANDING) -> Array:
-    """Speed, ``(N,)``, smoothly never below the least, m/s."""
+    """Return the speed, ``(N,)``, smoothly never below the least, m/s."""
     return (velocity[0] * velocity[0] + velocity[1] * velocity[1] + least**2) ** 0.5
 
 
 def frame_of(velocity: Array) -> Array:
-    """Rows of U^T: the direction of a velocity, and the one to its left, ``(2, 2, N)``; of what stands, the axes."""
+    """Return the rows of U^T: the direction of a velocity, and the one to its left, ``(2, 2, N)``; of what stands,
+    the axes.
+    """
     xp = namespace(velocity)
     moves = velocity[0] * velocity[0] + velocity[1] * velocity[1] > STANDING**2
     direction = velocity / speed_of(velocity)
@@ -100,7 +102,7 @@ def frame_of(velocity: Array) -> Array:
 def sensor_blocks(
     bank: Any, variances: Callable[..., Array], coupling: Callable[..., Array]
 ) -> Sequence[Block]:
-    """Blocks of the covariance of a measurement in the frame.
+    """Return the blocks of the covariance of a measurement in the frame.
 
     Args:
         bank: that shows them.
@@ -121,7 +123,7 @@ def sensor_blocks(
 
 
 def clock_blocks(bank: Any) -> Sequence[Block]:
-    """Blocks of the predicted speed, of the scan and of what it saw, for a bank with a ``mean``."""
+    """Return the blocks of the predicted speed, of the scan and of what it saw, for a bank with a ``mean``."""
     xp, p = bank.xp, bank.parameters
     return (
         Block(
@@ -146,7 +148,7 @@ def clock_blocks(bank: Any) -> Sequence[Block]:
 
 
 def sensor_covariance(measurement: Measurement, xp: Any) -> Array:
-    """Covariance of a measurement, ``(2, 2, N)``, m^2."""
+    """Return the covariance of a measurement, ``(2, 2, N)``, m^2."""
     none = 0.0 * measurement.variance[0]
     return xp.stack([xp.stack([measurement.variance[0], none]), xp.stack([none, measurement.variance[1]])])
 

@@ -131,7 +131,8 @@ def read_log(columns: Columns) -> TrackLog:
 
 
 def _typical_sigma(columns: Columns, there: numpy.ndarray) -> dict[str, float]:
-    """Median of the deviations that a table states, in place of the radar's; empty where it is that, or none is stated.
+    """Return the median of the deviations that a table states, in place of the radar's; empty where it is that, or
+    none is stated.
 
     Agents are shown deviations over this one, and errors cost in its square.
     """
@@ -233,7 +234,7 @@ def start_track(
 
 
 def _positions(columns: Columns) -> numpy.ndarray:
-    """X and y, ``(rows, 2)``, m; NaN where there is no plot."""
+    """Return the X and y, ``(rows, 2)``, m; NaN where there is no plot."""
     if columns.has("x", "y"):
         return numpy.stack([columns["x"], columns["y"]], axis=1)
     if not columns.has("range", "azimuth"):
@@ -254,12 +255,15 @@ def _positions(columns: Columns) -> numpy.ndarray:
 
 
 def east_north(length: numpy.ndarray, angle: numpy.ndarray) -> numpy.ndarray:
-    """Vector east and north, ``(2, n)``, of a length and an angle clockwise from north, rad, ``(n,)`` each."""
+    """Return the vector east and north, ``(2, n)``, of a length and an angle clockwise from north, rad, ``(n,)``
+    each.
+    """
     return numpy.stack([length * numpy.sin(angle), length * numpy.cos(angle)])
 
 
 def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.ndarray) -> float:
-    """Deviation of x and y where nothing states it, m; zero where something does, or a radar has measured them.
+    """Return the deviation of x and y where nothing states it, m; zero where something does, or a radar has measured
+    them.
 
     It is what ``--set range_sigma`` says, else how positions scatter about the line through their neighbours, which
     motion only makes larger: who fits a filter fits it, too.
@@ -277,7 +281,7 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
 
 
 def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
-    """Typical deviations, as columns would state them, and who says so."""
+    """Return the typical deviations, as columns would state them, and who says so."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:
         if columns.has(*pair):
@@ -305,7 +309,9 @@ def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source:
 def _variances(
     columns: Columns, position: numpy.ndarray, there: numpy.ndarray, assumed: float = 0.0
 ) -> numpy.ndarray:
-    """Variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot. ``assumed`` is a deviation of both, m."""
+    """Return the variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot. ``assumed`` is a deviation
+    of both, m.
+    """
     variance = numpy.full(position.shape, numpy.nan)
     if columns.has("sigma_x", "sigma_y"):
         variance[there] = columns.only(there).sigmas("sigma_x", "sigma_y") ** 2
@@ -325,7 +331,7 @@ def _variances(
 
 
 def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Rows and times of all scans after the start; -1 for scans that have no row, put evenly into gaps."""
+    """Return the rows and times of all scans after the start; -1 for scans that have no row, put evenly into gaps."""
     before, now = columns.time[first:-1], columns.time[first + 1 :]
     scans = numpy.maximum(numpy.rint((now - before) / interval).astype(int), 1)
     if scans.max() > LARGEST_GAP + 1:
@@ -342,7 +348,7 @@ def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray
 
 
 def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Seconds since the scan before, and since the last one that had a plot.
+    """Return the seconds since the scan before, and since the last one that had a plot.
 
     Args:
         time: of the start, and of the scans, ``(1 + T,)``.
@@ -376,7 +382,9 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
 
 
 def _displacements(columns: Columns) -> numpy.ndarray | None:
-    """Displacement since the row before by the second sensor, ``(rows, 2)``, m; NaN where it says nothing."""
+    """Return the displacement since the row before by the second sensor, ``(rows, 2)``, m; NaN where it says
+    nothing.
+    """
     if columns.has("odometry_x", "odometry_speed"):
         raise ValueError("it has odometry_x and odometry_speed: leave one of them out")
     if columns.has("odometry_x"):
@@ -396,7 +404,9 @@ def scale_noise(measurement: Any, factor: Any) -> Any:
 
 
 def predict_position(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Position that an estimate predicts over the time to a measurement, and what was measured, m, ``(2, N)`` each."""
+    """Return the position that an estimate predicts over the time to a measurement, and what was measured, m, ``(2,
+    N)`` each.
+    """
     predicted = mean[:2] + measurement.interval * mean[2:4]
     return predicted, numpy.where(measurement.available > 0.0, measurement.position, numpy.nan)
 

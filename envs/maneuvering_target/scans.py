@@ -68,7 +68,7 @@ class RegularScans:
         return None, Scan(self.course.advance(flight, number, before), always, interval, interval)
 
     def time(self, scans: Any, number: Array) -> Array:
-        """Time of the current scan in scan periods, ``(N,)``."""
+        """Return the time of the current scan in scan periods, ``(N,)``."""
         return number
 
     def context(self, scans: Any) -> dict[str, Array]:
@@ -123,11 +123,13 @@ class UnreliableScans(RegularScans):
         return scans, Scan(motion, available, interval, elapsed)
 
     def time(self, scans: Reliability, number: Array) -> Array:
-        """Time of the current scan in scan periods, ``(N,)``."""
+        """Return the time of the current scan in scan periods, ``(N,)``."""
         return number - scans.early
 
     def context(self, scans: Reliability) -> dict[str, Array]:
-        """Probability that scans see the target, and the share of the scan period by which they come early at most."""
+        """Return the probability that scans see the target, and the share of the scan period by which they come
+        early at most.
+        """
         return {"detection_probability": scans.detection_probability, "scan_jitter": scans.jitter}
 
 

@@ -203,23 +203,23 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return SemiMarkovState(initial.mean, initial.covariance, Likelihood.unknown(none), packed)
 
     def begin_thrust(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """State with an acceleration that is not known, ``(6, N)`` and ``(6, 6, N)``."""
+        """Return the state with an acceleration that is not known, ``(6, N)`` and ``(6, 6, N)``."""
         none = 0.0 * mean[:2]
         variance = self.prior.thrust**2 + none[0]
         return self.xp.concat([mean, none]), self.augment(covariance, [variance, variance])
 
     def begin_turn(self, mean: Array, covariance: Array, turn: Turn) -> tuple[Array, Array]:
-        """State with the turn rate of a kind of turn, ``(5, N)`` and ``(5, 5, N)``."""
+        """Return the state with the turn rate of a kind of turn, ``(5, N)`` and ``(5, 5, N)``."""
         pace = self.xp.sqrt(self.squared_pace(mean))
         rate = turn.acceleration / pace
         return self.xp.concat([mean, rate[None]]), self.augment(covariance, [(turn.spread / pace) ** 2])
 
     def squared_pace(self, mean: Array) -> Array:
-        """Square of the speed that divides accelerations of turns, (m/s)^2."""
+        """Return the square of the speed that divides accelerations of turns, (m/s)^2."""
         return self.xp.clip(mean[2] ** 2 + mean[3] ** 2, SLOWEST**2, None)
 
     def augment(self, covariance: Array, variances: list[Array]) -> Array:
-        """Covariance of a state and further components that are independent of it and of each other."""
+        """Return the covariance of a state and further components that are independent of it and of each other."""
         n, none = covariance.shape[0], 0.0 * variances[0]
         size = range(n + len(variances))
         return self.xp.stack(
@@ -339,5 +339,5 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
 
 
 def _moved(table: AgedHypotheses, mean: Array, covariance: Array) -> AgedHypotheses:
-    """Hypotheses after the time update."""
+    """Return the hypotheses after the time update."""
     return table._replace(mean=mean, covariance=mirror_lower(covariance))

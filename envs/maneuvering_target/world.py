@@ -157,8 +157,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def _measure(
         self, position: Array, errors: Array, states: dict[str, Any]
     ) -> tuple[dict[str, Any], Array]:
-        """Measured position, m, ``(2, N)``, from errors in units of their standard deviations: range and azimuth are
-        read, or x and y. With it the states of disturbances.
+        """Return the measured position, m, ``(2, N)``, from errors in units of their standard deviations: range and
+        azimuth are read, or x and y. With it the states of disturbances.
         """
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:
@@ -170,7 +170,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return states, radius * xp.stack([xp.cos(azimuth), xp.sin(azimuth)])
 
     def state(self, truth: Truth) -> Array:
-        """Position and velocity, ``(4, N)``."""
+        """Return the position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
@@ -193,12 +193,12 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return self.xp.concat([position, position * math.nan])
 
     def component_deviations(self, measurement: Measurement) -> Array:
-        """Root of the position's variance."""
+        """Return the root of the position's variance."""
         sigma = self.xp.sqrt(measurement.variance)
         return self.xp.concat([sigma, sigma * math.nan])
 
     def error_cost(self, error: Array) -> Array:
-        """Squared position error over the squared range sigma."""
+        """Return the squared position error over the squared range sigma."""
         scaled = error[:2] * (1.0 / self.parameters.range_sigma)
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
 

@@ -172,7 +172,7 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
         )  # fmt: skip
 
     def _present(self, measurement: Measurement) -> Array:
-        """Readings of each group of sensors that are there, at least one, ``(4, 1, N)``."""
+        """Return the readings of each group of sensors that are there, at least one, ``(4, 1, N)``."""
         here = [ordered_sum(measurement.available[sensor.readings]) for sensor in self.task.sensors]
         return self.xp.stack([self.xp.clip(count, 1.0, None) for count in here])[:, None]
 
@@ -210,7 +210,7 @@ class HypothesisBank(SatelliteBank):
         )
 
     def _predict_hypotheses(self, state: Filters) -> Prediction:
-        """Steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
+        """Return the steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = imm.mix(state.means, unpack(state.covariances, gnss_ins.SIZE), chain.mixing)
@@ -218,7 +218,7 @@ class HypothesisBank(SatelliteBank):
         return Prediction(mean, pack(covariance), chain.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
-        """State that the tracking loops expect at the next measurement, ``(17, N)``."""
+        """Return the state that the tracking loops expect at the next measurement, ``(17, N)``."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = weighted_sum(chain.mixing, state.means[:, :, None])
@@ -260,7 +260,7 @@ class HypothesisBank(SatelliteBank):
     def _before_the_action(
         self, predicted: Prediction, update: extended_kalman.Correction
     ) -> tuple[Array, Array]:
-        """Means and covariances, packed, that :meth:`act` goes on from."""
+        """Return the means and covariances, packed, that :meth:`act` goes on from."""
         return update.mean, pack(update.covariance)
 
     def _update_hypotheses(
@@ -272,7 +272,7 @@ class HypothesisBank(SatelliteBank):
         thresholds: Sequence[Array] | None = None,
         cautions: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
-        """Steps 5 and 6 for every hypothesis."""
+        """Return the steps 5 and 6 for every hypothesis."""
         expected, rows = gnss_ins.observe(
             means,
             measurement.satellite_position[:, :, None],
@@ -293,7 +293,7 @@ class HypothesisBank(SatelliteBank):
         )
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
-        """Thresholds of the robust update for each reading; None: the paper's update."""
+        """Return the thresholds of the robust update for each reading; None: the paper's update."""
         return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
@@ -333,8 +333,8 @@ class HypothesisBank(SatelliteBank):
         return imm.combine(state.means, covariances, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Probabilities, NIS of the combination and its degrees, log-density of the measurement as predicted, whether a
-        rate is beyond its aperture.
+        """Return the probabilities, NIS of the combination and its degrees, log-density of the measurement as
+        predicted, whether a rate is beyond its aperture.
         """
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
@@ -436,7 +436,7 @@ class RobustBank(NoiseBank):
         return [*variance[: forces.start], *(v * factor for v in variance[forces]), *variance[forces.stop :]]
 
     def _thresholds(self, exponent: Array) -> Sequence[Array]:
-        """Huber's for an action of 1, none for 0 or less."""
+        """Return Huber's for an action of 1, none for 0 or less."""
         sensors = self.task.sensors
         strength = self.xp.clip(exponent[len(sensors) + 1 :], LEAST_STRENGTH, None)
         none = math.inf + 0.0 * exponent[0]

@@ -57,7 +57,7 @@ class Course:
         return self._fixed_legs(draws, zeros)
 
     def _fixed_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Legs of the paper's experiment, or one that is matched to hypothesis 3, velocity and heading."""
+        """Return the legs of the paper's experiment, or one that is matched to hypothesis 3, velocity and heading."""
         xp, p = self.xp, self.parameters
         # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
         draws.unit("legs", 15)
@@ -79,7 +79,7 @@ class Course:
         return legs, along * speed, heading
 
     def _random_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Legs of rest, straight flight and manoeuvre at random, velocity at the start and heading."""
+        """Return the legs of rest, straight flight and manoeuvre at random, velocity at the start and heading."""
         xp, p = self.xp, self.parameters
         columns: list[tuple[Array, ...]] = []
         start: Array = None
@@ -119,7 +119,9 @@ class Course:
         return legs, velocity, heading
 
     def leg_at(self, legs: Legs, k: Array) -> tuple[Array, Array]:
-        """Kind of the leg that step k belongs to, ``(N,)``, and the acceleration with which it begins, ``(3, N)``."""
+        """Return the kind of the leg that step k belongs to, ``(N,)``, and the acceleration with which it begins,
+        ``(3, N)``.
+        """
         kind, push = legs.kind[0], legs.acceleration[:, 0]
         for i in range(1, legs.start.shape[0]):
             begun = k > legs.start[i]

@@ -426,7 +426,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         )
 
     def _move_levels(self, levels: Array) -> Array:
-        """Probabilities of the levels after a step, ``(L, N)``."""
+        """Return the probabilities of the levels after a step, ``(L, N)``."""
         L = levels.shape[0]
         return self.xp.stack(
             [

@@ -57,7 +57,7 @@ class NavigationProblem(Task):
         return self.xp.clip(number, None, self.horizon + 1)
 
     def satellites_at(self, number: Array) -> tuple[Array, Array]:
-        """Positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
+        """Return the positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
         row = self._row(number)
         return (
             self.xp.take(self._satellite_position, row, axis=2),

@@ -184,7 +184,9 @@ class TightlyCoupledNavigation(NavigationProblem):
     )
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
-        """State that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a manoeuvre."""
+        """Return the state that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a
+        manoeuvre.
+        """
         return gnss_ins.advance(mean, self.axis[:, :, SINGER], self.common.T, self.common.decay)
 
 

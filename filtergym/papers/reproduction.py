@@ -79,12 +79,12 @@ def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
 
 
 def verdict_if(holds: bool) -> Verdict:
-    """Verdict on a claim that holds or does not."""
+    """Return the verdict on a claim that holds or does not."""
     return "reproduced" if holds else "not reproduced"
 
 
 def verdict_of(holds: Iterable[bool]) -> Verdict:
-    """Verdict on a claim with several parts: reproduced if all of them hold, in part if some do."""
+    """Return the verdict on a claim with several parts: reproduced if all of them hold, in part if some do."""
     parts = list(holds)
     return "reproduced" if all(parts) else "reproduced in part" if any(parts) else "not reproduced"
 
@@ -143,7 +143,7 @@ class Reproduction:
     """What made it."""
 
     def markdown(self, suffix: str = "png") -> str:
-        """Claims, tables and figures as one page, which shows files of figures that end in a suffix."""
+        """Return the claims, tables and figures as one page, which shows files of figures that end in a suffix."""
         lines = [f"# {self.title}", ""]
         if self.command:
             lines += [f"Made by `{self.command}`.", ""]

@@ -69,7 +69,9 @@ def mean_squares(error: numpy.ndarray) -> numpy.ndarray:
 
 
 def rms(squares: numpy.ndarray, window: tuple[int, int] | None) -> numpy.ndarray:
-    """Root of the mean over a window of scans, both ends included, of squares ``(..., K, 2)``; None: peak."""
+    """Return the root of the mean over a window of scans, both ends included, of squares ``(..., K, 2)``; None:
+    peak.
+    """
     if window is None:
         return numpy.sqrt(squares.max(axis=-2))
     return numpy.sqrt(squares[..., window[0] - 1 : window[1], :].mean(axis=-2))

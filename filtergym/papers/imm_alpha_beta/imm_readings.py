@@ -53,13 +53,13 @@ class Reading:
 
 
 def _diagonal(values: numpy.ndarray) -> numpy.ndarray:
-    """Diagonal matrices ``(d, d, ...)`` of ``(d, ...)``."""
+    """Return the diagonal matrices ``(d, d, ...)`` of ``(d, ...)``."""
     d = len(values)
     return numpy.eye(d).reshape(d, d, *[1] * (values.ndim - 1)) * values
 
 
 def _kalman_covariance(P: numpy.ndarray, R: numpy.ndarray) -> numpy.ndarray:
-    """Covariance ``(2 d, 2 d, M, N)`` after an update with the optimal gain; R is ``(d, N)``."""
+    """Return the covariance ``(2 d, 2 d, M, N)`` after an update with the optimal gain; R is ``(d, N)``."""
     n, modes, lanes = len(P), P.shape[2], P.shape[3]
     repeated = _diagonal(numpy.tile(R, (1, modes)))
     nothing = numpy.zeros((n, modes * lanes))

@@ -29,7 +29,7 @@ SCALES = (0.01, 1.0, 100.0)
 
 
 def _excess(datasets: dict[str, Any]) -> str:
-    """Cost of the paper's filter above that of the filter told the noise, and its consistency."""
+    """Return the cost of the paper's filter above that of the filter told the noise, and its consistency."""
     ours, best = (datasets[name]["cost"].values.mean(axis=1) for name in ("kalman", "matched"))
     nees = datasets["kalman"]["nees"].values.mean() / datasets["kalman"].sizes["component"]
     return f"{quantity(means(ours) / means(best) - 1.0):.0%}, NEES {nees:.1f} per coordinate"
@@ -152,7 +152,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Tables of the report."""
+    """Return the tables of the report."""
     rows = []
     for case, loops in r.noise.items():
         for name, s in loops.items():
