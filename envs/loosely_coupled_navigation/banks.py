@@ -82,7 +82,7 @@ class Augmented(NamedTuple):
     drift: Array
     """Estimate of beta, ``(A, N)``, m/s."""
     coloured: Array
-    """Of eta, likewise."""
+    """Estimate of eta, ``(A, N)``, m/s."""
     covariance: ins_gnss.AugmentedCovariance
     """After the last measurement that was acted on, the same for all axes, ``(N,)`` each."""
     deviation: Array
@@ -102,7 +102,7 @@ class Schemes(NamedTuple):
     drift: Array
     """Estimate of beta by the augmented filter, ``(A, N)``, m/s."""
     coloured: Array
-    """Of eta, likewise."""
+    """Estimate of eta, ``(A, N)``, m/s."""
     covariance: ins_gnss.AugmentedCovariance
     """Of the augmented filter, the same for all axes, ``(N,)`` each."""
     seen: Innovations
@@ -111,7 +111,7 @@ class Schemes(NamedTuple):
 
 
 class KalmanBucyBank(Bank[Task, Measurement, Any]):
-    """What the banks share: the innovations that are shown, and the end of the observation."""
+    """Common base of the banks: the innovations in the observation, and its end."""
 
     parameters: LooselyCoupledNavigationParameters
     filters: tuple[str, ...] = ()
@@ -183,7 +183,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """What the receiver reports, and the innovations, as they are."""
+        """Reported deviation and innovations, without compression."""
         nominal = self.parameters.receiver_variance
         return (
             Quantity(
@@ -256,7 +256,7 @@ NOISES = ("receiver", "coloured", "white")
 
 
 class NoiseBank(KalmanBucyBank):
-    """Control ``noise``: the augmented filter, which takes the noises to be what the action says."""
+    """Control ``noise``: the augmented filter, with the noises scaled by the action."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
 
@@ -267,7 +267,7 @@ class NoiseBank(KalmanBucyBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What every filter shows, and the deviation that this one predicts."""
+        """Observation of every filter, and the deviation that this one predicts."""
         nominal = math.sqrt(self.parameters.receiver_variance)
         return (
             *super().blocks,

@@ -1,4 +1,4 @@
-"""What the bank over faults of LooselyCoupledNavigation expects at the start, and the noises that it tries."""
+"""Prior of the bank over faults of LooselyCoupledNavigation, and the noises that it tries."""
 
 import math
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from ..contract.observation import Array
 from .parameters import LooselyCoupledNavigationParameters
 
 LEVELS = tuple(100 ** (i / 3) for i in range(-2, 5))
-"""Variances of the receiver over the reported one that are told apart."""
+"""Variances of the receiver over the reported one that the bank distinguishes."""
 
 
 class FaultPrior(NamedTuple):
-    """What a bank expects before it has seen anything; times in s."""
+    """Prior of a bank; times in s."""
 
     points: int = 6
     """Points of noises beside the modelled one."""

@@ -85,7 +85,7 @@ def inertial_recording(
         fixes: ``latitude``, ``longitude`` (degrees) and ``height`` (m), or ``x``, ``y``, ``z`` (m east, north, up of
             ``site``); optional ``sigma`` (m, of each axis) and ``velocity_east``, ``velocity_north``, ``velocity_up``
             (m/s, all three). They come at one interval; rows may lack.
-        truth: positions likewise; where it has no row within 1.5 s the truth is not known.
+        truth: true positions in the same form; without a row within 1.5 s the truth is unknown.
         rate_unit: ``degrees/s`` or ``rad/s``.
         acceleration_unit: ``m/s^2`` or ``g``.
         mounting: roll, pitch and yaw of the IMU's axes to forward, right, down of the vehicle, degrees.

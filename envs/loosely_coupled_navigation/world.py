@@ -48,7 +48,7 @@ class Truth(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What INS and receiver say; A axes."""
+    """Readings of INS and receiver; A axes."""
 
     number: Array
     """Number of the measurement, from 1 on, ``(N,)``; it is taken ``sampling_interval`` seconds after the one
@@ -85,7 +85,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         self.no_covariance: Array = task.constant(numpy.zeros((axes, axes)))[:, :, None]
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """What the receiver reports."""
+        """Return the deviation that the receiver reports."""
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
@@ -191,7 +191,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return self.mask_missing(measurement).fix
 
     def component_deviations(self, measurement: Measurement) -> Array:
-        """As the receiver reports it."""
+        """Return the deviation that the receiver reports."""
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def error_cost(self, error: Array) -> Array:
@@ -199,7 +199,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return ordered_sum(error * error) / self.parameters.receiver_variance
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Whether there is a measurement, its noise, and what is reported of that."""
+        """Return whether there is a measurement, its noise, and the reported noise."""
         return {
             "available": truth.available,
             "receiver_deviation": truth.deviation,

@@ -39,7 +39,7 @@ from .world import Measurement
 SCANS_SHOWN = 20
 """The clock in the observation saturates here: a filter has settled after about ten scans."""
 PERIODS_SHOWN = (0.01, 100.0)
-"""Likewise the time since the last measurement, scan periods."""
+"""Limits of the time since the last measurement, scan periods."""
 
 LARGEST_SHARE = 1e8
 """Of what an acceleration leaves over the covariance that the gains give."""
@@ -78,7 +78,7 @@ class AlphaBeta(NamedTuple):
     grown: Array = None
     """s for which the innovation of the last update had grown, ``(N,)``; None where that is the scan period."""
     since: Array = None
-    """s since that update, ``(N,)``; None likewise, for zero."""
+    """s since that update, ``(N,)``; None for zero."""
 
 
 class Filters(NamedTuple):
@@ -109,7 +109,7 @@ class Filters(NamedTuple):
 
 
 class RadarBank(Bank[TargetProblem, Measurement, Any]):
-    """What both banks share: the averages that are shown, and the end of the observation."""
+    """Common base of both banks: the averages in the observation, and its end."""
 
     parameters: ManeuveringTargetParameters
 
@@ -138,7 +138,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         return self.xp.where(self.xp.abs(measurement.elapsed) < least, least, measurement.elapsed)
 
     def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """One of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
+        """Return one of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
         if self.regular or then is otherwise:
             return then
         if isinstance(then, tuple):
@@ -500,7 +500,7 @@ class GainsBank(FilterBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What every bank shows, and the gains."""
+        """Observation of every bank, and the gains."""
         each = tuple(str(j + 1) for j in range(self.count))
         return (
             *super().blocks,

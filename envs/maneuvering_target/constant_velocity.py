@@ -41,13 +41,13 @@ class ConstantVelocityModel:
         return self.unmoved + T * self.moved, self.correlated * outer(by_acceleration, by_acceleration)
 
     def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """One of two tuples of arrays where the scan saw the target, the other where it missed it."""
+        """Return one of two tuples of arrays where the scan saw the target, the other where it missed it."""
         there = measurement.available > 0.0
         parts = zip(then, otherwise, strict=True)
         return type(then)(*(self.xp.where(there, seen, missed) for seen, missed in parts))
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
-        """How well a scan was predicted; NaN where it missed the target."""
+        """Return the likelihood of a scan; NaN where it missed the target."""
         there = measurement.available > 0.0
         log_likelihood, nis = (self.xp.where(there, values, math.nan) for values in (log_likelihood, nis))
         return Likelihood(log_likelihood, nis, 2.0 * measurement.available)

@@ -31,22 +31,22 @@ COLUMNS = {
     "x": Column("m, east of the radar"),
     "y": Column("m, north of it"),
     "range": Column("m, in place of x and y"),
-    "azimuth": Column("degrees clockwise from north, likewise"),
+    "azimuth": Column("degrees clockwise from north"),
     "latitude": Column("degrees, in place of x and y"),
-    "longitude": Column("degrees, likewise"),
+    "longitude": Column("degrees"),
     "altitude": Column("m above the ellipsoid, beside them; optional"),
     "sigma_x": Column(
         "m, standard deviation of x; optional, default: the parameter range_sigma, else how positions scatter"
     ),
-    "sigma_y": Column("m, likewise"),
+    "sigma_y": Column("m"),
     "range_sigma": Column("m, standard deviation of the range; optional, default: the parameter"),
     "azimuth_sigma": Column("degrees, of the azimuth; default: the parameter bearing_sigma"),
     "odometry_x": Column(
         "m, moved east since the row before, by a second sensor such as wheels and a compass; optional"
     ),
-    "odometry_y": Column("m, moved north, likewise"),
+    "odometry_y": Column("m, moved north"),
     "odometry_speed": Column("m/s, in place of both: the speed by that sensor"),
-    "odometry_heading": Column("degrees clockwise from north, likewise"),
+    "odometry_heading": Column("degrees clockwise from north"),
 }
 FINER = 10.0
 """Times that a stated deviation exceeds the resolution of positions where noise does not repeat one by chance."""
@@ -104,7 +104,7 @@ def read_log(columns: Columns) -> TrackLog:
         parameters["sampling_interval"] = interval
     seen = (rows >= 0) & there[rows]
     nominal = (assumed or columns.given.get("range_sigma", ManeuveringTargetParameters.range_sigma)) ** 2
-    said = {
+    found = {
         "scan": numpy.arange(1.0, len(rows) + 1.0),
         "position": numpy.where(seen[:, None], position[rows], 0.0),
         "variance": numpy.where(seen[:, None], variance[rows], nominal),
@@ -113,7 +113,7 @@ def read_log(columns: Columns) -> TrackLog:
         **_odometry(columns, rows),
     }
     return TrackLog(
-        said,
+        found,
         initial,
         rows,
         parameters,
@@ -152,7 +152,7 @@ def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray)
     Args:
         columns: of one track.
         position: m, ``(rows, 2)``; NaN where there is none.
-        sigma: of their errors, m, likewise.
+        sigma: of their errors, m, same shape.
     """
     measured = position
     if columns.origin is not None:  # x and y change with altitude, too
@@ -197,7 +197,7 @@ def two_plot_start(
 
     Args:
         position: of the two, ``(..., 2, 2)``, m.
-        variance: of their errors, likewise, m^2.
+        variance: of their errors, m^2, same shape.
         lasted: s, ``(..., 1)``.
     """
     before, first = position[..., 0, :], position[..., 1, :]
@@ -265,13 +265,13 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
     """Return the deviation of x and y where nothing states it, m; zero where something does, or a radar has measured
     them.
 
-    It is what ``--set range_sigma`` says, else how positions scatter about the line through their neighbours, which
+    It is that of ``--set range_sigma``, else the scatter of positions about the line through their neighbours, which
     motion only makes larger: who fits a filter fits it, too.
 
     Args:
         columns: of one track.
         position: of its plots, m, ``(n, 2)``.
-        time: s, likewise.
+        time: s, same shape.
     """
     if not columns.has("x") or columns.has("sigma_x") or columns.has("range_sigma"):
         return 0.0
@@ -281,7 +281,7 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
 
 
 def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
-    """Return the typical deviations, as columns would state them, and who says so."""
+    """Return the typical deviations, as columns would state them, and their source."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:
         if columns.has(*pair):
@@ -289,7 +289,7 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
             return medians, f"columns {pair[0]} and {pair[1]}"
     if assumed:
         named = "range_sigma" in columns.given
-        who = "as --set range_sigma says" if named else "as positions scatter about their neighbours"
+        who = "as --set range_sigma states" if named else "as positions scatter about their neighbours"
         return dict.fromkeys(pairs[0], assumed), f"{NO_DEVIATIONS} of x and y, assumed {who}"
     names = {"range_sigma": "range_sigma", "azimuth_sigma": "bearing_sigma"}
     values = {
@@ -300,7 +300,7 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
 
 
 def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
-    """Say which deviations are assumed where neither a column nor the user states one."""
+    """Return notes on the deviations that are assumed where neither a column nor the user states one."""
     if not is_assumed(source) or "range_sigma" in columns.given:
         return []
     return [f"{source}: {deviation_words(deviations)}"]
@@ -361,7 +361,7 @@ def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray
 
 
 def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """What a second sensor says of the motion between scans; nothing where there is none.
+    """Return the motion between scans by a second sensor; empty where there is none.
 
     Args:
         columns: of one track.
@@ -382,7 +382,7 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
 
 
 def _displacements(columns: Columns) -> numpy.ndarray | None:
-    """Return the displacement since the row before by the second sensor, ``(rows, 2)``, m; NaN where it says
+    """Return the displacement since the row before by the second sensor, ``(rows, 2)``, m; NaN where it has
     nothing.
     """
     if columns.has("odometry_x", "odometry_speed"):

@@ -39,7 +39,7 @@ SLOWEST = 30.0
 
 
 class SemiMarkovPrior(NamedTuple):
-    """What a semi-Markov filter expects of flights."""
+    """Prior of a semi-Markov filter on flights."""
 
     begin: float = 0.0157
     """Probability that a manoeuvre begins before a scan."""
@@ -143,7 +143,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
     """Gaussian sum over straight flight, constant thrust and coordinated turns with the time since each began.
 
     Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
-    distribution says, not geometrically. Turns to the left and to the right are kinds of their own, and so are gentle
+    distribution, not geometrically. Turns to the left and to the right are kinds of their own, and so are gentle
     and steep ones: about a turn rate of zero the extended filter would linearise where no turn is.
 
     Args:
@@ -180,7 +180,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         """Whose weights each of the first three settings multiplies, ``(3, H, 1)``."""
 
     def start(self, initial: Initial) -> SemiMarkovState:
-        """Start where everyone starts, long in straight flight."""
+        """Start at the initial estimate, long in straight flight."""
         xp, least = self.xp, semi_markov.LEAST_PROBABILITY
         none = 0.0 * initial.mean[0]
 
@@ -235,7 +235,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         )
 
     def switch(self, straight: AgedHypotheses, thrust: AgedHypotheses, *turns: AgedHypotheses) -> Tables:
-        """Let manoeuvres end and begin."""
+        """End and begin manoeuvres."""
         ages, turning = self.ages, self.prior.turning if self.turns else 0.0
         modes = [semi_markov.Mode(thrust, self.hazard, (1.0 - turning) * self.prior.begin, self.begin_thrust)]
         for table in turns:
@@ -275,13 +275,13 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return tuple(moved)
 
     def predict(self, state: SemiMarkovState, measurement: Measurement) -> SemiMarkovState:
-        """Let manoeuvres end and begin, and fly on to the scan."""
+        """End and begin manoeuvres, and predict to the scan."""
         switched = self.switch(*(table.unpack() for table in state.track))
         tables = self.fly(*switched, T=measurement.interval)
         return state._replace(track=tuple(table.pack() for table in tables))
 
     def heeds(self, measurement: Measurement) -> Array:
-        """Where the scan saw the target."""
+        """Return one where the scan saw the target."""
         return measurement.available
 
     def apply_factors(self, tables: Iterable[AgedHypotheses], logarithms: Array) -> list[AgedHypotheses]:

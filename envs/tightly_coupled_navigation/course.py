@@ -1,4 +1,4 @@
-"""How the user of TightlyCoupledNavigation moves: legs drawn anew for every episode, or the paper's fixed ones.
+"""Motion of the user of TightlyCoupledNavigation: legs drawn anew for every episode, or the paper's fixed ones.
 
 Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so nothing
 is left to jump at step 2000. The truth was probably a sequence of states with V incremented and A = 0:

@@ -1,4 +1,4 @@
-"""What may go wrong with the sensors of TightlyCoupledNavigation: a class for each."""
+"""Disturbances of the sensors of TightlyCoupledNavigation: a class for each."""
 
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -47,7 +47,7 @@ def _is_pulled(moment: Moment) -> Array | None:
 
 
 class _OfSatellites(Disturbance):
-    """What concerns satellites, S of them; pseudoranges come first in the readings, then their rates."""
+    """Disturbance of satellites, S of them; pseudoranges come first in the readings, then their rates."""
 
     def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
@@ -80,7 +80,7 @@ class Fault(NamedTuple):
 
 
 class _Once(_OfSatellites):
-    """What happens for a while, once in an episode, with a probability."""
+    """Temporary disturbance, once in an episode, with a probability."""
 
     title: ClassVar[str]
     """Of the parameters of its probability and duration."""
@@ -105,7 +105,7 @@ class _Once(_OfSatellites):
         return state._replace(now=self.xp.astype(happens, state.now.dtype))
 
     def is_at(self, state: Fault) -> Array:
-        """Whether it happens to each satellite now, booleans ``(S, N)``."""
+        """Return whether it affects each satellite now, booleans ``(S, N)``."""
         chosen = self.places == state.satellites[0]
         for i in range(1, state.satellites.shape[0]):
             chosen = chosen | (self.places == state.satellites[i])
@@ -313,11 +313,11 @@ class Reflections(_OfSatellites):
     def change_measurement(
         self, state: Reception, measurement: Any, step: DisturbanceInput
     ) -> tuple[Reception, Any]:
-        """Tell C/N0."""
+        """Change the C/N0."""
         return state, measurement._replace(cn0=state.cn0)
 
     def context(self, state: Reception) -> dict[str, Array]:
-        """Whether the episode is between houses."""
+        """Return whether the episode is between houses."""
         return {"urban": state.urban}
 
 
@@ -396,7 +396,7 @@ class Aperture(_OfSatellites):
         return state, self.change_available(measurement, 0, self.xp.astype(kept, feedback.dtype))
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Whether they do."""
+        """Return whether rates are outside the aperture."""
         return {"aperture": state}
 
 

@@ -100,7 +100,7 @@ class TightlyCoupledNavigationPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """What is steered, innovations, errors."""
+        """Return the strips: actions, innovations, errors."""
         hypotheses = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
         weights = {name: f"weight.{i}" for i, name in enumerate(hypotheses)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]

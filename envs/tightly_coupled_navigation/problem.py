@@ -1,4 +1,4 @@
-"""What world, filters and picture of TightlyCoupledNavigation use of their task: sensors, satellites and models."""
+"""Parts of the task that world, filters and picture of TightlyCoupledNavigation use: sensors, satellites and models."""
 
 import numpy
 
@@ -53,7 +53,7 @@ class NavigationProblem(Task):
         self.transition: Array = constant(p.transition)
 
     def _row(self, number: Array) -> Array:
-        """Where a measurement stands in the tables; an episode that is over stays at the end."""
+        """Return the row of a measurement in the tables; an episode that is over stays at the end."""
         return self.xp.clip(number, None, self.horizon + 1)
 
     def satellites_at(self, number: Array) -> tuple[Array, Array]:

@@ -50,7 +50,7 @@ class Truth(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What receiver and inertial system say; S satellites, m = 2 S + 6 readings."""
+    """Readings of receiver and inertial system; S satellites, m = 2 S + 6 readings."""
 
     number: Array
     """Of the measurement, counted from 1, ``(N,)`` integers; one takes ``sampling_interval`` seconds."""

@@ -102,7 +102,7 @@ def comparisons(r: Results) -> dict[str, Comparison]:
 
 
 class GridFinding(NamedTuple):
-    """Where on the gain grid an error is smallest."""
+    """Minimum of an error on the gain grid."""
 
     minimum: float
     gains: tuple[float, float]
@@ -299,7 +299,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     comparison = comparisons(r)
     imm, adaptive = r.main["imm"].squares, r.main["adaptive"].squares
     best = findings(r, "gains used", WINDOWS["all"])
@@ -349,7 +349,9 @@ def _grid_text(found: Sequence[GridFinding]) -> str:
 
 
 def _handover(mean: numpy.ndarray) -> str:
-    """When the mean probability of mode 1, ``(K,)``, falls below one half in the turn, and comes back."""
+    """Return the scans at which the mean probability of mode 1, ``(K,)``, falls below one half in the turn, and
+    comes back.
+    """
     first = WINDOWS["turn"][0]
     scans = numpy.arange(1, len(mean) + 1)
     below = scans[(scans >= first) & (mean < 0.5)]

@@ -50,7 +50,7 @@ NAMES = {
     "adaptive": "adaptive filter",
     "adaptive-rearm": "adaptive filter, re-arming",
     "kalman-imm": "IMM over two Kalman filters (acceleration 0 and 2.775 m/s^2)",
-    "known-turn": "Kalman filter told the turn's scans",
+    "known-turn": "Kalman filter given the turn's scans",
     "known-input-bound": "Cramer-Rao bound, acceleration known",
 }
 COMPARED_POLICIES = ("imm", "adaptive", "adaptive-rearm")

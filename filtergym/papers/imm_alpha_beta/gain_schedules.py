@@ -102,7 +102,7 @@ def ramp_schedule(
 def best_schedule(flight: Flight) -> numpy.ndarray:
     """Return the position gains of least summed mean-square position error: a floor for schedules, ``(K,)``.
 
-    It is told the whole flight, so no causal policy should be expected to reach it; one that reacts to the
+    It is given the whole flight, so no causal policy should be expected to reach it; one that reacts to the
     data may do better all the same.
     """
     from scipy.optimize import minimize

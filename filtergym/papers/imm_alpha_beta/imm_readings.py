@@ -17,7 +17,7 @@ from .alpha_beta_errors import variance_reduction
 
 
 class Recording(NamedTuple):
-    """What a radar saw of N episodes of K scans, and what was true."""
+    """Measurements of a radar and truth of N episodes of K scans."""
 
     start: numpy.ndarray
     """Estimate at scan 0: x, y (m), vx, vy (m/s), ``(4, N)``."""
@@ -38,7 +38,7 @@ Likelihood = Literal["gains used", "no spread", "Kalman", "R/(1-alpha)", "steady
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to fill what the paper leaves open; the default is the canonical one."""
+    """One way to fill the gaps of the paper; the default is the canonical one."""
 
     gains: tuple[float, ...] = (0.3, 0.7)
     stay: float = 0.9

@@ -111,7 +111,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     a, b = roots(r)
     p, gains = PARAMETERS, dict(zip(("white", "reduced", "best"), GAINS.values(), strict=True))
 

@@ -38,7 +38,7 @@ NAMES = {
     "best-constant": "plain, best constant gain",
     "augmented-gain": "plain, gain steered by an augmented filter",
     "augmented": "augmented",
-    "matched": "augmented, told the noise levels (reference)",
+    "matched": "augmented, given the noise levels (reference)",
 }
 DRIFTING = ("plain-white", "plain-reduced", "best-constant", "augmented")
 EXAMPLE_POLICIES = ("plain-white", "plain-reduced", "augmented")

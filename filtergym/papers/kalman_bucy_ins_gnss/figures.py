@@ -58,7 +58,7 @@ def draw_first_order(r: Results) -> Any:
 
 
 def draw_instruments(r: Results) -> Any:
-    """What the instruments say."""
+    """Draw the readings of the instruments."""
     figure, axes = panels(1, 1, (8.0, 3.6))
     run = r.paths["plain-reduced"]
     time = _times(len(run["ins"]))

@@ -71,7 +71,7 @@ def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verd
 
 
 def in_band(found: Loss) -> bool:
-    """Whether the tracks are lost when the paper says."""
+    """Return whether the tracks are lost in the paper's time."""
     return found.rate > 0.95 and BAND[0] <= found.median <= BAND[1]
 
 
@@ -173,7 +173,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     increment, kinematic = r.courses.values()
     adaptive, free, best = (increment[name] for name in (ADAPTIVE, "Singer, no aperture", "known mode"))
     few = len(free.nis)

@@ -252,7 +252,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
 
 
 class Loss(NamedTuple):
-    """How many tracks are lost, and when."""
+    """Lost tracks: their number, and times."""
 
     rate: float
     median: float

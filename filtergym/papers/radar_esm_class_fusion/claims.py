@@ -54,7 +54,7 @@ def approach_verdict(excess: Sequence[Sequence[Quantity]]) -> Verdict:
 
 
 class Variant(NamedTuple):
-    """What a variant of the experiment gives for one class."""
+    """Result of a variant of the experiment for one class."""
 
     recognised: float
     """Median time of the first P >= 0.9, s."""
@@ -173,7 +173,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     early, middle, _ = WINDOWS.values()
     printed, joint = r.fixed_type["quasi-optimal"], r.fixed_type["joint-type"]
     fighter = (printed.true_class == 2) & (printed.true_type == 1)

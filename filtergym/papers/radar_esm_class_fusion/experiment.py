@@ -23,7 +23,7 @@ COMPONENTS = (("range", "m"), ("range rate", "m/s"), ("acceleration", "m/s²"))
 CLASSES = ("S0", "S1", "S2")
 INTERVAL = RadarEsmTrackingParameters.sampling_interval
 WORTHLESS_RATE = 1e4
-"""m/s: a radial velocity measured with this error says no more than two ranges half a second apart."""
+"""m/s: a radial velocity with this error is no better than two ranges half a second apart."""
 
 
 def channel_error_covariance(
@@ -122,7 +122,7 @@ def rms(mean_square: numpy.ndarray, window: tuple[int, int]) -> float:
 
 
 class Run(NamedTuple):
-    """What is kept of a policy over some episodes; ``of`` chooses some of them."""
+    """Records of a policy over some episodes; ``of`` chooses some of them."""
 
     error: numpy.ndarray
     """Estimate minus truth, ``(episodes, K, 3)``."""
@@ -163,7 +163,7 @@ class Run(NamedTuple):
         return _quantile(numpy.where(last < unsure.shape[1], last, math.inf), share)
 
     def wrong(self) -> numpy.ndarray:
-        """Whether a wrong class has P >= 0.9, ``(episodes, K)``."""
+        """Return whether a wrong class has P >= 0.9, ``(episodes, K)``."""
         other = numpy.arange(len(CLASSES)) != self.true_class[:, None, None]
         return ((self.probability >= SURE) & other).any(axis=2)
 

@@ -1,4 +1,4 @@
-"""The loop of aircraft, filter and controller: its runs, and what linear theory says about it."""
+"""The loop of aircraft, filter and controller: its runs, and its linear theory."""
 
 import math
 from dataclasses import dataclass
