@@ -77,8 +77,8 @@ class LooselyCoupledNavigation(Task):
 
     By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the squared error of position, summed over the axes,
     over the nominal variance of a measurement (``N / sampling_interval``), in units of 0.02, its median under the
-    action zero, and x0 that of the action zero on the same noise. Outages and jamming rule the mean of x and are
-    nobody's merit. "cost" is ``-30 log(1 + x / 30)`` in units of 0.16, the mean cost of the paper's plain scheme.
+    action zero, and x0 that of the action zero on the same noise. Outages and jamming dominate the mean of x,
+    whatever a filter does. "cost" is ``-30 log(1 + x / 30)`` in units of 0.16, the mean cost of the paper's plain scheme.
 
     ### Starting State
 

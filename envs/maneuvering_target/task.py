@@ -75,8 +75,7 @@ class ManeuveringTarget(TargetProblem):
 
     ## Scans that miss the target or come early
 
-    In the paper every scan sees the target, T seconds after the one before. With `detection_probability` below 1 some
-    do
+    In the paper every scan sees the target, T seconds after the one before. With `detection_probability` below 1 some do
     not: `available` is 0 then, the measurement zero (an estimator gets NaN), the filters' state the predicted one and
     the weights the predicted ones (13), whatever the action. With `scan_jitter` j scan k comes at T (k - j u), u
     uniform on [0, 1): the filters predict over the time that has passed, and estimate and truth are those of that time.
