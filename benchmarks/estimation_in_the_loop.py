@@ -81,14 +81,15 @@ TRAINING: dict[str, dict[str, Any]] = {
                     "gae_lambda": 0.9, "learning_rate": 1e-3},
     "Pendulum-v1": {"steps": 100_000, "n_steps": 256, "batch_size": 256, "n_epochs": 10, "gamma": 0.9,
                     "gae_lambda": 0.95, "learning_rate": 1e-3, "use_sde": True, "sde_sample_freq": 4},
-    "MountainCarContinuous-v0": {"steps": 60_000, "n_steps": 64, "batch_size": 256, "n_epochs": 10, "gamma": 0.9999,
-                                 "gae_lambda": 0.9, "learning_rate": 7.77e-5, "ent_coef": 0.00429, "vf_coef": 0.19,
-                                 "max_grad_norm": 5.0, "use_sde": True,
-                                 "policy_kwargs": {"log_std_init": -3.29, "ortho_init": False}},
+    "MountainCarContinuous-v0": {"steps": 60_000, "n_steps": 512, "batch_size": 256, "n_epochs": 10, "gamma": 0.99,
+                                 "gae_lambda": 0.9, "learning_rate": 3e-4, "ent_coef": 0.0, "use_sde": True,
+                                 "sde_sample_freq": 64,
+                                 "policy_kwargs": {"log_std_init": -1.0, "ortho_init": False}},
     "Acrobot-v1": {"steps": 100_000, "n_steps": 256, "batch_size": 256, "n_epochs": 4, "gamma": 0.99,
                    "gae_lambda": 0.94},
 }  # fmt: skip
-"""Steps of a training, and what differs from PPO's defaults: as RL Baselines3 Zoo has it, for eight lanes."""
+"""Steps of a training, and what differs from PPO's defaults, for eight lanes: near those of RL Baselines3 Zoo; those of
+MountainCarContinuous were chosen on two seeds under the truth, which the Zoo's did not solve."""
 LANES = 8
 FILTERS = ("extended", "unscented")
 

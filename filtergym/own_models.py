@@ -66,6 +66,7 @@ def state_space(
     hypotheses: Sequence[Mapping[str, Any]] = (),
     transition: Any = None,
     switching: bool = True,
+    registered: bool = True,
     **parameters: Any,
 ) -> type[StateSpace]:
     """Make an environment of a state-space model and register it: ``x = f(x) + w``, ``z = h(x) + v``.
@@ -106,6 +107,7 @@ def state_space(
             Filters then are interacting multiple models of all of them.
         transition: probabilities that one model follows another (row = from), ``(M, M)``; default: it stays with 0.95.
         switching: whether the world switches; otherwise only the filters take it for possible.
+        registered: whether Gymnasium and the commands find it by its id.
         **parameters: of :class:`filtergym.envs.linear.parameters.StateSpaceParameters` in the training distribution,
             such as ``horizon`` and ``process_noise``.
 
@@ -212,6 +214,9 @@ def state_space(
     attributes |= {"id": id, "__module__": module, "__qualname__": name, "__doc__": StateSpace.__doc__}
     cls: Any = type(name, (StateSpace,), attributes)
     cls.reward = _EstimatedReward(cls, StateSpaceParameters(**parameters))
+    made: type[StateSpace] = cls
+    if not registered:
+        return made
     try:
         register_task(cls, state_space_baselines(cls))
     except ValueError as error:
@@ -220,7 +225,6 @@ def state_space(
         raise
     if module in sys.modules:
         setattr(sys.modules[module], name, cls)
-    made: type[StateSpace] = cls
     return made
 
 

@@ -336,7 +336,7 @@ def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkey
     words = [word for name in ("mine:Mine", "imm", "bptt", "known-turn") for word in ("--policy", name)]
     code, output, errors = command("evaluate", ID, "--episodes", 3, "--set", "horizon=10", *words)
     assert code == 0, errors
-    assert [line for line in output.splitlines() if line.startswith("mine:Mine  ")]
+    assert [line for line in output.splitlines() if line.startswith("> mine:Mine  ")]
     assert output.count("mine:Mine: ") > 1  # why, in sentences: it is the first that is named
     assert re.match(r"mine:Mine: [\d.]+ ", output)  # the first sentence is about the user's own
     assert "cost vs imm, %" in output

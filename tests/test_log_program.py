@@ -558,6 +558,7 @@ def test_every_way_of_reading_a_log_is_decided_for_c():
         "truth": "not read",
         "truth_offset": "not read",
         "rename": "columns of LogSetup and of a Recording",
+        "sort": "refused: a row whose time decreases ends the program",
         "keywords": "parameters of LogSetup and of the request",
     }
     assert set(inspect.signature(read_recording).parameters) == decided.keys()

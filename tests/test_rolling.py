@@ -20,7 +20,7 @@ from filtergym.compiler.library import portable
 from filtergym.compiler.namespace import Traced
 from filtergym.compiler.program import FUNCTIONS, OPERATIONS, Graph, ProgramResult, program
 from filtergym.compiler.rolling import CONSTANTS, SCRATCH, TURN, roll
-from filtergym.exports.traced_filter import ANSWER, MEASUREMENT, STATE
+from filtergym.exports.traced_filter import ANSWER, DERIVED, INITIAL, MEASUREMENT, STATE
 
 QUICK = [
     ("ManeuveringTarget", "imm"),
@@ -288,8 +288,13 @@ def test_loops_of_llvm_have_the_bits_of_the_straight_line(lane_first):
 def test_a_filter_in_loops_has_the_bits_of_its_straight_line(environment, name):
     """Start and three measurements."""
     traced, given = replayed(environment, name, episodes=2, measurements=3)
-    state = interpret(traced.start, lambda _, row: given.initial[row])
-    assert_same_bits(run_loops(traced.start, lambda _, row: given.initial[row]), state)
+    own = list(traced.free.usual)
+    derived = own[: traced.free.kept]
+    kept = dict(enumerate(derived, len(traced.state) - len(derived)))
+    start = {INITIAL: given.initial, DERIVED: own, STATE: kept}
+    state = interpret(traced.start, lambda argument, row: start[argument][row])
+    assert_same_bits(run_loops(traced.start, lambda argument, row: start[argument][row]), state)
+    state = [*state, *derived]
     answers = np.random.default_rng(0).uniform(0.2, 0.8, (64, 2))
     for measured in given.measurements:
         structures = {STATE: state, MEASUREMENT: measured, ANSWER: answers}
@@ -304,4 +309,5 @@ def test_a_filter_in_loops_has_the_bits_of_its_straight_line(environment, name):
         assert_same_bits(found, expected)
         if traced.shown:
             assert_same_bits(told[0], expected[: traced.shown])
-        state = expected[traced.shown : traced.shown + len(traced.state)]
+        end = traced.shown + len(traced.state) - len(derived)
+        state = [*expected[traced.shown : end], *derived]

@@ -9,7 +9,7 @@ from ...envs.contract.model import Model
 from ...envs.contract.observation import Reader
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
 from ...filters import class_fusion, imm
-from ..alarm import Alarm
+from ..alarm import Alarm, innovation_evidence
 
 REFUSAL_SHARE = 0.5
 """Share of decisions that the gate refuses where a second emitter is heard; ours."""
@@ -72,3 +72,23 @@ class ClassAlarm(Alarm):
         return numpy.logaddexp.reduce(self.log_prior + fixed) - numpy.logaddexp.reduce(
             self.log_prior + redrawn
         )
+
+
+class InnovationsAlarm(Alarm):
+    """Innovations of all hypotheses of control ``hypotheses`` together that are larger, smaller or to one side."""
+
+    window = 50
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.innovation: Reader = model.reader("innovation")
+
+    def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
+        """Return the log-likelihood ratios of range and range rate."""
+        innovation = self.innovation(observation)
+        return innovation_evidence(innovation, numpy.ones_like(innovation, dtype=bool))
+
+
+def make_alarm(model: Model) -> Alarm:
+    """Return the alarm of a model's control."""
+    return InnovationsAlarm(model) if model.control == "hypotheses" else ClassAlarm(model)

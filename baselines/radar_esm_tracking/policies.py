@@ -17,7 +17,7 @@ from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
 from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
-from .alarm import ClassAlarm
+from .alarm import make_alarm
 from .metrics import METRICS
 from .references import Ideal, KnownDrawBound
 
@@ -260,7 +260,7 @@ BASELINES = Baselines(
     score_reference="ideal",
     tunable=TUNABLE,
     fallback="exact-bayes-vague",
-    alarm=ClassAlarm,
+    alarm=make_alarm,
     physical=("rmse", "acceleration"),
     benchmark=(
         "quasi-optimal",

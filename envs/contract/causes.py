@@ -26,12 +26,12 @@ RESERVED = ("all", "start", "other")
 
 
 class Moment(NamedTuple):
-    """What causes are computed from, at one measurement of N episodes."""
+    """State of N episodes at one measurement, from which causes are computed."""
 
     xp: ModuleType
     """Array namespace."""
     context: Mapping[str, Array]
-    """What the world tells of the episode, see :meth:`.World.context`; of a recording none of it."""
+    """Context that the world reports of the episode, see :meth:`.World.context`; none of a recording."""
     state: Array
     """True values of the task's components, ``(C, N)``; NaN where a recording does not know them."""
     measurement: Any
@@ -42,7 +42,9 @@ class Moment(NamedTuple):
     """Standard deviations that are stated for their errors, ``(C, N)``."""
 
     def knows(self, *names: str) -> bool:
-        """Whether the context tells all of these, and each of something: of no commands there are no times."""
+        """Return whether the context has all of these names, none of them empty: without commands there are no
+        times.
+        """
         return all(name in self.context and 0 not in self.context[name].shape for name in names)
 
 
@@ -103,7 +105,7 @@ def context_flag(name: str) -> Callable[[Moment], Array | None]:
 
 
 def _is_missed(moment: Moment) -> Array | None:
-    """Whether something that is available at other times is not, ``(N,)``."""
+    """Return whether something that is available at other times is not, ``(N,)``."""
     available = getattr(moment.measurement, "available", None)
     if available is None:
         return None
@@ -114,7 +116,7 @@ def _is_missed(moment: Moment) -> Array | None:
 
 
 def _is_outlier(moment: Moment) -> Array | None:
-    """Whether the error of a reading is beyond ``LARGE_ERROR`` stated deviations, ``(N,)``."""
+    """Return whether the error of a reading is beyond ``LARGE_ERROR`` stated deviations, ``(N,)``."""
     if moment.readings is None or moment.deviations is None:
         return None
     error = moment.xp.abs(moment.readings - moment.state)
@@ -135,7 +137,7 @@ class Causes(NamedTuple):
 
     @classmethod
     def of(cls, task: Any) -> "Causes":
-        """Causes of a task, by default missed measurements."""
+        """Return the causes of a task, by default missed measurements."""
         return find_companion(task, cls) or cls()
 
 

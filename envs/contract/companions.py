@@ -1,4 +1,4 @@
-"""What goes with a problem beside its declaration, each an object found by its type and absent where there is none.
+"""Companions of a problem: optional objects beside its declaration, found by their types.
 
 :attr:`.Task.companions` names them. The contract needs none of them: each is read by what it is for, with
 :func:`find_companion`. Further ones stand where their subject does: :class:`~.causes.Causes`,
@@ -24,17 +24,17 @@ def find_companion(task: Any, kind: type[Companion]) -> Companion | None:
 
 
 class Paper(NamedTuple):
-    """Where a problem comes from."""
+    """Source of a problem."""
 
     source: str
     """Reference of the paper."""
 
 
 class Actions(NamedTuple):
-    """What actions mean."""
+    """Meanings of actions."""
 
     meanings: Mapping[str, str]
-    """What an action means under each control, in words."""
+    """Return the meaning of an action under each control, in words."""
     reach: Mapping[str, tuple[str, ...]] = {}
     """Parameters that say how far an action reaches, or how long it holds, by control or trained bank. A learned policy
     keeps those that it was trained with: under others the same numbers would be other actions."""
@@ -50,17 +50,17 @@ class TrainedBanks(NamedTuple):
 
 
 class LostTracks(NamedTuple):
-    """When a track counts as lost, and why a filter lost it."""
+    """Criterion of a lost track, and the explanation of a loss."""
 
     cost: float | None = None
-    """Mean cost of an episode beyond which its track counts as lost; None where that is not said."""
+    """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
     explain: Callable[[Any, Array, Array, Any], str] | None = None
     """From the task, the last valid mean ``(C, N)``, its covariance ``(C, C, N)`` and the measurement that the filter
     took in, of N lanes: a sentence on why it lost an episode there, empty where there is none."""
 
 
 class ArrayMeanings(NamedTuple):
-    """What arrays hold, in words for those who fill them in or read them in another program."""
+    """Meanings of arrays, in words for users of another program."""
 
     measurement: str = ""
     """What the numbers of a measurement are, in a sentence; empty where names say it."""
@@ -70,14 +70,14 @@ class ArrayMeanings(NamedTuple):
 
 
 class PictureMaker(NamedTuple):
-    """What draws an episode, where the general picture is not enough."""
+    """Class that draws an episode where the general picture is not enough."""
 
     make: Callable[[Any], Any]
     """From a model to its :class:`~.rendering.Picture`, or None for the general one. It imports what draws."""
 
 
 class FlightScenarios(NamedTuple):
-    """How a problem makes a scenario in which every episode flies one of a user's flights."""
+    """Function that makes a scenario in which every episode flies one of a user's flights."""
 
     make: Callable[[Any, Mapping[str, Any]], Any]
     """From a :class:`~.trajectory.Trajectory` or :class:`~.flights.Flights` and the keywords of ``gym.make`` beside the
@@ -85,36 +85,36 @@ class FlightScenarios(NamedTuple):
 
 
 class LoopRecords(NamedTuple):
-    """What else an evaluation keeps of each measurement, beside what filter and world report."""
+    """Further records of each measurement, beside those of filter and world."""
 
     report: Callable[[Any, Any, dict[str, Array]], dict[str, Array]]
     """From the model, the episode after the action and what filter and world report, see :meth:`.Filter.records`."""
 
 
 def trained_banks(task: Any) -> Mapping[str, type]:
-    """Trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
+    """Return the trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
     found = find_companion(task, TrainedBanks)
     return {} if found is None else found.banks
 
 
 def action_reach(task: Any, control: str) -> tuple[str, ...]:
-    """Parameters that say how far an action of a control reaches, see :class:`Actions`."""
+    """Return the parameters that say how far an action of a control reaches, see :class:`Actions`."""
     found = find_companion(task, Actions)
     return () if found is None else found.reach.get(control, ())
 
 
 def action_meanings(task: Any) -> Mapping[str, str]:
-    """What an action means under each control, in words."""
+    """Return the meaning of an action under each control, in words."""
     found = find_companion(task, Actions)
     return {} if found is None else found.meanings
 
 
 def lost_cost(task: Any) -> float | None:
-    """Mean cost of an episode beyond which its track counts as lost; None where that is not said."""
+    """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
     found = find_companion(task, LostTracks)
     return None if found is None else found.cost
 
 
 def array_meanings(task: Any) -> ArrayMeanings:
-    """What arrays of a task hold, in words that may be empty."""
+    """Return the meanings of arrays of a task, in words that may be empty."""
     return find_companion(task, ArrayMeanings) or ArrayMeanings()

@@ -1,4 +1,4 @@
-"""What an action means to a bank of filters: mode, weights, evidence; or factors of a filter's settings."""
+"""Controls of a bank of filters: mode, weights, evidence; or factors of a filter's settings."""
 
 import math
 from abc import abstractmethod
@@ -16,7 +16,7 @@ from .observation import Array
 
 
 def bank_action_space(control: str, count: int) -> gymnasium.Space[Any]:
-    """Action space of a control over a bank of ``count`` hypotheses.
+    """Return the action space of a control over a bank of ``count`` hypotheses.
 
     ``mode``: the one hypothesis that is believed. ``weights``: absolute weights, normalised by the task (all
     zero = uniform). ``evidence``: scaled and added to the log-posterior of Bayes' rule; zero is the paper.
@@ -35,7 +35,7 @@ def bank_probabilities(
     evidence_scale: float,
     xp: ModuleType,
 ) -> Array:
-    """Weights of the bank that an action puts in force, ``(M, N)``.
+    """Return the weights of the bank that an action puts in force, ``(M, N)``.
 
     Args:
         control: "mode", "weights" or "evidence".
@@ -67,11 +67,11 @@ class SteerableFilter(Filter[TaskT, Measurement, State]):
     a new policy explores, costs a twentieth at most."""
 
     def heeds(self, measurement: Measurement) -> Array:
-        """One where an action does something, zero where nothing is measured, ``(N,)``."""
+        """Return one where an action has an effect, zero where nothing is measured, ``(N,)``."""
         return 1.0
 
     def examine(self, state: State, measurement: Measurement) -> Any:
-        """What it makes of a measurement without an action, of which a bank shows something; here its state after it.
+        """Return the result of a measurement without an action, from which a bank is observed; here the state after it.
 
         Args:
             state: after :meth:`predict`.
@@ -129,9 +129,9 @@ class SettingsBank(Bank[Any, Any, Any]):
         return state._replace(own=own, action=shown)
 
     def mean(self, state: Any) -> Array:
-        """That of the filter."""
+        """Return that of the filter."""
         return self.own.mean(state.own)
 
     def covariance(self, state: Any) -> Array:
-        """That of the filter."""
+        """Return that of the filter."""
         return self.own.covariance(state.own)

@@ -36,7 +36,7 @@ class Draws:
 
     @classmethod
     def counting(cls, average: Array, xp: ModuleType) -> "Draws":
-        """Draws that always give one half and count in ``used`` what is asked for.
+        """Return the draws that always give one half and count in ``used`` what is asked for.
 
         Args:
             average: ``(1, N)``, all one half.
@@ -62,11 +62,11 @@ class Draws:
         return values
 
     def unit(self, name: str, count: int | None = None) -> Array:
-        """Uniform on [0, 1)."""
+        """Return the uniform on [0, 1)."""
         return self._keep(name, self._rows(count))
 
     def uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Uniform between two limits."""
+        """Return the uniform between two limits."""
         low, high = limits
         return self._keep(name, low + (high - low) * self._rows(count))
 
@@ -76,12 +76,12 @@ class Draws:
         return self._keep(name, low * self.xp.exp(math.log(high / low) * self._rows(count)))
 
     def integer(self, name: str, limits: Sequence[int], count: int | None = None) -> Array:
-        """Whole number from the first to the last, all equally probable, as a float."""
+        """Return the whole number from the first to the last, all equally probable, as a float."""
         first, last = limits
         return self._keep(name, first + self.xp.floor((last - first + 1) * self._rows(count)))
 
     def event(self, name: str, probability: float, count: int | None = None) -> Array:
-        """Boolean, true with a probability."""
+        """Return the boolean, true with a probability."""
         return self._keep(name, self._rows(count) < probability)
 
     def category(self, name: str, thresholds: Sequence[Array]) -> Array:
@@ -100,7 +100,9 @@ def draw_between(draw: Callable[..., Array], name: str, limits: tuple[float, flo
 
 
 def category(uniform: Array, thresholds: Sequence[Array], xp: ModuleType) -> Array:
-    """Index of the interval between cumulative ``thresholds`` that a uniform number falls into, ``(N,)``."""
+    """Return the index of the interval between cumulative ``thresholds`` that a uniform number falls into,
+    ``(N,)``.
+    """
     index = xp.zeros_like(uniform, dtype=xp.int64)
     for threshold in thresholds:
         index = index + xp.astype(uniform >= threshold, xp.int64)
@@ -116,7 +118,7 @@ class StepSignal(NamedTuple):
     """Of the steps, ascending, ``(J, N)``: numbers of measurements, or s."""
 
     def at(self, time: Array, xp: ModuleType) -> Array:
-        """Value at a time, ``(..., N)``."""
+        """Return the value at a time, ``(..., N)``."""
         value = self.values[0]
         for i in range(self.times.shape[0]):
             value = xp.where(time >= self.times[i], self.values[i + 1], value)
@@ -124,5 +126,5 @@ class StepSignal(NamedTuple):
 
 
 def within(time: Array, window: Array) -> Array:
-    """Whether a time lies in a window: not before its first row, but before its second one, ``(N,)``."""
+    """Return whether a time lies in a window: not before its first row, but before its second one, ``(N,)``."""
     return (time >= window[0]) & (time < window[1])

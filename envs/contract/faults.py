@@ -1,4 +1,4 @@
-"""What a world may do to its sensors: the parts that it lists, and the errors that more than one environment has."""
+"""Disturbances of sensors: the parts that a world lists, and the errors that more than one environment has."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +12,7 @@ from .task_base import TaskBase
 
 
 class DisturbanceInput(NamedTuple):
-    """A measurement, as a disturbance meets it."""
+    """A measurement on its way through the disturbances."""
 
     number: Array
     """Of the measurement, from 1 on, ``(N,)``."""
@@ -43,18 +43,18 @@ def undisturbed(draws: Draws, parameters: Any) -> Array | None:
 
 
 class Disturbance(ABC):
-    """One thing that a world may do to its sensors, with a name, draws, an effect and causes.
+    """A disturbance of sensors, with a name, draws, an effect and causes.
 
-    It is drawn with the episode, moves on with every measurement, and acts where a method says so: on the deviations of
-    the white errors, on errors, on what is read, or on the whole measurement. What it has drawn and where it stands is
-    its state, nested NamedTuples of arrays ``(..., N)``. By default nothing is drawn, nothing moves and nothing is
-    changed.
+    It is drawn with the episode, moves on with every measurement, and acts through the methods that it defines: on the
+    deviations of the white errors, on errors, on what is read, or on the whole measurement. What it has drawn and where
+    it stands is its state, nested NamedTuples of arrays ``(..., N)``. By default nothing is drawn, nothing moves and
+    nothing is changed.
 
     Args:
         task: with its parameters.
 
     Attributes:
-        name: under which the truth holds its state, and by which a reference says that it knows it.
+        name: under which the truth holds its state, and by which a reference declares that it knows it.
         causes: circumstances by which an evaluation splits costs.
         initial_normals: standard normal numbers that it takes at the start of the track.
         normals: standard normal numbers that it takes at each measurement.
@@ -73,7 +73,7 @@ class Disturbance(ABC):
 
     @classmethod
     def is_in(cls, parameters: Any) -> bool:
-        """Whether a task of these parameters has it; by default every one has."""
+        """Return whether a task of these parameters has it; by default every one has."""
         return True
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Any:
@@ -104,23 +104,25 @@ class Disturbance(ABC):
         return state
 
     def advance(self, state: Any, step: DisturbanceInput) -> Any:
-        """State at a measurement, from that at the one before."""
+        """Return the state at a measurement, from that at the one before."""
         return state
 
     def change_deviations(self, state: Any, deviations: Array) -> Array:
-        """Standard deviations of the white errors over the usual ones, ``(..., N)``, with what it does to them."""
+        """Return the standard deviations of the white errors over the usual ones, ``(..., N)``, with what it does
+        to them.
+        """
         return deviations
 
     def change_errors(self, state: Any, errors: Array) -> Array:
-        """Errors, ``(n, N)`` in the world's units of them, with what it does to them."""
+        """Return the errors, ``(n, N)`` in the world's units of them, with what it does to them."""
         return errors
 
     def change_reading(self, state: Any, reading: Array) -> tuple[Any, Array]:
-        """State and what the sensor reads, ``(n, N)`` in its own coordinates, with what it does to them."""
+        """Return the state and what the sensor reads, ``(n, N)`` in its own coordinates, with what it does to them."""
         return state, reading
 
     def change_measurement(self, state: Any, measurement: Any, step: DisturbanceInput) -> tuple[Any, Any]:
-        """State and measurement with what it does to them.
+        """Return the state and measurement with what it does to them.
 
         Args:
             state: of :meth:`advance`.
@@ -187,7 +189,7 @@ class Disturbances:
         return self._draw(lambda part: part.begin(draws, shares[part.name], zero))
 
     def complete(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
-        """States with what only some scenarios draw."""
+        """Return the states with what only some scenarios draw."""
         return self._draw(lambda part: part.complete(states[part.name], draws))
 
     def _draw(self, draw: Callable[[Disturbance], Any]) -> dict[str, Any]:
@@ -196,7 +198,7 @@ class Disturbances:
         return {part.name: states[part.name] for part in self.parts}
 
     def quiet(self, states: dict[str, Any], calm: Array | None) -> dict[str, Any]:
-        """States with no hidden disturbance in some episodes, see :func:`undisturbed`."""
+        """Return the states with no hidden disturbance in some episodes, see :func:`undisturbed`."""
         if calm is None:
             return states
         return {part.name: part.quiet(states[part.name], calm) for part in self.parts}
@@ -204,7 +206,7 @@ class Disturbances:
     def share(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
     ) -> dict[str, DisturbanceInput]:
-        """Hand out a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
+        """Return the hand out a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
         steps, n, u = {}, 0, 0
         for part in self.parts:
             own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
@@ -213,23 +215,23 @@ class Disturbances:
         return steps
 
     def advance(self, states: Mapping[str, Any], steps: Mapping[str, DisturbanceInput]) -> dict[str, Any]:
-        """States at a measurement."""
+        """Return the states at a measurement."""
         return {part.name: part.advance(states[part.name], steps[part.name]) for part in self.parts}
 
     def change_deviations(self, states: Mapping[str, Any], deviations: Array) -> Array:
-        """Standard deviations of the white errors over the usual ones with what each does to them."""
+        """Return the standard deviations of the white errors over the usual ones with what each does to them."""
         for part in self.parts:
             deviations = part.change_deviations(states[part.name], deviations)
         return deviations
 
     def change_errors(self, states: Mapping[str, Any], errors: Array) -> Array:
-        """Errors with what each does to them."""
+        """Return the errors with what each does to them."""
         for part in self.parts:
             errors = part.change_errors(states[part.name], errors)
         return errors
 
     def change_reading(self, states: Mapping[str, Any], reading: Array) -> tuple[dict[str, Any], Array]:
-        """States and what the sensor reads, with what each does to them."""
+        """Return the states and what the sensor reads, with what each does to them."""
         changed = dict(states)
         for part in self.parts:
             changed[part.name], reading = part.change_reading(changed[part.name], reading)
@@ -238,7 +240,7 @@ class Disturbances:
     def change_measurement(
         self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, DisturbanceInput]
     ) -> tuple[dict[str, Any], Any]:
-        """States and measurement with what each does to them."""
+        """Return the states and measurement with what each does to them."""
         changed = dict(states)
         for part in self.parts:
             own = changed[part.name], measurement, steps[part.name]
@@ -246,11 +248,11 @@ class Disturbances:
         return changed, measurement
 
     def context(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """What all report of what was drawn."""
+        """Return the draws that all report."""
         return {name: v for part in self.parts for name, v in part.context(states[part.name]).items()}
 
     def records(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """What all report for an evaluation to keep."""
+        """Return the records of all."""
         return {name: v for part in self.parts for name, v in part.records(states[part.name]).items()}
 
 
@@ -260,7 +262,7 @@ def causes_of(kinds: Sequence[type[Disturbance]]) -> tuple[Cause, ...]:
 
 
 class Outliers(Disturbance):
-    """Measurements whose errors are larger than stated, each one on its own; nobody says so.
+    """Measurements whose errors are larger than stated, each one on its own, and which is not reported.
 
     Its state is the standard deviation of this measurement's errors over that of usual ones, ``(N,)``.
 
@@ -283,7 +285,7 @@ class Outliers(Disturbance):
     @staticmethod
     @abstractmethod
     def limits(parameters: Any) -> tuple[float, float]:
-        """Probability and factor."""
+        """Return the probability and factor."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
         """Start with a usual one."""
@@ -304,12 +306,12 @@ class Glint(Outliers):
 
     @classmethod
     def is_in(cls, parameters: Any) -> bool:
-        """Whether any measurement may be one."""
+        """Return whether any measurement may be one."""
         return bool(parameters.glint_probability > 0.0)
 
     @staticmethod
     def limits(parameters: Any) -> tuple[float, float]:
-        """Those of glint."""
+        """Return the limits of glint."""
         return parameters.glint_probability, parameters.glint_factor
 
     def change_errors(self, state: Array, errors: Array) -> Array:
@@ -358,7 +360,8 @@ class ColouredErrorsState(NamedTuple):
 
 
 class ColouredErrors(Disturbance):
-    """Errors that last from measurement to measurement, beside the white ones, at a fixed interval; nobody says so.
+    """Errors that last from measurement to measurement, beside the white ones, at a fixed interval, which is not
+    reported.
 
     Args:
         task: with its parameters.
@@ -400,7 +403,7 @@ class ColouredErrors(Disturbance):
         return ColouredErrorsState(deviation, state.process._replace(kick=kick), level)
 
     def advance(self, state: ColouredErrorsState, step: DisturbanceInput) -> ColouredErrorsState:
-        """Let them wander."""
+        """Advance the errors by a measurement."""
         return (
             state._replace(level=state.process.advance(state.level, step.normals)) if self.normals else state
         )

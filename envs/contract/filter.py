@@ -1,8 +1,8 @@
-"""What estimates.
+"""Filters, and the likelihood that they report.
 
-A **filter** starts where everyone starts, predicts to every measurement, updates with it, and reports mean and
-covariance. Everything that competes is one: a bank of filters that a policy steers, an estimator of a user,
-a learned estimator, a reference that is told more, a bound. So there is one rollout and one compilation for all.
+A **filter** starts at the initial estimate given to every filter, predicts to every measurement, updates with it, and
+reports mean and covariance. Everything that competes is one: a bank of filters that a policy steers, an estimator of a
+user, a learned estimator, a reference that is given more, a bound. So there is one rollout and one compilation for all.
 
 State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last axis, and are never changed in place.
 """
@@ -42,14 +42,14 @@ class FilterInput(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """How well a filter has predicted a measurement."""
+    """Likelihood of a measurement under its prediction."""
 
     log_likelihood: Array
     """Log-density of the measurement as it was predicted, in nats, ``(N,)``; NaN where nothing was received."""
     nis: Array = None
     """Normalised innovation squared, ``(N,)``; None where it is not known."""
     nis_degrees: Array = None
-    """Numbers of the measurement that it counts, ``(N,)``; likewise."""
+    """Degrees of freedom of the NIS, ``(N,)``; None where they are not known."""
 
     @classmethod
     def of(cls, values: Any) -> "Likelihood":
@@ -63,7 +63,7 @@ class Likelihood(NamedTuple):
 
     @classmethod
     def told(cls, records: Mapping[str, Array]) -> "Likelihood":
-        """What the records of a filter tell of it, see :meth:`Filter.records`; None for the rest."""
+        """Return the likelihood in the records of a filter, see :meth:`Filter.records`; None for missing parts."""
         return cls(*(records.get(name) for name in cls._fields))
 
     def fill_unknown(self, like: Array) -> "Likelihood":
@@ -73,12 +73,12 @@ class Likelihood(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """What is stated by a filter that does not always state everything; the rest is NaN."""
+    """Estimate of a filter that does not always report all of it; the rest is NaN."""
 
     components: tuple[bool, ...]
     """Which components it estimates, ``(C,)``."""
     deviations: tuple[bool, ...]
-    """Of which it says how large its errors are, ``(C,)``."""
+    """Components whose errors it estimates, ``(C,)``."""
 
 
 class EstimateState(NamedTuple):
@@ -90,7 +90,7 @@ class EstimateState(NamedTuple):
 
 
 class Filter(ABC, Generic[TaskT, Measurement, State]):
-    """What estimates, batch last: arrays of N episodes are ``(..., N)``. Policies have the batch first.
+    """A filter, batch last: arrays of N episodes are ``(..., N)``. Policies have the batch first.
 
     Args:
         task: the estimation problem, with the constants that world and filter share.
@@ -116,25 +116,27 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """What the action may be; here there is none to choose."""
+        """Action space; here without a choice."""
         return gymnasium.spaces.Discrete(1)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What an agent is shown, of this state and the measurement, in order."""
+        """Observation blocks of this state and the measurement, in order."""
         return ()
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """What else a policy can read from an observation."""
+        """Further quantities that a policy can read from an observation."""
         return ()
 
     @abstractmethod
     def start(self, initial: Any) -> State:
-        """State at the start of the track, of the task's :class:`Initial`."""
+        """Return the state at the start of the track, of the task's :class:`Initial`."""
 
     def initialise(self, given: FilterInput) -> State:
-        """State at the start of the track, of all that the filter is given: the initial estimate as measurement."""
+        """Return the state at the start of the track, of all that the filter is given: the initial estimate as
+        measurement.
+        """
         return self.start(given.measurement)
 
     def predict(self, state: State, measurement: Measurement) -> State:
@@ -151,16 +153,18 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         """
 
     def step(self, state: State, given: FilterInput) -> State:
-        """Predict to a measurement and take it in, where nobody acts between."""
+        """Predict to a measurement and take it in, without an action in between."""
         return self.update(self.predict(state, given.measurement), given)
 
     def mean(self, state: State) -> Array:
-        """Estimate of the task's components, after :meth:`update`, ``(C, N)``; by default the state's ``mean``."""
+        """Return the estimate of the task's components, after :meth:`update`, ``(C, N)``; by default the state's
+        ``mean``.
+        """
         mean: Array = state.mean  # type: ignore[attr-defined]
         return mean
 
     def covariance(self, state: State) -> Array:
-        """Covariance that is reported for it, ``(C, C, N)``; by default the state's ``covariance``."""
+        """Return the covariance that is reported for it, ``(C, C, N)``; by default the state's ``covariance``."""
         covariance: Array = state.covariance  # type: ignore[attr-defined]
         return covariance
 
@@ -178,7 +182,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
         ``mode_probability``.
 
-        How well the measurement was predicted is told by ``log_likelihood`` (log-density of the measurement as it was
+        The quality of the prediction is reported by ``log_likelihood`` (log-density of the measurement as it was
         predicted, NaN where nothing was received), ``nis``, the normalised innovation squared, and ``nis_degrees``, its
         dimension. By default those of the state's ``likelihood``, if it has one.
         """
@@ -201,12 +205,12 @@ class Bank(Filter[TaskT, Measurement, State]):
     @property
     @abstractmethod
     def action_space(self) -> gymnasium.Space[Any]:
-        """What the action may be."""
+        """Action space."""
 
     @property
     @abstractmethod
     def blocks(self) -> Sequence[Block]:
-        """What the agent is shown, of this state and the measurement, in order."""
+        """Observation blocks of this state and the measurement, in order."""
 
     @abstractmethod
     def predict(self, state: State, measurement: Measurement) -> State:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .task import Task
 
 LARGEST = 1e15
-"""Of what a sensor says: nothing in SI units is larger here, and its square is still a number."""
+"""Largest reading of a sensor: nothing in SI units is larger here, and its square is still a number."""
 Memory = dict[str, Any]
 """What an input remembers of the measurements before: values by name."""
 
@@ -31,12 +31,12 @@ class LiveInput:
     Args:
         task: on NumPy arrays.
         initial: an initial estimate, for its names and shapes.
-        measurement: a measurement, likewise.
+        measurement: a measurement, for its shapes and types.
         tracks: how many come side by side, N.
 
     Attributes:
         values: names of what it takes at a measurement, and what they are.
-        start_values: likewise at the start, beside mean and covariance.
+        start_values: names and descriptions of the values at the start, beside mean and covariance.
         lanes: shape of the axis of tracks: ``(N,)``, or empty of one track.
     """
 
@@ -120,7 +120,7 @@ class LiveInput:
             )
 
     def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Initial estimate of the task's NamedTuple, arrays ``(..., N)`` also of one track, and memory.
+        """Return the initial estimate of the task's NamedTuple, arrays ``(..., N)`` also of one track, and memory.
 
         Args:
             time: of the start, s, ``(N,)``, of one track a float.
@@ -137,11 +137,11 @@ class LiveInput:
         return type(self.initial)(**found), {"time": time, "count": self.same_of_all(0.0)}
 
     def same_of_all(self, number: float, shape: tuple[int, ...] = ()) -> Any:
-        """One number in every place, ``(*shape, N)``, of one track ``shape``."""
+        """Return one number in every place, ``(*shape, N)``, of one track ``shape``."""
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 
     def _read_finite(self, given: Mapping[str, Any], name: str, like: numpy.ndarray, what: str) -> Any:
-        """Return a value as :meth:`read` does, rounded as the type of an array says.
+        """Return a value as :meth:`read` does, rounded to the type of an array.
 
         Raises:
             ValueError: for what is missing or not finite.
@@ -184,7 +184,7 @@ class LiveInput:
         return type(self.measurement)(**made), {**memory, "time": time, "count": count}
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
-        """Initial mean and covariance from the first two measurements, each with its ``time``.
+        """Return the initial mean and covariance from the first two measurements, each with its ``time``.
 
         Raises:
             ValueError: if two measurements start no track here, or one lacks what it takes.
@@ -192,7 +192,7 @@ class LiveInput:
         raise ValueError(f"a track of {self.task.id} does not start from two measurements: call start")
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
-        """Numbers that stand for what was not received; zeros."""
+        """Return the numbers that stand for what was not received; zeros."""
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
 
 
@@ -209,11 +209,11 @@ class LiveValues:
         self.values = values
 
     def has(self, *names: str) -> bool:
-        """Whether all of these are given."""
+        """Return whether all of these are given."""
         return all(self.values.get(name) is not None for name in names)
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Value of each track, ``(N,)``; NaN where none came."""
+        """Return the value of each track, ``(N,)``; NaN where none came."""
         return numpy.atleast_1d(self.input.read(self.values, name))
 
     def place(self, number: int) -> str:
@@ -221,7 +221,7 @@ class LiveValues:
         return f"track {number}"
 
     def deviations(self, name: str) -> Any:
-        """Standard deviations, ``(N,)``, of one track a float; NaN where none is stated.
+        """Return the standard deviations, ``(N,)``, of one track a float; NaN where none is stated.
 
         Raises:
             ValueError: if one is not above zero.
@@ -233,13 +233,13 @@ class LiveValues:
 
 
 class LiveReader(NamedTuple):
-    """How values that come one by one become measurements of a problem."""
+    """Conversion of single values to measurements of a problem."""
 
     input: type[LiveInput] = LiveInput
 
     @classmethod
     def of(cls, task: Any) -> "LiveReader":
-        """Reader of a task, or of a class of tasks; by default that of the arrays by their names."""
+        """Return the reader of a task, or of a class of tasks; by default that of the arrays by their names."""
         return find_companion(task, cls) or cls()
 
 

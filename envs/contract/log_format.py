@@ -1,4 +1,4 @@
-"""What sensors report, as rows of a table and as values that come live, and what an environment makes of a table."""
+"""Readings of sensors as rows of a table and as live values, and the reading of a table."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Column(NamedTuple):
 
     @property
     def live_text(self) -> str:
-        """What it is where it comes live."""
+        """Description of the live value."""
         return self.live or self.text
 
 
@@ -36,20 +36,20 @@ class Readings(Protocol):
     """Numbers by the names of their columns: n rows of a table, or what came for n tracks."""
 
     def has(self, *names: str) -> bool:
-        """Whether all of these are given."""
+        """Return whether all of these are given."""
         ...
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Numbers of a column, ``(n,)``; NaN where one did not come."""
+        """Return the numbers of a column, ``(n,)``; NaN where one did not come."""
         ...
 
     def place(self, number: int) -> str:
-        """Where a number stands, such as "row 12"."""
+        """Return the place of a number, such as "row 12"."""
         ...
 
 
 def optional(readings: Readings, name: str, count: int) -> numpy.ndarray:
-    """Numbers of a column that may lack, ``(n,)``; then NaN.
+    """Return the numbers of a column that may lack, ``(n,)``; then NaN.
 
     Args:
         readings: given.
@@ -76,18 +76,18 @@ def check_deviations(readings: Readings, name: str, values: Any) -> None:
 
 
 NO_DEVIATIONS = "no column states deviations"
-"""How whoever assumes deviations begins to say so."""
+"""First words of the source of assumed deviations."""
 UNITS = {"azimuth_sigma": "degrees"}
 """Of deviations that are no metres."""
 
 
 def is_assumed(words: str) -> bool:
-    """Whether words say of deviations that no column states them."""
+    """Return whether words say of deviations that no column states them."""
     return words.startswith(NO_DEVIATIONS)
 
 
 def deviation_words(deviations: Mapping[str, float]) -> str:
-    """Typical deviations in words, such as "sigma_x 13.8 m, sigma_y 13.8 m"."""
+    """Return the typical deviations in words, such as "sigma_x 13.8 m, sigma_y 13.8 m"."""
     return ", ".join(f"{name} {value:.3g} {UNITS.get(name, 'm')}" for name, value in deviations.items())
 
 
@@ -116,16 +116,16 @@ class TrackLog(NamedTuple):
     start: float
     """Time of the start of the track, s, as in the table."""
     time: numpy.ndarray
-    """Of the measurements, likewise, ``(T,)``."""
+    """Recording of each measurement, ``(T,)``."""
     notes: tuple[str, ...] = ()
     """What was done to the table, a line each."""
     typical: Mapping[str, float] = {}
     """Parameters that are a typical size of what the table states of its errors, and may differ from track to track;
-    nobody has set them."""
+    the user has not set them."""
     deviations: Mapping[str, float] = {}
     """Typical deviations of what was measured, in the names and units of the columns that state them, or would."""
     deviations_from: str = ""
-    """Who says so, in words."""
+    """Source of the deviations, in words."""
 
 
 class Predicted(NamedTuple):
@@ -138,7 +138,7 @@ class Predicted(NamedTuple):
 
 
 class PlainRows(NamedTuple):
-    """How the rows of a table are measurements as they stand, where no more is done to them: the ``Measurement`` has
+    """Rows of a table that are measurements without a conversion: the ``Measurement`` has
     ``values`` and ``available``, and perhaps ``interval`` and ``inputs``.
     """
 
@@ -155,7 +155,7 @@ class PlainRows(NamedTuple):
 
 
 class PlotRows(NamedTuple):
-    """How the rows of a table are plots of a track, which starts from the first two of them."""
+    """Rows of a table that are plots of a track, which starts from the first two of them."""
 
     farthest: float
     """m from the origin."""
@@ -207,7 +207,7 @@ class LogFormat:
 
 
 class LogSetup(NamedTuple):
-    """How the log was read that a filter is advised for: what one needs to feed the filter in the same way."""
+    """Reading of the log for which a filter is advised, so that the filter can be run on the same input."""
 
     interval: float
     """Median time between measurements, s: the filter was judged with a missed scan wherever more time passes."""
@@ -218,7 +218,7 @@ class LogSetup(NamedTuple):
     deviations: dict[str, float]
     """Of measurements that state none, in the names and units of the columns."""
     deviations_from: str
-    """Who says so."""
+    """Source of the deviations."""
     origin: dict[str, float]
     """Latitude and longitude, degrees, and usual altitude, m, around which positions were made metres; empty where they
     were metres."""
@@ -226,14 +226,16 @@ class LogSetup(NamedTuple):
     """Measurements of the longest track; zero: not known."""
 
     def scenario(self, task: Any) -> Scenario:
-        """Parameters of a task on logs that are read in the same way, in place of those of a simulated scenario."""
+        """Return the parameters of a task on logs that are read in the same way, in place of those of a simulated
+        scenario.
+        """
         log_format: Any = find_companion(task, LogFormat)
         known = ("horizon", self.horizon), ("decision_interval", log_format.decision_interval)
         return Scenario("log", "", {**{name: value for name, value in known if value}, **self.parameters})
 
     @property
     def plane(self) -> PlaneOrigin | None:
-        """That origin."""
+        """Origin of the plane."""
         return PlaneOrigin(**self.origin) if self.origin else None
 
     @property

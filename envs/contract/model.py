@@ -1,4 +1,4 @@
-"""What runs: a task with a filter in the loop.
+"""The model of an environment: a task with a filter in the loop.
 
 The engine, the Gymnasium classes and every evaluation step a :class:`Model`. Its methods are the clock of the task, see
 :mod:`.task`; on NumPy and torch they are the functions of world and filter one after another, and
@@ -71,11 +71,11 @@ class Model:
 
     @property
     def backend(self) -> str:
-        """What computes its steps: "numpy", "torch", or "compiled"."""
+        """Code that computes its steps: "numpy", "torch", or "compiled"."""
         return "torch" if "torch" in self.task.xp.__name__ else "numpy"
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Positions of named fields in the observation.
+        """Return the positions of named fields in the observation.
 
         Raises:
             ValueError: for a name that is no field.
@@ -126,25 +126,25 @@ class Model:
         return None if maker is None or self.task.recording is not None else maker.make(self)
 
     def truth_for_filter(self, truth: Any) -> Any:
-        """Truth as the filter is given it: None unless it ``knows`` something."""
+        """Return the truth as the filter is given it: None unless it ``knows`` something."""
         return truth if self.filter.knows else None
 
     # --- the filter's part of a step
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
-        """State of the filter at the start of the track."""
+        """Return the state of the filter at the start of the track."""
         return self.filter.initialise(FilterInput(initial, truth))
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
-        """State of the filter when a measurement has come, before it is taken in."""
+        """Return the state of the filter when a measurement has come, before it is taken in."""
         return self.filter.predict(state, measurement)
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
-        """State of the filter when the measurement is taken in, by a bank with the action."""
+        """Return the state of the filter when the measurement is taken in, by a bank with the action."""
         return self.filter.update(state, FilterInput(measurement, truth, action))
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """What a filter gives back to the world, see :meth:`.Task.feedback`; None in an open loop."""
+        """Return the feedback of a filter to the world, see :meth:`.Task.feedback`; None in an open loop."""
         if not self.task.closes_loop:
             return None
         own = self.filter.feedback(state, measurement)
@@ -155,7 +155,7 @@ class Model:
     # --- what the engine calls
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Episode at the start of the track.
+        """Return the episode at the start of the track.
 
         Args:
             uniforms: ``(noise.uniforms, N)``, of the task.
@@ -165,7 +165,7 @@ class Model:
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
+        """Return the steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.task.world.advance(episode.truth, noise, feedback)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
@@ -183,16 +183,16 @@ class Model:
         return episode._replace(filter=self.update_filter(episode.filter, episode.measurement, action, truth))
 
     def mean(self, episode: Episode) -> Array:
-        """Estimate, ``(len(components), N)``, in the units of ``components``."""
+        """Return the estimate, ``(len(components), N)``, in the units of ``components``."""
         return self.filter.mean(episode.filter)
 
     def context(self, episode: Episode) -> dict[str, Array]:
-        """What was drawn for the episode, and what of it holds now: arrays of floats ``(..., N)``."""
+        """Return the draws of the episode, and those in force now: arrays of floats ``(..., N)``."""
         context = self.task.world.context(episode.truth)
         return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
 
     def moment(self, episode: Episode) -> Moment:
-        """What causes are computed from."""
+        """Return the moment from which causes are computed."""
         world, measurement = self.task.world, episode.measurement
         return Moment(
             self.task.xp,
@@ -204,7 +204,7 @@ class Model:
         )
 
     def causes(self, episode: Episode) -> Array:
-        """Which causes of the task hold, ``(N,)``, see :func:`.causes.cause_number`."""
+        """Return the causes of the task that hold, ``(N,)``, see :func:`.causes.cause_number`."""
         return cause_number(Causes.of(self.task).causes, self.moment(episode))
 
     def cost(self, episode: Episode) -> Array:
@@ -212,7 +212,7 @@ class Model:
         return self.task.world.cost(episode.truth, self.filter.mean(episode.filter))
 
     def counted_cost(self, episode: Episode) -> Array:
-        """Part of the cost that the reward counts, ``(N,)``; see :meth:`World.counted_cost`."""
+        """Return the part of the cost that the reward counts, ``(N,)``; see :meth:`World.counted_cost`."""
         return self.task.world.counted_cost(episode.truth, self.filter.mean(episode.filter))
 
     def error(self, episode: Episode) -> Array:
@@ -220,19 +220,20 @@ class Model:
         return self.task.subtract(self.filter.mean(episode.filter), self.task.world.state(episode.truth))
 
     def covariance(self, episode: Episode) -> Array:
-        """Covariance that the estimator reports for its error, ``(C, C, N)``."""
+        """Return the covariance that the estimator reports for its error, ``(C, C, N)``."""
         return self.filter.covariance(episode.filter)
 
     def track(self, episode: Episode) -> dict[str, Array]:
-        """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
+        """Return the data of a picture: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
         ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
         """
         measured = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
         return {**self._truth_and_estimate(episode), **measured}
 
     def picture_track(self, episode: Episode) -> dict[str, Array]:
-        """Arrays that a picture of a track shows: as :meth:`track`, but of the measurement only ``seen``, the readings
-        of the components ``(C, N)``, if the world has any; NaN where a component was not measured.
+        """Return the arrays that a picture of a track shows: as :meth:`track`, but of the measurement only
+        ``seen``, the readings of the components ``(C, N)``, if the world has any; NaN where a component was not
+        measured.
         """
         seen = self.task.world.component_readings(episode.measurement)
         return {**self._truth_and_estimate(episode), **({} if seen is None else {"seen": seen})}
@@ -247,7 +248,7 @@ class Model:
         return {"truth": truth, **estimate}
 
     def records(self, episode: Episode) -> dict[str, Array]:
-        """What else an evaluation keeps of each measurement."""
+        """Return the further records of each measurement."""
         kept = {
             **self.filter.records(episode.filter, episode.measurement),
             **self.task.world.records(episode.truth),

@@ -1,7 +1,7 @@
-"""What an agent is shown, written once: a list of blocks gives fields, observation and decoding.
+"""Observations: a list of blocks gives fields, observation and decoding.
 
 A :class:`Block` is one quantity of the observation: a function of what the filters know, and a
-:class:`Compression` that says how it is shown. The base class of the banks derives the observation from the
+:class:`Compression` with which it is shown. The base class of the banks derives the observation from the
 list, and a :class:`Reader` that gives a quantity back: policies never undo a compression by hand.
 """
 
@@ -32,7 +32,7 @@ class Field(NamedTuple):
 
 
 class Compression(NamedTuple):
-    """How a value is shown, and how it is read back."""
+    """Compression of a value, and its inverse."""
 
     text: str
     """Put in front of the description of a block."""
@@ -50,7 +50,7 @@ def symlog(value: Array, xp: ModuleType) -> Array:
 
 
 def symexp(value: Array, xp: ModuleType) -> Array:
-    """Inverse of :func:`symlog`."""
+    """Return the inverse of :func:`symlog`."""
     return xp.sign(value) * xp.expm1(xp.abs(value))
 
 
@@ -59,7 +59,7 @@ PLAIN = Compression("", None, None)
 
 
 def within(low: float, high: float) -> Compression:
-    """As it is, where that cannot lie outside these limits."""
+    """Return no compression, for values that cannot lie outside these limits."""
     return Compression("", None, None, (low, high))
 
 
@@ -82,7 +82,7 @@ def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
 
 
 def bounded_exponential(shown: numpy.ndarray) -> numpy.ndarray:
-    """Inverse of :func:`bounded_logarithm`."""
+    """Return the inverse of :func:`bounded_logarithm`."""
     return symexp(shown / (1.0 - numpy.abs(shown) / LIMIT), numpy)
 
 
@@ -104,7 +104,7 @@ KEPT_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LO
 def linear_scale(
     factor: float, offset: float = 0.0, limits: tuple[float, float] = (-math.inf, math.inf)
 ) -> Compression:
-    """``factor (x - offset)``, where the unit of the field says what is left to say.
+    """``factor (x - offset)``, where the unit of the field describes the rest.
 
     Args:
         factor: above zero.
@@ -136,7 +136,7 @@ class Block(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """What can be computed from an observation, such as an innovation in metres."""
+    """Quantity that can be computed from an observation, such as an innovation in metres."""
 
     name: str
     unit: str
@@ -190,7 +190,7 @@ class Blocks:
         self._values = [block.value for block in self.blocks]
 
     def observe(self, state: Any, measurement: Any) -> Array:
-        """What is shown, ``(fields, N)``."""
+        """Return the observation, ``(fields, N)``."""
         xp = self.xp
         values = []
         for function in self._values:
@@ -210,7 +210,7 @@ class Blocks:
         return xp.concat(values)
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Positions of named fields.
+        """Return the positions of named fields.
 
         Raises:
             ValueError: for a name that is no field.
@@ -254,7 +254,7 @@ class Blocks:
 
 
 class DecisionMeans:
-    """The fields that are shown as their means over the measurements for which a decision holds.
+    """Fields of the observation that are means over the measurements for which a decision holds.
 
     Args:
         fields: of the observation.
@@ -324,22 +324,22 @@ def innovation_block(
     shown: Compression = SIGNED_LOG,
     over_interval: Interval = "last",
 ) -> Block:
-    """Innovation over a deviation; by default the ``innovation`` that the state keeps."""
+    """Return the innovation over a deviation; by default the ``innovation`` that the state keeps."""
     return Block(name, value, text, parts, shown, over_interval=over_interval)
 
 
 def average_block(name: str, value: Value, text: str, parts: Sequence[str] = ()) -> Block:
-    """Average over the last measurements of what has both signs, such as an innovation."""
+    """Return the average over the last measurements of what has both signs, such as an innovation."""
     return Block(name, value, text, parts, SIGNED_LOG)
 
 
 def nis_block(parts: Sequence[str] = ()) -> Block:
-    """Normalised innovation squared, ``nis`` of the state."""
+    """Return the normalised innovation squared, ``nis`` of the state."""
     return Block("nis", lambda f, _: f.nis, "normalised innovation squared", parts, LOG1P)
 
 
 def log_squared_block(parts: Sequence[str] = ()) -> Block:
-    """Normalised innovation squared, of which the state keeps the logarithm ``log_squared``."""
+    """Return the normalised innovation squared, of which the state keeps the logarithm ``log_squared``."""
     return Block(
         "log_squared_innovation",
         lambda f, _: f.log_squared,
@@ -350,7 +350,7 @@ def log_squared_block(parts: Sequence[str] = ()) -> Block:
 
 
 def average_log_squared_block(average: str, parts: Sequence[str] = ()) -> Block:
-    """Average of :func:`log_squared_block`, ``average_log_squared`` of the state.
+    """Return the average of :func:`log_squared_block`, ``average_log_squared`` of the state.
 
     Args:
         average: over which measurements, in words.
@@ -371,7 +371,7 @@ def expected_nis_block(
     text: str = "the hypotheses' mean normalised innovation squared",
     over_interval: Interval = "last",
 ) -> Block:
-    """Normalised innovation squared that a bank of hypotheses expects; zero where nothing was received.
+    """Return the normalised innovation squared that a bank of hypotheses expects; zero where nothing was received.
 
     Args:
         xp: array namespace.
@@ -396,26 +396,26 @@ def relative_likelihood_block(
     name: str = "log_likelihood",
     value: Callable[[Any], Array] = lambda f: f.log_likelihood,
 ) -> Block:
-    """Log-likelihoods of the hypotheses, less the largest; by default ``log_likelihood`` of the state."""
+    """Return the log-likelihoods of the hypotheses, less the largest; by default ``log_likelihood`` of the state."""
     return Block(name, lambda f, _: value(f) - xp.max(value(f), axis=0), text, parts, shown)
 
 
 def log_density_block(
     value: Value, text: str, name: str = "log_likelihood", over_interval: Interval = "last"
 ) -> Block:
-    """Log-density of a measurement in its usual units."""
+    """Return the log-density of a measurement in its usual units."""
     return Block(name, value, text, shown=BOUNDED_LOG, over_interval=over_interval)
 
 
 def log_predicted_block(
     parts: Sequence[str], text: str = "the logarithm of the predicted probability"
 ) -> Block:
-    """Logarithms of the predicted probabilities, ``log_predicted`` of the state."""
+    """Return the logarithms of the predicted probabilities, ``log_predicted`` of the state."""
     return Block("log_predicted", lambda f, _: f.log_predicted, text, parts, SIGNED_LOG)
 
 
 def predicted_block(parts: Sequence[str], measurement: str = "measurement", of: str = "") -> Block:
-    """Logarithms of the probabilities ``predicted`` by a bank of hypotheses.
+    """Return the logarithms of the probabilities ``predicted`` by a bank of hypotheses.
 
     Args:
         parts: endings of the rows.
@@ -438,12 +438,14 @@ def probability_block(
     name: str = "probability",
     value: Callable[[Any], Array] = lambda f: f.probabilities,
 ) -> Block:
-    """Probabilities of hypotheses, by default ``probabilities`` of the state; rounding may not leave 0 to 1."""
+    """Return the probabilities of hypotheses, by default ``probabilities`` of the state; rounding may not leave 0
+    to 1.
+    """
     return Block(name, lambda f, _: xp.clip(value(f), 0.0, 1.0), text, parts, SHARE)
 
 
 def entropy_block(xp: ModuleType) -> Block:
-    """Entropy of the hypotheses, ``entropy`` of the state."""
+    """Return the entropy of the hypotheses, ``entropy`` of the state."""
     return Block(
         "entropy",
         lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
@@ -457,14 +459,14 @@ def prior_block(
     text: str = "the sigma of the predicted position over that of the measurement",
     value: Value = lambda f, _: f.prior,
 ) -> Block:
-    """Deviation of the prediction over that of the measurement; the state keeps the logarithm ``prior``."""
+    """Return the deviation of the prediction over that of the measurement; the state keeps the logarithm ``prior``."""
     return Block("prior", value, text, parts, KEPT_AS_LOG)
 
 
 def last_action_block(
     parts: Sequence[str] = (), name: str = "last_action", shown: Compression = ACTION
 ) -> Block:
-    """Action that was applied before, ``action`` of the state."""
+    """Return the action that was applied before, ``action`` of the state."""
     return Block(name, lambda f, _: f.action, "action applied before", parts, shown)
 
 
@@ -473,14 +475,14 @@ def last_weight_block(
     value: Callable[[Any], Array] = lambda f: f.probabilities,
     text: str = "weight in force before this scan",
 ) -> Block:
-    """Weights of the hypotheses that were in force before; by default ``probabilities`` of the state."""
+    """Return the weights of the hypotheses that were in force before; by default ``probabilities`` of the state."""
     return Block("last_weight", lambda f, _: value(f), text, parts, SHARE)
 
 
 def availability_block(
     text: str = "1 where a value was received", parts: Sequence[str] = (), over_interval: Interval = "last"
 ) -> Block:
-    """Whether a measurement was received, its ``available``."""
+    """Return whether a measurement was received, its ``available``."""
     return Block(
         "available",
         lambda _, measurement: measurement.available,
@@ -492,7 +494,7 @@ def availability_block(
 
 
 def clock_block(xp: ModuleType, horizon: int, unit: str = "1") -> Block:
-    """Share of the horizon that has passed, from the ``number`` of a measurement."""
+    """Return the share of the horizon that has passed, from the ``number`` of a measurement."""
     return Block(
         "time",
         lambda _, measurement: xp.astype(measurement.number, xp.float64) / horizon,

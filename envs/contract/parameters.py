@@ -5,8 +5,8 @@
         range_sigma: float = parameter(100.0, above=0.0)
         \"\"\"Standard deviation of the range, m (paper).\"\"\"
 
-The type of a field says what a value must be (number, whole number, boolean, word, tuples of them, None);
-:func:`parameter` says what else must hold. Every refusal is a ``ValueError`` with the name, the value and what
+The type of a field determines the values that it takes (number, whole number, boolean, word, tuples of them, None);
+:func:`parameter` declares further limits. Every refusal is a ``ValueError`` with the name, the value and what
 was expected.
 """
 
@@ -23,7 +23,7 @@ import numpy
 
 @dataclasses.dataclass(frozen=True)
 class ParameterLimits:
-    """What must hold for a value beside its type; for each number where the value is a sequence."""
+    """Limits of a value beside its type; of each number where the value is a sequence."""
 
     above: float | None = None
     at_least: float | None = None
@@ -43,7 +43,7 @@ def parameter(default: Any, **limits: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class TaskParameters:
-    """What every task has. Subclasses may give other defaults, and check in :meth:`check` what one field's limits
+    """Parameters of every task. Subclasses may give other defaults, and check in :meth:`check` what one field's limits
     cannot say.
     """
 
@@ -76,7 +76,7 @@ class TaskParameters:
 
 @cache
 def field_limits(cls: type) -> dict[str, tuple[Any, ParameterLimits]]:
-    """Type and limits of every field of a parameters' dataclass."""
+    """Return the type and limits of every field of a parameters' dataclass."""
     hints = typing.get_type_hints(cls)
     return {
         f.name: (hints[f.name], f.metadata.get("limits", ParameterLimits())) for f in dataclasses.fields(cls)
@@ -135,7 +135,7 @@ LARGEST = 1e60
 
 
 def quote_shortened(value: Any, most: int = 80) -> str:
-    """Return a value as Python writes it, on one line and cut where it is long: nobody wants two megabytes."""
+    """Return a value as Python writes it, on one line and shortened where it is long."""
     if isinstance(value, int) and abs(value) >= 10**most:
         return f"a whole number of {value.bit_length() * math.log10(2.0):,.0f} digits"
     if isinstance(value, str | bytes | list | tuple):

@@ -6,7 +6,7 @@ runs. A task knows nothing of Gymnasium and owns no random generator: numbers co
 
 It is made of two halves, and the :class:`Measurement <.model.Episode>` is the only door between them:
 
-* the :class:`World` draws the episode, moves the truth and says what the sensors say;
+* the :class:`World` draws the episode, moves the truth and returns the readings of the sensors;
 * a :class:`~.filter.Filter` predicts and estimates. A task brings a :class:`~.filter.Bank` for each control, which
   also shows what it has found and is steered by an action; :meth:`.Model.with_filter` puts any other filter in its
   place. No filter that competes receives the truth, nor anything else that the world keeps.
@@ -28,8 +28,8 @@ real measurement that is not acted on.
 
 A :class:`Task` is what an author declares; :class:`TaskBase` holds what follows from it, the parameters,
 the constants computed of them and its world. What goes with a problem beside its declaration, such as the format of its
-logs or its picture, is a companion, see :mod:`~.companions`. What runs is a :class:`~.model.Model`: a task with a filter
-in the loop.
+logs or its picture, is a companion, see :mod:`~.companions`. What runs is a :class:`~.model.Model`: a task with a
+filter in the loop.
 
 Arrays inside a task have the batch as their last axis and belong to the namespace ``task.xp`` (NumPy or
 torch). Truth, measurement and the filter's state are NamedTuples of arrays ``(..., N)`` and are never changed
@@ -97,15 +97,15 @@ class PaperPolicy(NamedTuple):
 
 
 class Reward(NamedTuple):
-    """What an estimate costs, and how agents are rewarded for it."""
+    """Cost of an estimate, and the reward for it."""
 
     cost: str
     """What the cost is and its unit, in words."""
     kind: str = "cost"
     """Of the reward that agents get unless another one is asked for, see :mod:`.reward`."""
     unit: float = 1.0
-    """Mean cost of the paper's algorithm in the default scenario, as far as it counts: one in the reward. Where few lost
-    tracks rule that mean, something between them and the median."""
+    """Mean cost of the paper's algorithm in the default scenario, as far as it counts: one in the reward. Where few
+    lost tracks rule that mean, something between them and the median."""
     log_unit: float | None = None
     """Unit of the reward ``log-relative``, about the cost of an ordinary episode, where that is far below ``unit``;
     None where it is the same."""
@@ -134,7 +134,7 @@ class Task(TaskBase):
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     reward: ClassVar[Reward]
-    """What an estimate costs, and how agents are rewarded for it."""
+    """Cost of an estimate, and the reward for it."""
     components: tuple[Component, ...]
     """What is estimated. This and the two attributes below may be set for each instance."""
     modes: tuple[str, ...] = ()
@@ -168,7 +168,7 @@ class Task(TaskBase):
 
 
 def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
-    """Arrays of nested NamedTuples, with the names that lead to them."""
+    """Return the arrays of nested NamedTuples, with the names that lead to them."""
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
             yield from named_arrays(value, f"{prefix}{name}_")
@@ -177,7 +177,7 @@ def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
 
 
 def field_texts(cls: type) -> dict[str, str]:
-    """What the text of a class says below each of its own fields, in one line; nothing where there is no text."""
+    """Return the documentation below each field of a class, in one line; empty where there is none."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):
@@ -193,8 +193,8 @@ def field_texts(cls: type) -> dict[str, str]:
 
 
 def field_words(cls: type) -> dict[str, str]:
-    """The same of a single track in which the field exists: without shapes such as ``(2, N)``, and without a clause on
-    where it is None.
+    """Return the words for a single track in which the field exists: without shapes such as ``(2, N)``, and without a
+    clause on where it is None.
     """
     found = {}
     for name, text in field_texts(cls).items():

@@ -1,4 +1,4 @@
-"""What follows from the declaration of a task: its constants, arrays, episodes and random numbers."""
+"""Derived parts of a task: its constants, arrays, episodes and random numbers."""
 
 import functools
 import importlib
@@ -16,7 +16,7 @@ from .observation import Array
 
 
 class NoiseLayout(NamedTuple):
-    """How many random numbers an episode takes.
+    """Numbers of random numbers of an episode.
 
     At its start these are ``uniforms`` numbers between 0 and 1 for the scenario and ``initial_normals`` standard normal
     ones for the start of the track, then one row for each measurement: ``normals`` standard normal numbers followed by
@@ -30,7 +30,8 @@ class NoiseLayout(NamedTuple):
 
 
 class TaskBase(ABC):
-    """What is computed of a task that is declared: its parameters on arrays, its world, and how its episodes run.
+    """Parts that are computed from the declaration of a task: its parameters on arrays, its world, and how its episodes
+    run.
 
     An author writes none of it; the declaration is :class:`~.task.Task`.
 
@@ -60,7 +61,7 @@ class TaskBase(ABC):
     ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
     closes_loop: bool
     """Whether an estimate decides what is measured next: where :meth:`.Task.feedback` is written, unless ``set_up``
-    says otherwise of the parameters; never in a recording."""
+    has other parameters; never in a recording."""
     world: Any
     """The :class:`~.world.World`, simulated or replayed."""
     noise: NoiseLayout
@@ -96,7 +97,7 @@ class TaskBase(ABC):
 
     @abstractmethod
     def _writes_feedback(self) -> bool:
-        """Whether the declaration gives something back to the world."""
+        """Return whether the declaration gives something back to the world."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Share the task: nothing in it changes."""
@@ -140,7 +141,7 @@ class TaskBase(ABC):
         """Seconds from one measurement to the next, where all of them are that far apart, and the first that far from
         the start of the track; None where they come at times of their own, or the times are not known.
 
-        It is the parameter ``sampling_interval`` where there is one, unless a recording says otherwise.
+        It is the parameter ``sampling_interval`` where there is one, unless a recording has another.
         """
         seconds: float | None = self._sampling_interval()
         if seconds is not None and self.recording is not None:
@@ -148,11 +149,11 @@ class TaskBase(ABC):
         return seconds
 
     def _sampling_interval(self) -> float | None:
-        """What the parameters say of the time between measurements, s; None where it differs."""
+        """Return the time between measurements by the parameters, s; None where it differs."""
         return getattr(self.parameters, "sampling_interval", None)
 
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
+        """Return the number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
 
         Args:
             uniforms: of the scenario, ``(noise.uniforms, N)``; the first row draws the flight.
@@ -160,7 +161,7 @@ class TaskBase(ABC):
         return numpy.floor(len(self.flights) * uniforms[0]).astype(int)
 
     def lengths(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Measurements acted on in each episode, ``(N,)``.
+        """Return the measurements acted on in each episode, ``(N,)``.
 
         Args:
             uniforms: of the scenario, ``(noise.uniforms, N)``.

@@ -1,4 +1,4 @@
-"""What is, and what the sensors say: the half of a task that is simulated, or replayed."""
+"""Truth and sensors: the half of a task that is simulated, or replayed."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,7 +16,7 @@ Measurement = TypeVar("Measurement")
 
 
 class World(ABC, Generic[TaskT, Truth, Measurement]):
-    """What is, and what the sensors say.
+    """Truth and sensors.
 
     Args:
         task: whose world it is, with the constants that both halves share.
@@ -38,8 +38,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     reading_field: ClassVar[str] = ""
     """Field of the measurement that sensors read with errors; empty: the received field."""
     stated_field: ClassVar[str] = ""
-    """Field that states how large these errors are, variances where its name says so, else deviations; empty where a
-    measurement does not say."""
+    """Field that states how large these errors are, variances where its name contains the word, else deviations;
+    empty where a measurement does not say."""
     elapsed_field: ClassVar[str] = ""
     """Field with the s since the last measurement that was received; empty where there is none."""
     cost_remedy: ClassVar[str] = ""
@@ -55,7 +55,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     @abstractmethod
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Any]:
-        """Truth at the start of the track, and the initial estimate given to every filter.
+        """Return the truth at the start of the track, and the initial estimate given to every filter.
 
         Args:
             draws: what fixes the scenario of each episode.
@@ -76,7 +76,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """
 
     def state(self, truth: Truth) -> Array:
-        """True values of the task's components, ``(C, N)``; by default the truth's ``state``."""
+        """Return the true values of the task's components, ``(C, N)``; by default the truth's ``state``."""
         state: Array = truth.state  # type: ignore[attr-defined]
         return state
 
@@ -107,21 +107,21 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return measurement
 
     def component_readings(self, measurement: Measurement) -> Array | None:
-        """Readings of the task's components, ``(C, N)`` in their units, for pictures.
+        """Return the readings of the task's components, ``(C, N)`` in their units, for pictures.
 
         NaN where they say nothing; None, as here, where what is measured is no component at all.
         """
         return None
 
     def component_deviations(self, measurement: Measurement) -> Array | None:
-        """Standard deviations that are stated for the errors of :meth:`component_readings`, in the same form; None
-        where that is None.
+        """Return the standard deviations that are stated for the errors of :meth:`component_readings`, in the same
+        form; None where that is None.
         """
         return None
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Standard deviations of the errors of what sensors read, stated or nominal, in the shape of the readings; here
-        the square roots of ``stated_field``.
+        """Return the standard deviations of the errors of what sensors read, stated or nominal, in the shape of the
+        readings; here the square roots of ``stated_field``.
 
         Args:
             measurement: of :meth:`advance`.
@@ -133,7 +133,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.xp.sqrt(getattr(measurement, self.stated_field))
 
     def error_cost(self, error: Array) -> Array:
-        """What an error of the estimate costs where nothing else matters, ``(N,)``; :meth:`cost` then need not be
+        """Return the cost of an error of the estimate alone, ``(N,)``; :meth:`cost` then need not be
         written, and recordings of the task can be judged.
 
         Args:
@@ -154,8 +154,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.error_cost(self.task.subtract(mean, self.state(truth)))
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
-        """Part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it, unless some is
-        known not to be its fault.
+        """Return the part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it,
+        unless some is known not to be its fault.
 
         Args:
             truth: at the measurement that the estimate is for.

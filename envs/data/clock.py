@@ -7,7 +7,8 @@ TIME_UNITS = 1e9, 1e6, 1e3
 
 
 def time_unit(time: float) -> float:
-    """How many of a number's unit are a second: 1e9, 1e6 or 1e3 of a number that is too large for seconds since 1970.
+    """Return the number of units of a time in a second: 1e9, 1e6 or 1e3 of a number that is too large for seconds since
+    1970.
 
     1e11 seconds after 1970 are in the year 5138, 1e11 milliseconds in 1973; and so on in steps of a thousand.
     """

@@ -4,7 +4,7 @@ What was opened must be a file, no device, pipe or folder, and no larger than it
 it is parsed. Whatever a library of others parses (NetCDF-4, Parquet, ULog, bags, SQLite, YAML) is parsed in a process
 of its own (:mod:`.foreign_parsers`) with limits of memory and of processor time, which hands back plain arrays.
 
-A file that breaks a limit is refused in one sentence, which says how to raise it: ``FILTERGYM_READ_MEMORY`` in MB and
+A file that breaks a limit is refused in one sentence, with the way to raise it: ``FILTERGYM_READ_MEMORY`` in MB and
 ``FILTERGYM_READ_SECONDS`` in the environment.
 """
 
@@ -40,7 +40,7 @@ SECONDS_OF_MEGABYTE = 0.5
 
 
 class ReadingLimits(NamedTuple):
-    """What reading one file may take."""
+    """Limits of reading one file."""
 
     memory: int
     """Bytes."""
@@ -52,7 +52,7 @@ def limits() -> ReadingLimits:
     """Return the limits in force.
 
     Raises:
-        ValueError: if the environment says what is no limit.
+        ValueError: if an environment variable is no limit.
     """
     found = []
     for name, otherwise in ((MEMORY, 512.0), (SECONDS, 5.0)):
@@ -67,7 +67,7 @@ def limits() -> ReadingLimits:
 
 
 def refuse_memory(what: str) -> ValueError:
-    """Return the error for a file that needs more memory than it may take; ``what`` says what needs it."""
+    """Return the error for a file that needs more memory than it may take; ``what`` names what needs it."""
     most = limits().memory / 1e6
     return ValueError(
         f"{what}, and reading a file may take {most:,.0f} MB: split it, or set {MEMORY}={2 * most:.0f} (MB) if you "
@@ -109,7 +109,7 @@ def _size(count: int) -> str:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder of this name; not for a name that no folder can have."""
+    """Return whether there is a folder of this name; not for a name that no folder can have."""
     try:
         return path.is_dir()
     except (OSError, ValueError):  # a name that no file can have
@@ -136,7 +136,7 @@ def read_content(path: Path, most: int | None = None) -> bytes:
 
 
 def parse_json(content: bytes) -> Any:
-    """Return what JSON says, if that fits into the limit of memory.
+    """Return the content of JSON, if it fits into the limit of memory.
 
     Raises:
         ValueError: if it is none, or larger.
@@ -154,7 +154,7 @@ def parse_json(content: bytes) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Return what a file of JSON says.
+    """Return the content of a JSON file.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -164,7 +164,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """Return what a file of YAML says: words, numbers, lists and mappings.
+    """Return the content of a YAML file: words, numbers, lists and mappings.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -183,7 +183,7 @@ _WARNED: list[bool] = []
 
 
 def _warn_without_limit() -> None:
-    """Say once where the system cannot limit the memory of a process."""
+    """Warn once where the system cannot limit the memory of a process."""
     if sys.platform != "linux" and not _WARNED:
         _WARNED.append(True)
         warnings.warn(
@@ -299,7 +299,7 @@ def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
 
 
 def _array_forms(value: Any) -> Iterator[tuple[str, list[int]]]:
-    """Types and shapes of the arrays that a head names, in their order."""
+    """Return the types and shapes of the arrays that a head names, in their order."""
     if isinstance(value, dict):
         if "array" in value:
             yield value["dtype"], value["shape"]

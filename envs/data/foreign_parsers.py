@@ -7,7 +7,7 @@ imported here, so that a start costs a tenth of a second; a parser may use NumPy
 
 A parser returns plain values: numbers, words, lists, arrays, and dictionaries whose keys are of this file: names that a
 file gives stand in lists of pairs. It raises ``ValueError`` with a sentence
-for whoever gave the file.
+for the user who gave the file.
 """
 
 import json
@@ -80,7 +80,7 @@ def parse_netcdf4(
         path: of it; unused.
         wanted: ``names``, in lower case, and ``prefix``: of the variables whose values are read; None: of all.
         bytes_limit: of all values together, counted before any is read.
-        numbers_limit: likewise, of their number.
+        numbers_limit: limit of their number.
     """
     import h5netcdf
     import h5py
@@ -169,7 +169,7 @@ def parse_parquet(
         path: of it; unused.
         wanted: ``names``, in lower case, and ``prefix``, of the columns that are read.
         rows_limit: of the table.
-        bytes_limit: of these columns unpacked, as the file itself says it.
+        bytes_limit: of these columns unpacked, as the file states.
     """
     import pyarrow
     from pyarrow import parquet
@@ -325,7 +325,7 @@ class _Bag(NamedTuple):
     """Of a type's definition as the library knows it; None where a bag holds none."""
 
     def busiest(self, kind: str) -> str:
-        """Topic that has most messages of a type; empty where there are none."""
+        """Return the topic that has most messages of a type; empty where there are none."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             if connection.msgtype == kind:
@@ -333,7 +333,7 @@ class _Bag(NamedTuple):
         return next(iter(counts.most_common(1)), ("", 0))[0]
 
     def rows(self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int) -> Any:
-        """Numbers of the messages of a topic, a column each: messages take a hundred times as much.
+        """Return the numbers of the messages of a topic, a column each: messages take a hundred times as much.
 
         Raises:
             ValueError: if there are none or too many, or they are of another definition.
@@ -375,8 +375,8 @@ def _open_bag(path: str) -> _Bag:
 
 
 def parse_bag(file: BinaryIO, path: str, rows_limit: int) -> Any:
-    """Return the topic with most messages of a position, its kind and its numbers ``(values, n)``, and likewise a topic
-    of odometry beside positions of a receiver.
+    """Return the topic with most messages of a position, its kind and its numbers ``(values, n)``, and the same of a
+    topic of odometry beside positions of a receiver.
     """
     bag = _open_bag(path)
     topic, source = bag.busiest(NAVSAT), bag.busiest(ODOMETRY)
@@ -406,7 +406,7 @@ def _fix_values(fix: Any) -> tuple[float, ...]:
 
 
 def _pose_values(message: Any) -> tuple[float, ...]:
-    """Time, x, y, and their variances, zero where they are not told."""
+    """Time, x, y, and their variances, zero where the file has none."""
     pose, variances = message.pose, (0.0, 0.0)
     if hasattr(pose, "covariance"):
         diagonal = pose.covariance.reshape(6, 6).diagonal()
@@ -418,7 +418,7 @@ def _pose_values(message: Any) -> tuple[float, ...]:
 
 
 def parse_yaml(file: BinaryIO, path: str) -> Any:
-    """Return what a file of YAML says, in words, numbers, lists and mappings, its aliases resolved."""
+    """Return the content of a YAML file, in words, numbers, lists and mappings, its aliases resolved."""
     import yaml
 
     try:
@@ -430,7 +430,7 @@ def parse_yaml(file: BinaryIO, path: str) -> Any:
     def plain(value: Any) -> Any:
         nodes[0] += 1
         if nodes[0] > MOST_NODES:
-            raise ValueError(f"it says more than {MOST_NODES:,} values, aliases resolved: write fewer")
+            raise ValueError(f"it holds more than {MOST_NODES:,} values, aliases resolved: write fewer")
         if isinstance(value, list):
             return [plain(item) for item in value]
         if isinstance(value, dict):
@@ -466,7 +466,7 @@ LIBRARIES: Mapping[str, tuple[str, ...]] = {
 
 
 class LimitError(Exception):
-    """A file needs more than the limit of memory; its text says what."""
+    """A file needs more than the limit of memory; the message names it."""
 
 
 # --- the program
@@ -482,12 +482,12 @@ class _WithoutPandas:
 
 
 def _limit(memory: int, seconds: int) -> None:
-    """Let this process have no more memory than it has now and ``memory`` bytes, ``seconds`` of processor time, and
+    """Limit this process to it has now and ``memory`` bytes, ``seconds`` of processor time, and
     write no file.
     """
     try:
         import resource
-    except ImportError:  # Windows; the parent has said so
+    except ImportError:  # Windows; the parent has reported it
         return
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
@@ -534,7 +534,7 @@ def _answer(handle: int, head: Any, arrays: Sequence[Any] = ()) -> None:
 
 
 def main() -> None:
-    """Answer the request in the first argument."""
+    """Parse the file of the request in the first argument."""
     request = json.loads(sys.argv[1])
     # Libraries print what they find strange: the answer has a channel of its own.
     answers = os.dup(1)

@@ -19,10 +19,10 @@ from ..contract.world import World
 
 
 class Replayed(NamedTuple):
-    """Where an episode is in the tables of a recording."""
+    """Place of an episode in the tables of a recording."""
 
     number: Array
-    """Of the recording, ``(N,)``, as a float; likewise all that follows."""
+    """Of the recording, ``(N,)``, as a float, like all that follows."""
     count: Array
     """Measurements so far."""
     first: Array
@@ -39,12 +39,13 @@ class RecordedArrays(NamedTuple):
     truth: numpy.ndarray | None
     seconds: numpy.ndarray
     first: numpy.ndarray
-    """Column of the first measurement of each recording, ``(E,)``; likewise of the last."""
+    """Column of the first measurement of each recording, ``(E,)``, and column of the last."""
     last: numpy.ndarray
 
 
 def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """What a task of NumPy says of a start of the track, and one measurement; eight episodes side by side.
+    """Return an example of the start of the track and of a measurement, from a task of NumPy; eight episodes side by
+    side.
 
     Args:
         task: on NumPy arrays.
@@ -65,7 +66,7 @@ def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
 
 def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """What a task of NumPy says of a start of the track, and one measurement; arguments as of :func:`measure_examples`.
+    """Return an example of the start of the track and of a measurement; arguments of :func:`measure_examples`.
 
     Raises:
         ValueError: if what is measured depends on what is estimated.
@@ -73,7 +74,7 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
     if task.closes_loop:
         raise ValueError(
             f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
-            "what the sensors said to one estimate is not what they would have said to another, and can be neither "
+            "readings depend on the estimate in the loop, so that they can be neither "
             "recorded nor replayed"
         )
     return measure_examples(task, names)
@@ -99,7 +100,7 @@ def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
 
 
 class _ForeignWorld(World[Task, Any, Any]):
-    """What real sensors say, in place of a task's own world.
+    """Readings of real sensors, in place of a task's own world.
 
     Attributes:
         simulated: the task's own world, which knows what an error costs.
@@ -114,20 +115,20 @@ class _ForeignWorld(World[Task, Any, Any]):
         return self.simulated.mask_missing(measurement)
 
     def component_readings(self, measurement: Any) -> Array | None:
-        """What it says of the components, as in the task's own world."""
+        """Return the readings of the components, as in the task's own world."""
         return self.simulated.component_readings(measurement)
 
     def component_deviations(self, measurement: Any) -> Array | None:
-        """What is stated of the errors of that, likewise."""
+        """Return the stated deviations of these readings, as in the task's own world."""
         return self.simulated.component_deviations(measurement)
 
     def error_cost(self, error: Array) -> Array:
-        """What it costs in the task's own world."""
+        """Return the cost in the task's own world."""
         return self.simulated.error_cost(error)
 
 
 class RecordedWorld(_ForeignWorld):
-    """What the sensors said, in place of a task's own world.
+    """Recorded readings, in place of a task's own world.
 
     Args:
         task: of which.
@@ -162,12 +163,12 @@ class RecordedWorld(_ForeignWorld):
         return Replayed(number, 0.0 * number, first, last), initial
 
     def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
-        """Go on to the next measurement; at the end the last one is said again."""
+        """Go on to the next measurement; at the end the last one is repeated."""
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
 
     def all_observations(self) -> tuple[Array | None, Array | None]:
-        """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
+        """Return the readings of the components in all measurements of all episodes, and its stated deviation,
         ``(C, measurements)``; None where it is no component.
         """
         columns = self.xp.arange(self.tables.seconds.shape[-1])
@@ -177,20 +178,20 @@ class RecordedWorld(_ForeignWorld):
         )
 
     def _column(self, truth: Replayed) -> Array:
-        """Of the measurement at hand."""
+        """Return the column of the present measurement."""
         xp = self.xp
         return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
 
     def _at(self, table: Array, column: Array) -> Array:
-        """Entries of a table, ``(..., N)``."""
+        """Return the entries of a table, ``(..., N)``."""
         return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
 
     def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
-        """A NamedTuple of arrays as one that was measured, from the tables."""
+        """Return a NamedTuple of arrays of the tables, in the form of another."""
         return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
 
     def state(self, truth: Replayed) -> Array:
-        """True values of the task's components, ``(C, N)``.
+        """Return the true values of the task's components, ``(C, N)``.
 
         Raises:
             ValueError: if the recording has none.
@@ -200,17 +201,17 @@ class RecordedWorld(_ForeignWorld):
         return self._at(self.tables.truth, self._column(truth))
 
     def records(self, truth: Replayed) -> dict[str, Array]:
-        """Time since the start of the track, s."""
+        """Return the time since the start of the track, s."""
         return {"seconds": self._at(self.tables.seconds, self._column(truth))}
 
     def context(self, truth: Replayed) -> dict[str, Array]:
-        """Which recording it is."""
+        """Return the number of the recording."""
         return {"recording": truth.number}
 
 
 @dataclass(frozen=True)
 class Feed:
-    """Stands in a task in a recording's place: what is measured comes from outside, and nobody knows the truth.
+    """Stands in a task in a recording's place: measurements come from outside, and the truth is unknown.
 
     Args:
         regular: whether every measurement comes, one sampling interval after the one before.
@@ -230,7 +231,9 @@ class Feed:
     has_whole_truth: ClassVar[bool] = False
 
     def has_interval(self, seconds: float) -> bool:
-        """Whether measurements come that many seconds apart; where times do not matter to the filters, they do."""
+        """Return whether measurements come that many seconds apart; where times do not matter to the filters, they
+        do.
+        """
         return True
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
@@ -243,11 +246,11 @@ class Feed:
 
 
 class Unknown(NamedTuple):
-    """Truth that nobody knows."""
+    """Unknown truth."""
 
 
 class LiveWorld(_ForeignWorld):
-    """What comes from outside, in place of a task's own world: numbers of a measurement stand in place of its noise.
+    """Live measurements in place of a task's own world: numbers of a measurement stand in place of its noise.
 
     Args:
         task: whose world it is.
@@ -255,7 +258,7 @@ class LiveWorld(_ForeignWorld):
 
     Attributes:
         initial: an initial estimate, for its names, shapes and types.
-        measurement: a measurement, likewise.
+        measurement: a measurement, for its shapes and types.
     """
 
     def __init__(self, task: Task, second_sensor: bool) -> None:
@@ -274,7 +277,9 @@ class LiveWorld(_ForeignWorld):
         return truth, self._fill(self.measurement, noise)
 
     def _fill(self, like: Any, numbers: Array) -> Any:
-        """A NamedTuple of arrays as another, of their numbers one array after the other, ``(numbers, N)``."""
+        """Return a NamedTuple of arrays in the form of another, of their numbers one array after the other,
+        ``(numbers, N)``.
+        """
         parts, first = {}, 0
         for name, array in named_arrays(like):
             last = first + math.prod(array.shape[:-1])
@@ -283,12 +288,12 @@ class LiveWorld(_ForeignWorld):
         return fill_arrays(like, parts.__getitem__, self.xp)
 
     def state(self, truth: Unknown) -> Array:
-        """Raise ValueError: nobody knows it."""
+        """Raise ValueError: the truth is unknown."""
         raise ValueError(
             "the truth of what comes from outside is not known, so there is no error and no cost"
         )
 
 
 def _count_numbers(like: Any) -> int:
-    """Numbers of a NamedTuple of arrays in one lane."""
+    """Return the numbers of a NamedTuple of arrays in one lane."""
     return sum(math.prod(array.shape[:-1]) for _, array in named_arrays(like))

@@ -1,13 +1,13 @@
-"""Recorded measurements in place of a simulated world: what sensors really said, replayed to any policy.
+"""Recorded measurements in place of a simulated world: readings of real sensors, replayed to any policy.
 
-A :class:`Recording` holds episodes of one environment: every array of its ``Measurement``, what everyone is told of the
+A :class:`Recording` holds episodes of one environment: every array of its ``Measurement``, the initial estimate of the
 start of the track, the times, and the truth where it is known. As a scenario it puts a :class:`.RecordedWorld` in the
 place of the task's own: an episode replays one recording, which its first uniform number draws. Banks,
 estimators, backends and evaluations know nothing of it.
 
 What the arrays are, the environment is asked: it measures once, and the recording must have arrays of the same names
 and shapes. So this module is the same for every task whose measurements do not depend on what is estimated. In a closed
-loop they do, and no recording can answer what the sensors would have said to another estimate.
+loop they do, and no recording has the readings that another estimate would have caused.
 
 Where there is no truth there is no error and no cost, and rewards are zero.
 """
@@ -38,7 +38,7 @@ class Recording(ScenarioData):
     Args:
         environment: its id.
         measurements: every array of the environment's ``Measurement`` by its name, ``(E, T, ...)``.
-        initial: every array of what everyone is told of the start of the track, ``(E, ...)``.
+        initial: every array of the initial estimate given to every filter, ``(E, ...)``.
         seconds: times since the start of the track, s, ``(E, T)``; NaN beyond the end of an episode.
         lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation shows it,
             otherwise the last measurement again.
@@ -49,14 +49,14 @@ class Recording(ScenarioData):
         name: of the whole, in reports.
         source: where the data come from, in words.
         licence: of the data, in words.
-        notes: what is to be told of the reading, a line each.
+        notes: remarks on the reading, a line each.
         log_time: times of the measurements as they stand in the log, numbers or words, ``(E, T)``; NaN or empty where
             the log has no row. None: there is no other time than ``seconds``.
         started: from the first measurement of the log to the start of the track, s, ``(E,)``; default: zero.
-        typical: parameters that follow from what the log states of its errors, where nobody names them.
+        typical: parameters that follow from what the log states of its errors, where the user does not name them.
         columns: names in the log of the columns that were read, by what they are called here.
         deviations: typical deviations of what was measured, see :class:`.TrackLog`.
-        deviations_from: who says so.
+        deviations_from: source of the deviations.
         origin: latitude and longitude, degrees, and usual altitude, m, around which positions of the first episode were
             made metres; empty where they were metres.
 
@@ -153,7 +153,7 @@ class Recording(ScenarioData):
 
     @functools.cached_property
     def truth_known(self) -> numpy.ndarray:
-        """Which components of the truth are known at some measurement of every episode, booleans, ``(C,)``.
+        """Return whether each component of the truth is known at some measurement of every episode, ``(C,)``.
 
         The truth must not be None.
         """
@@ -171,7 +171,7 @@ class Recording(ScenarioData):
         return bool(numpy.isfinite(self.truth[there]).all())
 
     def has_interval(self, seconds: float) -> bool:
-        """Whether measurements come that many seconds apart, the first that far from the start of the track."""
+        """Return whether measurements come that many seconds apart, the first that far from the start of the track."""
         times = seconds * numpy.arange(1, self.seconds.shape[1] + 1)
         late = numpy.abs(self.seconds - times)
         # NaN beyond the end of a shorter episode. Times in a file are rounded.
@@ -184,7 +184,7 @@ class Recording(ScenarioData):
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
-        """Measurements acted on in each episode, whole decisions, none beyond the horizon."""
+        """Return the measurements acted on in each episode, whole decisions, none beyond the horizon."""
         lengths = numpy.minimum(self.lengths, horizon)
         return tuple((lengths - lengths % decision_interval).tolist())
 
@@ -239,7 +239,7 @@ class Recording(ScenarioData):
         initial, measurement = measure_once(task, self.measurements)
         for kind, prefix, example, found, leading in (
             ("measures", "", measurement, self.measurements, 2),
-            ("is told at the start", "initial_", initial, self.initial, 1),
+            ("is given at the start", "initial_", initial, self.initial, 1),
         ):
             expected = {name: tuple(values.shape[:-1]) for name, values in named_arrays(example)}
             missing = [f"{prefix}{name}" for name in expected if name not in found]
@@ -295,7 +295,7 @@ class Recording(ScenarioData):
 
     @property
     def dataset(self) -> Any:
-        """As it stands in a file, an :class:`xarray.Dataset`."""
+        """Return the content of the file, an :class:`xarray.Dataset`."""
         return _dataset_of(self)
 
     def write(self, path: Any) -> None:
@@ -356,7 +356,7 @@ def _dataset_of(recording: Recording) -> Any:
             ("episode", "time", "component"),
             numpy.where(there[..., None], recording.truth, numpy.nan),
         )
-    told = {name: getattr(recording, name) for name in ("source", "licence") if getattr(recording, name)}
+    origin = {name: getattr(recording, name) for name in ("source", "licence") if getattr(recording, name)}
     coords: dict[str, Any] = {"recording": ("episode", numpy.array(recording.names, dtype=str))}
     if recording.log_time is not None:
         coords["log_time"] = (("episode", "time"), recording.log_time)
@@ -366,7 +366,7 @@ def _dataset_of(recording: Recording) -> Any:
         attrs={
             "environment": recording.environment,
             "parameters": json.dumps({**recording.typical, **recording.parameters}),
-            **told,
+            **origin,
         },
     )
 
@@ -410,7 +410,7 @@ def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[
     Args:
         recordings: at least one.
         name: of the whole.
-        notes: what is to be told of the reading, a line each; what is left out is added.
+        notes: remarks on the reading, a line each; omissions are added.
     """
     first, lines = recordings[0], list(notes)
     kept: list[Recording] = []
@@ -480,12 +480,12 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
 
 
 def _first(values: numpy.ndarray) -> int:
-    """Place of the first row that is not finite."""
+    """Return the place of the first row that is not finite."""
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 
 def differing(parameters: Any) -> dict[str, Any]:
-    """Parameters of a task that differ from the defaults, without the horizon."""
+    """Return the parameters of a task that differ from the defaults, without the horizon."""
     found = {}
     for each in dataclasses.fields(parameters):
         value = getattr(parameters, each.name)

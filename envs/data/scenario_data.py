@@ -1,4 +1,4 @@
-"""What a user may give in the place of a scenario: data that make one, and readers that find such data in files."""
+"""Data in the place of a scenario: objects that make one, and readers that find such data in files."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple

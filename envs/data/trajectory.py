@@ -68,7 +68,7 @@ class Trajectory(FlightData):
         return float(self.time[-1] - self.time[0])
 
     def intervals(self, interval: float) -> int:
-        """Number of whole sampling intervals (s) that the flight lasts.
+        """Return the number of whole sampling intervals (s) that the flight lasts.
 
         Raises:
             ValueError: if they are too many for an episode.
@@ -83,7 +83,7 @@ class Trajectory(FlightData):
         return int(count)
 
     def resample(self, interval: float, count: int) -> numpy.ndarray:
-        """State at ``count`` times from the start, ``interval`` apart, straight on beyond the end.
+        """Return the state at ``count`` times from the start, ``interval`` apart, straight on beyond the end.
 
         Between the given times a cubic runs through positions and velocities (Hermite), or, without
         velocities, a cubic spline through the positions.

@@ -52,7 +52,7 @@ class EstimatePicture(Picture):
         """Return what the history keeps of a measurement.
 
         Args:
-            track: of the episode, as :meth:`.Model.picture_track` says it of one measurement, ``(K, ...)``.
+            track: of the episode, as :meth:`.Model.picture_track` returns it of one measurement, ``(K, ...)``.
             k: number of the measurement, from 0 on.
         """
         mean, P = track["estimate"][k], track["covariance"][k]
@@ -68,14 +68,14 @@ class EstimatePicture(Picture):
         return values
 
     def strips(self) -> Sequence[Strip]:
-        """Errors of the first components."""
+        """Return the errors of the first components."""
         return [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
             for component in self.task.components[:MOST_STRIPS]
         ]
 
     def shows_observation(self) -> bool:
-        """No: nobody is shown one."""
+        """Return False: there is none to show."""
         return False
 
     def open(self, figure: Figure) -> None:
@@ -149,12 +149,12 @@ class EstimatePicture(Picture):
             self.ellipse.set_angle(float(numpy.degrees(numpy.arctan2(directions[1, 1], directions[0, 1]))))
 
     def _places(self, values: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Where values stand in the panel: in the plane, or over time."""
+        """Return the places of values in the panel: in the plane, or over time."""
         return (values[0], values[1]) if self.plane else (numpy.arange(1, len(values[0]) + 1), values[0])
 
 
 def _extent(values: numpy.ndarray) -> tuple[float, float]:
-    """Lowest and highest value with a margin."""
+    """Return the lowest and highest value with a margin."""
     finite = values[numpy.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
     margin = MARGIN * (high - low) or 1.0

@@ -75,14 +75,14 @@ class Strip(NamedTuple):
 
 
 def error_strip(title: str, component: str, limit: float) -> Strip:
-    """Panel of a component's error with its reported band, between plus and minus ``limit`` at first."""
+    """Return the panel of a component's error with its reported band, between plus and minus ``limit`` at first."""
     return Strip(
         title, {"error": f"error.{component}"}, (-limit, limit), band=f"sigma.{component}", guides=(0.0,)
     )
 
 
 def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-    """Stretch limits about zero by the least factor 1, 2, 5, 10, ... that lets them hold low and high."""
+    """Return the stretch limits about zero by the least factor 1, 2, 5, 10, ... that lets them hold low and high."""
     lowest, highest = limits
     # A value on the far side of a limit at zero cannot be reached by stretching, and is cut off.
     needed = max(
@@ -99,9 +99,9 @@ def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, 
 
 
 class Picture:
-    """What is drawn of a task's episode.
+    """Picture of an episode.
 
-    This base class draws any task. A subclass says what it adds to the history (:meth:`records`), which
+    This base class draws any task. A subclass declares its additions to the history (:meth:`records`), which
     strips are drawn (:meth:`strips`), and may draw panels of its own into the figure's left part
     (:meth:`open`, :meth:`begin`, :meth:`draw`).
 
@@ -123,11 +123,11 @@ class Picture:
         self.task: Any = model.task
 
     def records(self, state: Any) -> dict[str, float]:
-        """Values that the history keeps of a state after the action, beside errors, sigmas and actions."""
+        """Return the values that the history keeps of a state after the action, beside errors, sigmas and actions."""
         return {}
 
     def strips(self) -> Sequence[Strip]:
-        """Error of every component with its reported band, and the action."""
+        """Return the error of every component with its reported band, and the action."""
         shown = self.model.task.components[:MOST_COMPONENTS]
         errors = [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
@@ -146,7 +146,7 @@ class Picture:
         return [*errors, Strip(f"action, {self.model.control}", named, limits, steps=discrete)]
 
     def shows_observation(self) -> bool:
-        """Whether a last strip shows every component of the observation as a colour."""
+        """Return whether a last strip shows every component of the observation as a colour."""
         return True
 
     def open(self, figure: Figure) -> None:
@@ -156,7 +156,7 @@ class Picture:
         """Take note of a new episode, from its state after the first measurement."""
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Measurements, from and to, that every strip marks with a grey ground."""
+        """Return the measurements, from and to, that every strip marks with a grey ground."""
         return ()
 
     def arrange(self) -> None:
@@ -281,7 +281,7 @@ class EpisodePicture:
         self.mode = mode
         self.frames_per_second = frames_per_second
         self.caption = ""
-        """What the title says beside environment, scenario and control, such as the policy's name."""
+        """Part of the title beside environment, scenario and control, such as the policy's name."""
         self.picture: Picture = picture_of(model) if picture is None else picture
         self.history: dict[str, list[float]] = {}
         self.observations: list[numpy.ndarray] = []
@@ -524,7 +524,7 @@ class EpisodePictures:
 
 
 def _alone(state: Any, lane: int) -> Any:
-    """Episode in one lane as a picture takes it: on the host, padded with itself."""
+    """Return the episode in one lane as a picture takes it: on the host, padded with itself."""
     return map_arrays(lambda values: host_array(values)[..., [lane] * round_up_lanes(1)], state)
 
 
@@ -536,15 +536,15 @@ def _moving(axes: Axes) -> list[Artist]:
 
 
 class _WindowError(Exception):
-    """A window cannot be opened; says why, and what to check."""
+    """A window cannot be opened; the message has the reason and the remedy."""
 
 
 def _missing_display() -> str:
-    """Say what keeps matplotlib from opening a window, and what to do; empty where nothing is known to."""
+    """Return why matplotlib cannot open a window, and the remedy; empty where no reason is known."""
     from matplotlib.backends.registry import BackendFilter, backend_registry
 
     try:
-        # Without a display pyplot falls back to "agg" when imported, or refuses, whatever MPLBACKEND says.
+        # Without a display pyplot falls back to "agg" when imported, or refuses, regardless of MPLBACKEND.
         from matplotlib import pyplot
 
         backend = str(pyplot.get_backend())

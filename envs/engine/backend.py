@@ -1,4 +1,4 @@
-"""What computes the steps of a task: code compiled for the processor, NumPy, or torch on a device."""
+"""Backends, which compute the steps of a task: code compiled for the processor, NumPy, or torch on a device."""
 
 from types import ModuleType
 from typing import Any
@@ -27,7 +27,7 @@ def make_model(
     threads: int = 1,
     **keywords: Any,
 ) -> Model:
-    """Make a task with the bank of a control in the loop; ``model.backend`` says what computes its steps.
+    """Make a task with the bank of a control in the loop; ``model.backend`` names the code that computes its steps.
 
     Args:
         cls: the task.

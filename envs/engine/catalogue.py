@@ -1,7 +1,7 @@
-"""Which environments there are, and the modules that users name.
+"""Catalogue of the environments, and the modules that users name.
 
-Every folder in ``envs/`` that says an ``ID`` is an environment; its ``task.py`` says the class, ``TASK``, which is
-imported when somebody asks for it. Nothing else needs to know about it. A user's own are added by
+Every folder in ``envs/`` that defines an ``ID`` is an environment; its ``task.py`` defines the class, ``TASK``, which
+is imported when somebody asks for it. Nothing else needs to know about it. A user's own are added by
 :mod:`.registration`; :mod:`.scenario_choice` makes a task from names and keywords.
 """
 
@@ -65,14 +65,14 @@ def folders() -> dict[str, str]:
     return {package.ID: name for name, package in packages.items() if hasattr(package, "ID")}
 
 
-class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (a name says what it is)
+class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (the name describes it)
     """A keyword that an environment does not take: a TypeError as of any function, which clients look for who try
     whether an environment takes one, and a ValueError as for every other wrong name.
     """
 
 
 def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
-    """Say which name is unknown and what was probably meant."""
+    """Return an error for an unknown name, with the nearest known one."""
     return ValueError(f"unknown {kind} {quote_shortened(name)}: {_meant(name, valid)}")
 
 
@@ -87,12 +87,12 @@ def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None
 _SEARCH_FOLDERS: list[str] = []
 """Folders in which modules that a user names are looked for, after ``sys.path``."""
 FOUND_IN: list[str] = []
-"""Those of them in which one was found; other processes are told, see :mod:`..evaluation.parallel`."""
+"""Those of them in which one was found; other processes receive them, see :mod:`..evaluation.parallel`."""
 
 
 @contextmanager
 def modules_from(folder: str) -> Iterator[None]:
-    """Let modules that a user names be found in a folder, too, and nothing else: a file there is no library."""
+    """Find modules that a user names in a folder, too, and no others: a file there is no library."""
     _SEARCH_FOLDERS.append(folder)
     try:
         yield
@@ -103,7 +103,7 @@ def modules_from(folder: str) -> Iterator[None]:
 
 @contextmanager
 def on_path(folders: Iterable[str]) -> Iterator[None]:
-    """Let folders stand at the end of ``sys.path`` for a while, where none of them hides a library."""
+    """Put folders at the end of ``sys.path`` for a while, where none of them hides a library."""
     further = [folder for folder in folders if folder not in sys.path]
     sys.path.extend(further)
     try:
@@ -131,7 +131,7 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
         with on_path(_SEARCH_FOLDERS):
             found = importlib.import_module(module)
     except Exception as error:  # a module is a program: it can raise anything
-        # A ValueError says all that there is to say.
+        # A ValueError is complete.
         line = "" if isinstance(error, ValueError) else own_line(error)
         raise ValueError(f"{refusal}: {type(error).__name__}: {error}{line}") from error
     places = (*getattr(found, "__path__", ()), getattr(found, "__file__", None) or "")
@@ -222,22 +222,22 @@ def _import_name(name: str) -> ImportableName:
 
 
 def importable_name(cls: "type[Task]") -> str:
-    """Id by which another process finds an environment: of a user's with the module that registers it."""
+    """Return the id by which another process finds an environment: of a user's with the module that registers it."""
     return ImportableName(f"{cls.__module__}:{cls.id}") if cls.id in USER_TASKS else cls.id
 
 
 def short_name(id: str) -> str:
-    """Name of a Gymnasium id for files, and where the id is too long."""
+    """Return the name of a Gymnasium id for files, and where the id is too long."""
     return id.removeprefix("filtergym/").replace("/", "-")
 
 
 def bare_name(id: str) -> str:
-    """Gymnasium id without its namespace and version, as tables and pages call an environment."""
+    """Return the Gymnasium id without its namespace and version, as tables and pages call an environment."""
     return id.rpartition("/")[2].removesuffix("-v0")
 
 
 def parameter_names(cls: "type[Task]") -> list[str]:
-    """Names of the keywords that an environment takes besides control, scenario and reward."""
+    """Return the names of the keywords that an environment takes besides control, scenario and reward."""
     return [f.name for f in dataclasses.fields(cls.Parameters)]
 
 

@@ -25,7 +25,7 @@ from .programs import PROGRAM_CACHE_SIZE, Programs, Report, begin_world, start_f
 
 
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Let a method of a model run as code of the processor."""
+    """Compile a method of a model."""
 
     @functools.wraps(method)
     def run(self: "CompiledModel", episode: Episode) -> Any:
@@ -71,7 +71,7 @@ class CompiledModel(Model):
 
     @property
     def backend(self) -> str:
-        """What computes its steps."""
+        """Name of the backend."""
         return "compiled"
 
     def under(self, control: str) -> Model:
@@ -108,34 +108,34 @@ class CompiledModel(Model):
         return function(self._plain, *parts)
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
-        """State of the filter at the start of the track."""
+        """Return the state of the filter at the start of the track."""
         if self.filter.in_python:
             return super().start_filter(initial, truth)
         return self.run(start_filter, initial, truth)[0]
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
-        """State of the filter when a measurement has come."""
+        """Return the state of the filter when a measurement has come."""
         return self.programs.filter_prediction(state, measurement, threads=self.threads)[0]
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
-        """State of the filter when the measurement is taken in."""
+        """Return the state of the filter when the measurement is taken in."""
         if self.filter.in_python:
             return super().update_filter(state, measurement, action, truth)
         return self.programs.filter_update(truth, state, measurement, action, threads=self.threads)[0]
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """What a filter gives back to the world."""
+        """Return the feedback of a filter to the world."""
         if self.filter.in_python:
             return super().feedback(state, measurement)
         return self.run(Model.feedback, state, measurement)
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Episode at the start of the track."""
+        """Return the episode at the start of the track."""
         truth, initial = self.run(begin_world, uniforms, normals)
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Steps 1 and 2."""
+        """Return the steps 1 and 2."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
@@ -181,7 +181,7 @@ def _hashes(value: Any) -> bool:
 
 
 def _name_of(function: Callable[..., Any]) -> str:
-    """Name of a function, or of the class of an object that is called."""
+    """Return the name of a function, or of the class of an object that is called."""
     return getattr(function, "__qualname__", type(function).__name__)
 
 
@@ -197,12 +197,12 @@ def warn_of(what: str, error: BaseException) -> None:
 
 
 def share_world(model: Any, other: Any) -> bool:
-    """Whether two compiled models are of one task, and neither filter gives anything back to its world."""
+    """Return whether two compiled models are of one task, and neither filter gives anything back to its world."""
     return model.task is other.task and model.programs.is_open_loop and other.programs.is_open_loop
 
 
 def can_step(model: Any, report: Report) -> bool:
-    """Whether a model's steps are compiled, and a report on them can be."""
+    """Return whether a model's steps are compiled, and a report on them can be."""
     if not isinstance(model, CompiledModel) or model.filter.in_python or report in model.programs.refused:
         return False
     try:

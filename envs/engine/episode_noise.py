@@ -47,7 +47,7 @@ def _identities_of_seeds(seeds: tuple[int, ...]) -> numpy.ndarray:
 
 
 def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
-    """Identities of the first episodes of environments that are reset with these seeds, ``(2, N)`` uint64.
+    """Return the identities of the first episodes of environments that are reset with these seeds, ``(2, N)`` uint64.
 
     To seed a generator takes long, and competitors are compared on the same seeds, so the identities
     of the last blocks of seeds are kept.
@@ -56,7 +56,8 @@ def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
 
 
 def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Uniforms ``(layout.uniforms, N)`` and normals ``(layout.initial_normals, N)`` of the start of episodes.
+    """Return the uniforms ``(layout.uniforms, N)`` and normals ``(layout.initial_normals, N)`` of the start of
+    episodes.
 
     Args:
         identities: ``(2, N)`` uint64.
@@ -68,7 +69,7 @@ def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy
 
 
 def uniforms_of_seeds(seeds: Sequence[int], layout: NoiseLayout) -> numpy.ndarray:
-    """Uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of these seeds.
+    """Return the uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of these seeds.
 
     Args:
         seeds: as in :func:`identities_of_seeds`.
@@ -127,7 +128,7 @@ class EpisodeNoise:
         return numpy.concatenate([draw_identity(generators[lane]) for lane in lanes]).reshape(-1, 2).T
 
     def put(self, identities: numpy.ndarray) -> None:
-        """Let the first lanes have episodes of these identities, ``(2, lanes)``, before their start; the others are
+        """Put episodes of these identities, ``(2, lanes)``, into the first lanes before their start; the others are
         padding.
         """
         self.identities[:, : identities.shape[1]] = identities
@@ -159,7 +160,7 @@ class EpisodeNoise:
         return memory[normals:], memory[:normals]
 
     def take(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:
-        """Go on in some lanes with the first episodes of others."""
+        """Continue in some lanes with the first episodes of others."""
         self.identities[:, lanes] = other.identities[:, : len(lanes)]
         self.measurement[lanes] = other.measurement[: len(lanes)]
         if self._ahead is not None:
@@ -168,7 +169,7 @@ class EpisodeNoise:
     # --- their numbers
 
     def advance(self) -> None:
-        """Go on to the next measurement."""
+        """Advance to the next measurement."""
         if self._due:
             _ = self.row
         self._due, self._row = True, None
@@ -184,7 +185,7 @@ class EpisodeNoise:
     def call_of_each(self) -> Call:
         """Return what goes on to the next measurement and makes its numbers at :attr:`address`.
 
-        It is for whoever goes on over several in native code, and is run at least once.
+        It serves native code that runs over several measurements, and is run at least once.
         """
         if self._due:
             _ = self.row
@@ -219,7 +220,7 @@ class EpisodeNoise:
         return self._ahead[self._slot - 1]
 
     def _numbers_ahead(self, lanes: numpy.ndarray, measurements: int) -> numpy.ndarray:
-        """Rows of the coming measurements of some lanes, ``(measurements, rows, lanes)``."""
+        """Return the rows of the coming measurements of some lanes, ``(measurements, rows, lanes)``."""
         t = self.measurement[lanes] + numpy.arange(1, measurements + 1)[:, None]
         return numbers(self.identities[:, lanes], t, self._layout.normals, self._layout.row_uniforms)
 
@@ -241,7 +242,7 @@ class EpisodeNoise:
         return copy.deepcopy({name: getattr(self, name) for name in _STATE_ATTRIBUTES})
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go on from a snapshot of the same task and as many lanes."""
+        """Continue from a snapshot of the same task and as many lanes."""
         self.__dict__.update(copy.deepcopy(snapshot))
         self._forget()
 

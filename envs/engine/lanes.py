@@ -50,7 +50,7 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
 
 
 class EpisodeStepper(Protocol):
-    """What steps the episodes of a model: :class:`.Stepper` or :class:`ModelStepper`.
+    """Protocol of the steppers of a model: :class:`.Stepper` and :class:`ModelStepper`.
 
     ``others`` are steppers of the same kind, width and task. What is done with the first one is done with them beside
     it, on the same noise.
@@ -67,7 +67,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def load(self, episode: Episode, shown: Array = None) -> None:
-        """Go on from other episodes; what they show, ``(fields, width)``, is observed from them unless it is given."""
+        """Continue from other episodes; their observation, ``(fields, width)``, is computed unless it is given."""
         ...
 
     def episode(self) -> Episode:
@@ -79,7 +79,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def decide(self, noise: EpisodeNoise, others: Any) -> None:
-        """Answer all measurements of a decision by the action, and report on each."""
+        """Take in all measurements of a decision with the action, and report on each."""
         ...
 
     def reports(self) -> list[Any]:
@@ -92,11 +92,11 @@ class EpisodeStepper(Protocol):
         ...
 
     def observation_by_field(self) -> Array:
-        """What is shown, ``(fields, width)``, until the next decision."""
+        """Return the observation, ``(fields, width)``, valid until the next decision."""
         ...
 
     def observation(self, count: int) -> Array:
-        """Observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first; the caller may keep it."""
         ...
 
     def take_alone(self, action: Array) -> None:
@@ -104,11 +104,11 @@ class EpisodeStepper(Protocol):
         ...
 
     def first_reward(self, beside: Any) -> float:
-        """Mean of the rewards of the first lane, less those of what runs beside it, if anything does."""
+        """Return the mean of the rewards of the first lane, less those of what runs beside it, if anything does."""
         ...
 
     def observation_of_first(self) -> Array:
-        """Observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane; the caller may keep it."""
         ...
 
 
@@ -145,13 +145,13 @@ class ModelStepper:
         return start
 
     def _start(self, noise: EpisodeNoise) -> tuple[Array, Array]:
-        """Uniforms and normals of the start."""
+        """Return the uniforms and normals of the start."""
         task = self.model.task
         uniforms, normals = (task.xp.asarray(numbers, device=task.device) for numbers in noise.start())
         return uniforms, normals
 
     def load(self, episode: Episode, shown: Array = None) -> None:
-        """Go on from other episodes; what they show is observed from them unless it is given."""
+        """Continue from other episodes; their observation is computed unless it is given."""
         self._episode, self.shown = episode, shown
 
     def begin_some(
@@ -195,7 +195,7 @@ class ModelStepper:
         self.take(action[None])
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
-        """Answer all measurements of a decision by the action, see :meth:`.Stepper.decide`."""
+        """Take in all measurements of a decision with the action, see :meth:`.Stepper.decide`."""
         means = DecisionMeans(self.model.fields, self.model.task.decision_interval)
         total: Any = 0.0
         for each in (self, *others):
@@ -222,22 +222,24 @@ class ModelStepper:
         return self._reports
 
     def first_reward(self, beside: "ModelStepper | None") -> float:
-        """Mean of the same of the first lane, where each is one number, less those of what runs beside it."""
+        """Return the mean of the same of the first lane, where each is one number, less those of what runs beside
+        it.
+        """
         others = [0.0] * len(self._reports) if beside is None else beside._reports
         return float(mean_of([a - b for a, b in zip(self._reports, others, strict=True)])[0])
 
     def observation_of_first(self) -> Array:
-        """Observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane; the caller may keep it."""
         return self.observation(1)[0]
 
     def observation_by_field(self) -> Array:
-        """What is shown, ``(fields, width)``."""
+        """Return the observation, ``(fields, width)``."""
         if self.shown is None:
             self.shown = self.model.observe(self._episode)
         return self.shown
 
     def observation(self, count: int) -> Array:
-        """Observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first; the caller may keep it."""
         shown = self.observation_by_field()[:, :count].T
         # Contiguous, in memory of its own.
         return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
@@ -309,13 +311,13 @@ class Lanes:
             lanes: in which, ascending; default: all.
         """
         task = self.task
-        everyone = lanes is None or len(lanes) == self.count
-        index = numpy.arange(self.count) if lanes is None or everyone else numpy.asarray(lanes)
+        is_whole = lanes is None or len(lanes) == self.count
+        index = numpy.arange(self.count) if lanes is None or is_whole else numpy.asarray(lanes)
         if not self._moving and self._report is not None:
             self._reporting(self._report)
         self._moving = self._moving or self._by_functions()
         own, *beside = self._moving
-        if everyone:
+        if is_whole:
             start = own.begin(identities, self.noise, beside)
         else:
             noise = self._noise_of_some(len(index))
@@ -329,7 +331,7 @@ class Lanes:
             self._on_start(self.model.begin(*start))
 
     def _noise_of_some(self, count: int) -> EpisodeNoise:
-        """Noise of so many lanes that restart, in one of a few sizes."""
+        """Return the noise of so many lanes that restart, in one of a few sizes."""
         width = LANES
         while width < count:
             width *= 2
@@ -403,7 +405,7 @@ class Lanes:
             measurements: after which they are left, a multiple of the decision interval; default: those of an episode.
 
         Returns:
-            Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of the policy.
+            Reports, arrays ``(measurements, ..., width)``, and the actions of the policy in the same form.
         """
         (stepper,) = self._reporting(report)
         assert isinstance(stepper, Stepper)
@@ -415,21 +417,21 @@ class Lanes:
         return answer
 
     def next_row(self) -> Array:
-        """Noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""
+        """Return the noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""
         self.noise.advance()
         return self.noise.row
 
     # --- what steps them
 
     def _by_functions(self) -> list[Any]:
-        """Steppers by the models' functions, without episodes."""
+        """Return the steppers by the models' functions, without episodes."""
         steppers = [ModelStepper(model, self.width) for model in self._models]
         if self.beside is not None:
             steppers[1].take(self._beside_action(self.width))
         return steppers
 
     def _beside_action(self, count: int) -> Array:
-        """Action of what runs beside, batch first."""
+        """Return the action of what runs beside, batch first."""
         assert self.beside is not None
         actions = [self.beside.action] * count
         discrete = isinstance(self.beside.action, int)
@@ -440,7 +442,7 @@ class Lanes:
         )
 
     def _reporting(self, report: Report) -> Sequence[Any]:
-        """Steppers that make a report, which hold the episodes from now on."""
+        """Return the steppers that make a report, which hold the episodes from now on."""
         if self._moving is self._steppers.get(report):
             return self._moving
         if report not in self._steppers and all(can_step(model, report) for model in self._models):
@@ -461,7 +463,7 @@ class Lanes:
         return after
 
     def _settle(self) -> list[ModelStepper]:
-        """Let the models' functions step the episodes, in arrays of their own; returns what does."""
+        """Return steppers that run the episodes by the functions of the models, in arrays of their own."""
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
@@ -515,7 +517,7 @@ class Lanes:
     # --- copies, growth, gradients
 
     def _episodes(self) -> tuple[Any, ...]:
-        """Episodes of every task with what is shown of them; the arrays never change."""
+        """Return the episodes of every task with what is shown of them; the arrays never change."""
         return tuple((stepper.episode(), stepper.shown) for stepper in self._settle())
 
     def _load(self, episodes: tuple[Any, ...]) -> None:
@@ -533,7 +535,7 @@ class Lanes:
         return {"count": self.count, "episodes": self._episodes(), "noise": self.noise.snapshot(), **kept}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go on from a snapshot of lanes of the same task.
+        """Continue from a snapshot of lanes of the same task.
 
         Raises:
             ValueError: if their number differs.
@@ -546,7 +548,7 @@ class Lanes:
         self._load(snapshot["episodes"])
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
+        """Shorten the episodes that have just begun in some lanes by so many decisions, to one at least."""
         self.decisions[list(lanes)] = numpy.minimum(decisions, self._lengths[list(lanes)] - 1)
 
     @property
@@ -555,5 +557,7 @@ class Lanes:
         return self.decisions >= self._lengths
 
     def observe(self) -> Array:
-        """Observation of every lane, batch first: ``(count, len(model.fields))``; the caller may keep it."""
+        """Return the observation of every lane, batch first: ``(count, len(model.fields))``; the caller may keep
+        it.
+        """
         return self._moving[0].observation(self.count)

@@ -1,4 +1,4 @@
-"""What is traced and compiled of a model: the parts of a step, and its reports.
+"""Compiled programs of a model: the parts of a step, and its reports.
 
 A step has four parts. Apart, because scenarios differ in the world, controls in the action and callers in the report:
 what is long, world and filter, is compiled once for all of them.
@@ -28,34 +28,34 @@ Report = Callable[[Model, Episode], Any]
 
 
 def _update(model: Model, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
-    """Filter after the measurement, and what it gives back to the world."""
+    """Return the filter after the measurement, and what it gives back to the world."""
     after = model.filter.update(state, FilterInput(measurement, truth, action))
     return after, model.feedback(after, measurement)
 
 
 def _advance(model: Model, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
-    """Truth at the next measurement, and the measurement."""
+    """Return the truth at the next measurement, and the measurement."""
     return model.task.world.advance(truth, noise, feedback)
 
 
 def _predict(model: Model, state: Any, measurement: Any) -> tuple[Any, Array]:
-    """Filter at the measurement, and what is shown of it."""
+    """Return the filter at the measurement, and what is shown of it."""
     predicted = model.filter.predict(state, measurement)
     return predicted, model.observe(Episode(None, measurement, predicted))
 
 
 def _predict_unseen(model: Model, state: Any, measurement: Any) -> Any:
-    """Filter at the measurement, of which nothing is shown."""
+    """Return the filter at the measurement, of which nothing is shown."""
     return model.filter.predict(state, measurement)
 
 
 def begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any]:
-    """Truth at the start of the track, and the initial estimate."""
+    """Return the truth at the start of the track, and the initial estimate."""
     return model.task.world.begin(Draws(uniforms, model.task.xp), normals)
 
 
 def start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
-    """Filter at the start of the track, and what it gives back to the world."""
+    """Return the filter at the start of the track, and what it gives back to the world."""
     state = model.filter.initialise(FilterInput(initial, truth))
     return state, model.feedback(state, initial)
 
@@ -85,7 +85,7 @@ class _ComputedOnce:
 
 
 class Programs:
-    """What is traced of a task, for all that have its parameters.
+    """Traced programs of a task, shared by all models with its parameters.
 
     Args:
         traced: the task on traced arrays.
@@ -129,7 +129,7 @@ class Programs:
         return self._kept[key]
 
     def function(self, function: Callable[..., Any], **options: Any) -> CompiledFunction:
-        """Compiled form of ``function(task, ...)``."""
+        """Return the compiled form of ``function(task, ...)``."""
         if function not in self._functions:
             options = {"unchanged": 0, **options}
             self._functions[function] = CompiledFunction(
@@ -139,24 +139,24 @@ class Programs:
 
     @_ComputedOnce
     def filter_update(self) -> CompiledFunction:
-        """The filter with the measurement; a part of it that stays is not written again."""
+        """Return the program of the filter update; a part of it that stays is not written again."""
         return self.function(_update, unchanged=None)
 
     @_ComputedOnce
     def world_advance(self) -> CompiledFunction:
-        """The world; a part of the truth that stays is not written again."""
+        """Return the program of the world; a part of the truth that stays is not written again."""
         if self._of_world is not self:
             return self._of_world.world_advance
         return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
 
     @_ComputedOnce
     def filter_prediction(self) -> CompiledFunction:
-        """The filter at the next measurement."""
+        """Return the program of the filter prediction."""
         return self.function(_predict, turned=True)
 
     @_ComputedOnce
     def world_start(self) -> Specialised:
-        """World at the start of the track."""
+        """Return the world at the start of the track."""
         if self._of_world is not self:
             return self._of_world.world_start
         noise = self.traced.task.noise
@@ -165,7 +165,7 @@ class Programs:
 
     @_ComputedOnce
     def start(self) -> tuple[Specialised, Specialised]:
-        """World and filter at the start of the track."""
+        """Return the world and filter at the start of the track."""
         truth, initial = self.world_start.example()
         return self.world_start, self.function(start_filter).specialise(
             initial, self.traced.truth_for_filter(truth)
@@ -173,13 +173,13 @@ class Programs:
 
     @_ComputedOnce
     def first(self) -> Parts:
-        """Parts of the way from the start of the track over the first measurement."""
+        """Return the parts of the way from the start of the track over the first measurement."""
         world, started = self.start
         return self._parts(world.example()[0], *started.example())
 
     @_ComputedOnce
     def later(self) -> Parts:
-        """Parts of the way from an action to the next.
+        """Return the parts of the way from an action to the next.
 
         Raises:
             NotTraceable: if one is no straight line of arithmetic.
@@ -196,7 +196,7 @@ class Programs:
 
     @_ComputedOnce
     def unseen_predictions(self) -> tuple[Specialised, Specialised]:
-        """The filter at the first measurement and at later ones, where nobody looks at what it shows."""
+        """Return the filter predictions at the first and at later measurements, without an observation."""
         states = self.start[1].example()[0], self.first.update.example()[0]
         predict, measurement = self.function(_predict_unseen), self.later.episode.measurement
         return predict.specialise(states[0], measurement), predict.specialise(states[1], measurement)
@@ -226,7 +226,7 @@ class Programs:
         return Parts(update, advance, predict, Episode(following, measurement, predicted))
 
     def report_program(self, report: Report) -> Specialised:
-        """A report on an episode.
+        """Return the program of a report.
 
         Raises:
             NotTraceable: if it is no straight line of arithmetic.

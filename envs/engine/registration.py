@@ -223,8 +223,8 @@ def _check_episodes(model: Model) -> None:
 
 
 def _leaves(name: str, part: Any) -> Iterator[tuple[str, Any]]:
-    """Arrays of nested tuples and dictionaries, and whatever stands in their place, with names such as "load of the
-    truth".
+    """Return the arrays of nested tuples and dictionaries, and whatever stands in their place, with names such as
+    "load of the truth".
     """
     if isinstance(part, dict):
         for field, value in part.items():

@@ -16,7 +16,7 @@
   difference of small costs, and the logarithm of the ratio of large ones. So a few wild episodes, which rule the mean
   of the cost, do not hide what an action changes in all others.
 
-:attr:`.Reward.kind` of the task says which is the default.
+:attr:`.Reward.kind` of the task is the default.
 
 The counted cost is the cost, or the part of it that :meth:`.World.counted_cost` leaves. What an evaluation compares is
 the whole cost, neither compressed nor in another unit.
@@ -36,30 +36,30 @@ COMPRESSED_BEYOND = 30.0
 
 
 def compress(model: Model, counted: Array) -> Array:
-    """Counted cost in units of the paper's average one, compressed, ``(N,)``."""
+    """Return the counted cost in units of the paper's average one, compressed, ``(N,)``."""
     return COMPRESSED_BEYOND * model.task.xp.log1p(
         counted * (1.0 / (COMPRESSED_BEYOND * model.task.reward.unit))
     )
 
 
 def compressed_cost(model: Model, state: Any) -> Array:
-    """Counted cost of the estimate in units of the paper's average one, compressed, ``(N,)``."""
+    """Return the counted cost of the estimate in units of the paper's average one, compressed, ``(N,)``."""
     return compress(model, model.counted_cost(state))
 
 
 def cost_reward(model: Model, state: Any) -> Array:
-    """Minus the compressed cost of the estimate, ``(N,)``."""
+    """Return the minus the compressed cost of the estimate, ``(N,)``."""
     return -compressed_cost(model, state)
 
 
 def log_cost_reward(model: Model, state: Any) -> Array:
-    """Minus ``log(1 + x)`` of the counted cost x in units of an ordinary one, ``(N,)``."""
+    """Return the minus ``log(1 + x)`` of the counted cost x in units of an ordinary one, ``(N,)``."""
     unit = model.task.reward.log_unit or model.task.reward.unit
     return -model.task.xp.log1p(model.counted_cost(state) * (1.0 / unit))
 
 
 def log_likelihood_reward(model: Model, state: Any) -> Array:
-    """Log-density of the truth under what is reported, ``(N,)``."""
+    """Return the log-density of the truth under what is reported, ``(N,)``."""
     return log_density(model.error(state), model.covariance(state))[0]
 
 
@@ -75,7 +75,7 @@ LIKELIHOOD_WEIGHTS = {"cost": 0.0, "cost-and-likelihood": 1.0}
 
 
 def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance: Array) -> Array:
-    """Expected reward, up to a constant, if the truth is distributed as a teacher says, ``(N,)``.
+    """Return the expected reward, up to a constant, if the truth has the distribution of a teacher, ``(N,)``.
 
     With d = x - m, the student's estimate less the teacher's, and their covariances P and S, the log-density is
     expected to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A cost is a square of errors, and adds that of the teacher's own
@@ -119,7 +119,7 @@ REWARDS = tuple(kind for kind in OWN_REWARDS if kind != "none")
 
 
 class RewardBaseline(NamedTuple):
-    """What runs beside every episode on the same noise, for rewards that are relative."""
+    """Baseline beside every episode on the same noise, for relative rewards."""
 
     model: Model
     """The same task, under a control."""

@@ -19,7 +19,7 @@ from .reward import OWN_REWARDS, teacher_reward
 
 
 class TrainingObjective(NamedTuple):
-    """What the gradient is of."""
+    """Function whose gradient is computed."""
 
     kind: str
     """Of reward."""
@@ -28,7 +28,7 @@ class TrainingObjective(NamedTuple):
 
 
 def _unpack(like: Episode, state: Any) -> Episode:
-    """Episode whose numbers are the rows of an array, ``(rows, N)``."""
+    """Return the episode whose numbers are the rows of an array, ``(rows, N)``."""
     row = 0
 
     def leaf(array: numpy.ndarray) -> Any:
@@ -49,7 +49,7 @@ def _pack(episode: Episode) -> Any:
 def _forward(
     programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *teacher: Any
 ) -> Any:
-    """Episodes at the next measurement, reward, and observation."""
+    """Return the episodes at the next measurement, reward, and observation."""
     model = programs.traced
     after = model.act(_unpack(programs.later.episode, state), action)
     episode, own = model.measure(after, noise), OWN_REWARDS[reward.kind](model, after)
@@ -62,7 +62,8 @@ def _forward(
 def _backward(
     programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *others: Any
 ) -> Any:
-    """Gradients with respect to episodes and action, from those with respect to what :func:`_forward` returns.
+    """Return the gradients with respect to episodes and action, from those with respect to what :func:`_forward`
+    returns.
 
     The last three arguments are the latter; what stands before them is the teacher's.
     """
@@ -97,9 +98,9 @@ class Rollout:
 
     Attributes:
         action: of every measurement, ``(measurements, A, width)``, to be written before it is flown.
-        noise: likewise, ``(measurements, row width, width)``.
-        teacher: likewise, means ``(measurements, C, width)`` and covariances ``(measurements, C C, width)`` of a
-            teacher; nothing where there is none.
+        noise: of every measurement, ``(measurements, row width, width)``.
+        teacher: of every measurement, means ``(measurements, C, width)`` and covariances ``(measurements, C C, width)``
+            of a teacher; nothing where there is none.
         reward: of the last action, ``(width,)``.
         shown: last observation, ``(fields, width)``.
         reward_adjoint: gradient with respect to the reward, ``(width,)``, to be written.
@@ -159,11 +160,11 @@ class Rollout:
         self._flown += 1
 
     def backward_from_here(self) -> None:
-        """Let the gradient with respect to the episodes as they are now be zero."""
+        """Set the gradient with respect to the present episodes to zero."""
         self._backward[0].arrays[self._adjoint][...] = 0.0
 
     def backward(self, measurement: int) -> None:
-        """Go back over a measurement, the last one first."""
+        """Propagate the gradient back over a measurement, the last one first."""
         backward = self._backward[0]
         backward.table[self._addresses] = self._places[measurement]
         backward(0, self._width)

@@ -1,4 +1,4 @@
-"""How a task is made from names and keywords: what a user may give as scenario."""
+"""Choice of a task by names and keywords, and of its scenario."""
 
 import math
 import re
@@ -33,8 +33,8 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
 
     Args:
         cls: the environment.
-        scenario: a mixture maps names of scenarios to weights, ``{"random": 0.8, "paper": 0.2}``, or says so in words,
-            ``"random:0.8,paper:0.2"``. A weight of zero leaves a scenario out.
+        scenario: a mixture maps names of scenarios to weights, ``{"random": 0.8, "paper": 0.2}``, or is written in
+            words, ``"random:0.8,paper:0.2"``. A weight of zero leaves a scenario out.
 
     Raises:
         ValueError: for an unknown scenario, and for weights that are none.

@@ -27,7 +27,7 @@ from .programs import Report
 
 
 def mean_of(rewards: Sequence[Any]) -> Any:
-    """Mean over the measurements of one decision."""
+    """Return the mean over the measurements of one decision."""
     return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
 
 
@@ -45,8 +45,8 @@ class Stepper:
         model: compiled.
         report: made of every episode after the action.
         width: lanes, a multiple of eight.
-        world_of: a stepper of the same task, both filters in an open loop. Its world is this one's too, and nobody
-            looks at what this one shows. Whatever is done with both is done with it first.
+        world_of: a stepper of the same task, both filters in an open loop. Its world is this one's too, and the
+            observation of this one is not used. Each call on both is made on it first.
 
     Attributes:
         action: applied at every step, ``(..., width)``.
@@ -159,7 +159,7 @@ class Stepper:
         self._action_place, self._report_place = len(update.inputs) - 1, len(tell.inputs)
 
     def load(self, episode: Episode, shown: Array = None) -> None:
-        """Go on from other episodes, which show what is given, ``(fields, width)``."""
+        """Continue from other episodes with this observation, ``(fields, width)``."""
         own = zip(self._copies[self._now], leaves(episode), strict=True)
         for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values.reshape(memory.shape)
@@ -268,7 +268,7 @@ class Stepper:
         self._first_action[...] = action
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
-        """Answer all measurements of a decision by the action, and report on each; others do so beside it.
+        """Take in all measurements of a decision with the action, and report on each; others do so beside it.
 
         A tile of lanes goes through all of it, with the others, as one native call.
         """
@@ -334,7 +334,7 @@ class Stepper:
     def _tiled(
         self, turns: Sequence[Sequence[Call]], others: "Sequence[Stepper]" = ()
     ) -> list[tuple[Call, int, int]]:
-        """Where calls have arrays of the first tile of lanes, as :class:`.CallSequence` takes it."""
+        """Return the places of arrays of the first tile of lanes in the calls, as :class:`.CallSequence` takes it."""
         apart = {id(array): hop for each in (self, *others) for array, hop in each._apart}
         calls = [call for turn in turns for call in turn]
         places = [(call, place, apart.get(id(a), 0)) for call in calls for place, a in enumerate(call.arrays)]
@@ -343,7 +343,9 @@ class Stepper:
     def _bound_copies(
         self, now: int, noise: EpisodeNoise, reported: Sequence[numpy.ndarray], moving: list[Moving]
     ) -> list[Call]:
-        """Calls of a step that begins with one of the copies, for tables of which entries move: reports are added."""
+        """Return the calls of a step that begins with one of the copies, for tables of which entries move: reports
+        are added.
+        """
         calls = [call.copy() for call in self._calls[now]]
         if self._world_of is None:
             calls[-2].table[self._row_entry] = noise.address
@@ -351,7 +353,7 @@ class Stepper:
         return calls
 
     def run(self, noise: EpisodeNoise, steps: int, compiled_policy: Specialised | None) -> tuple[Any, Any]:
-        """Go through many measurements without going back to Python between them.
+        """Run over many measurements without returning to Python between them.
 
         Args:
             noise: of the measurements.
@@ -360,8 +362,8 @@ class Stepper:
                 an action and the memory; a second run of the same episodes goes on. None: the action stays as it is.
 
         Returns:
-            The report on every measurement, in arrays ``(steps, ..., width)``, and the actions, likewise; None where
-            there is no policy.
+            The report on every measurement, in arrays ``(steps, ..., width)``, and the actions in the same form; None
+            where there is no policy.
         """
         if self._given:
             self._show_in(self._shown.copy())
@@ -394,7 +396,7 @@ class Stepper:
         return map_arrays(lambda i: answers[i], self._report_template), actions
 
     def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
-        """Memory of a policy before its first action."""
+        """Return the memory of a policy before its first action."""
         blank = memory_of(compiled_policy.outputs[1:] if compiled_policy else (), self.width)
         for array in blank:
             array[...] = 0.0
@@ -408,7 +410,9 @@ class Stepper:
         ]
 
     def first_reward(self, beside: "Stepper | None") -> float:
-        """Mean of these reports of the first lane, where each is one number, less those of what runs beside it."""
+        """Return the mean of these reports of the first lane, where each is one number, less those of what runs
+        beside it.
+        """
         if self._interval == 1:
             own: float = self._first_rewards.item(0)
             return own if beside is None else own - beside._first_rewards.item(0)
@@ -423,18 +427,18 @@ class Stepper:
         return self.reported[0] if self._interval > 1 else self.reported[0].copy()
 
     def observation_by_field(self) -> numpy.ndarray:
-        """What is shown, ``(fields, width)``, until the next step."""
+        """Return the observation, ``(fields, width)``, valid until the next step."""
         return self._shown.T
 
     def observation(self, count: int) -> numpy.ndarray:
-        """Observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first; the caller may keep it."""
         if count < MANY:
             return self._shown[:count].copy()
         self._given = True
         return self._shown[:count]
 
     def observation_of_first(self) -> numpy.ndarray:
-        """Observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane; the caller may keep it."""
         return self._first_shown.copy()
 
     def _show_in(self, memory: numpy.ndarray) -> None:
@@ -443,7 +447,7 @@ class Stepper:
 
 
 class _Bound(NamedTuple):
-    """What is run as one native call, from either of the two copies of the episodes."""
+    """One native call, from either of the two copies of the episodes."""
 
     draw: Call
     """What makes the noise of a measurement."""
@@ -459,8 +463,8 @@ def _bound(draw: Call, sequences: list[CallSequence], shown: list[list[Call]]) -
 
 
 def _side_by_side(arrays: Sequence[Leaf], width: int, tile: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
-    """Memory of all numbers of some arrays, ``(numbers, tiles, tile)``, and the arrays in it,
-    ``(..., tiles, tile)``: those of a tile side by side.
+    """Return the memory of all numbers of some arrays, ``(numbers, tiles, tile)``, and the arrays in it, ``(...,
+    tiles, tile)``: those of a tile side by side.
     """
     starts = numpy.cumsum([0, *(leaf.rows for leaf in arrays)]).tolist()
     if tile == width:

@@ -37,7 +37,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
             given out.
-        context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
+        context: whether ``info["context"]`` holds what was drawn for the episode and what of it holds now
             (:meth:`.Task.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
             and of what is "privileged", the context and the error after the last action in units of its reported
@@ -123,7 +123,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), self._with_context({})
 
     def _single_observation(self) -> Any:
-        """Observation of the one episode."""
+        """Return the observation of the one episode."""
         if not self.privileged:
             return self._to_dtype(self.fleet.observe()[0])
         return {name: values[0] for name, values in self._observations().items()}
@@ -170,7 +170,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
 
     @property
     def picture(self) -> "EpisodePicture | None":
-        """What keeps and draws the episode, up to date; None without a render mode."""
+        """Picture of the episode, up to date; None without a render mode."""
         return None if self._late is None else self._late.picture
 
     def render(self) -> numpy.ndarray | None:

@@ -1,4 +1,4 @@
-"""What both Gymnasium classes share: lanes of a task or of several, what is shown of them, and the reward."""
+"""Common base of both Gymnasium classes: lanes of one task or of several, observations, and the reward."""
 
 import inspect
 import math
@@ -33,7 +33,7 @@ def _no_truth(distribution: EpisodeDistribution) -> str:
 
 
 class EnvBase:
-    """What both environments share: a task, its spaces, and the reward."""
+    """Common base of both environments: a task, its spaces, and the reward."""
 
     model: Model
     """Where scenarios are mixed: of the single environment the one that is flown, of a vector the first."""
@@ -48,7 +48,7 @@ class EnvBase:
 
     @property
     def task(self) -> Task:
-        """What the model is of."""
+        """Task of the model."""
         return self.model.task
 
     def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
@@ -197,13 +197,13 @@ class EnvBase:
         )
 
     def _to_dtype(self, values: Array) -> Array:
-        """Numbers in the type that was asked for."""
+        """Return the numbers in the type that was asked for."""
         if self.options.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
 
     def _observations(self) -> Any:
-        """Observations of all lanes, batch first."""
+        """Return the observations of all lanes, batch first."""
         shown = self._to_dtype(self.fleet.observe())
         if not self.privileged:
             return shown
@@ -215,7 +215,7 @@ class EnvBase:
         }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Context of all lanes, batch first, and which of them has each part of it."""
+        """Return the context of all lanes, batch first, and which of them has each part of it."""
         found = []
         for (part,) in self.fleet.parts():
             context, xp = part.model.context(part.state), part.task.xp
@@ -252,7 +252,7 @@ class EnvBase:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium made this from; its ``max_episode_steps`` is the length of an episode in decisions."""
+        """Specification of Gymnasium; its ``max_episode_steps`` is the length of an episode in decisions."""
         return self._spec
 
     @spec.setter
@@ -261,7 +261,7 @@ class EnvBase:
 
     @property
     def backend(self) -> str:
-        """What computes the steps: "compiled", "numpy" or "torch"."""
+        """Code that computes the steps: "compiled", "numpy" or "torch"."""
         return self.model.backend
 
     # --- a step

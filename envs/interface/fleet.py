@@ -3,9 +3,8 @@
 A task has one set of parameters. As long as all episodes are of one, the fleet is that task's
 :class:`~.lanes.Lanes`, and every call goes straight to them. Where scenarios are mixed, or a reset names another
 scenario or other parameters, every distinct set has a task and lanes of its own. A lane's next episode gets a free
-place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. A place that nobody
-has is stepped all the same and never looked at: a step costs what as many environments of each task cost as ever flew
-it at once.
+place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. An unused place is
+stepped all the same: a step costs as much as the largest number of environments of each task that ever flew it at once.
 
 What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the identity
 of the episode, see :mod:`.episode_noise`. So sub-environment i of N equals the single environment with the same seed,
@@ -30,7 +29,7 @@ ROOM = 8
 
 
 class EpisodeDistribution(NamedTuple):
-    """What the coming episodes of a lane are drawn from."""
+    """Distribution of the coming episodes of a lane."""
 
     scenario: Any
     """As it was asked for."""
@@ -43,15 +42,15 @@ class EpisodeDistribution(NamedTuple):
     """Which sum to one."""
 
     def is_of(self, scenario: Any, parameters: Mapping[str, Any]) -> bool:
-        """Whether it was made of these."""
-        if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long to be told
+        """Return whether it was made of these."""
+        if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long for a message
             alike = scenario is self.scenario
         else:
             alike = repr(plain(self.scenario)) == repr(plain(scenario))
         return alike and repr(plain(self.parameters)) == repr(plain(parameters))
 
     def draw_task(self, generator: numpy.random.Generator) -> int:
-        """Number of the task of the next episode; one task takes no random number."""
+        """Return the number of the task of the next episode; one task takes no random number."""
         if len(self.models) == 1:
             return 0
         chosen = int(numpy.searchsorted(numpy.cumsum(self.weights), generator.random(), side="right"))
@@ -149,12 +148,12 @@ class Fleet:
         return self._parts[self._part[lane]].model
 
     def identity_of(self, lane: int) -> numpy.ndarray:
-        """Identity of a lane's episode, ``(2, 1)``, see :mod:`.episode_noise`."""
+        """Return the identity of a lane's episode, ``(2, 1)``, see :mod:`.episode_noise`."""
         place = self._place[lane]
         return self._parts[self._part[lane]].noise.identities[:, place : place + 1].copy()
 
     def scenario_of(self, lane: int) -> str:
-        """Name of the scenario of a lane's episode."""
+        """Return the name of the scenario of a lane's episode."""
         return self._names[lane]
 
     @property
@@ -171,7 +170,7 @@ class Fleet:
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
-        """Lanes of a task, made when they are first asked for."""
+        """Return the lanes of a task, made when they are first asked for."""
         for part in self._parts:
             if part.model is model or part.model.task.parameters == model.task.parameters:
                 return part
@@ -183,7 +182,7 @@ class Fleet:
         return part
 
     def _arrange(self) -> None:
-        """Forget lanes that nobody needs, and note where everybody is."""
+        """Remove unused lanes, and store the place of every environment."""
         needed = [
             model.task.parameters for distribution in self._distributions for model in distribution.models
         ]
@@ -201,7 +200,7 @@ class Fleet:
         for i in self._flying:
             own = numpy.flatnonzero(self._part == i)
             self._where[own] += first
-            # A place that nobody has takes the action of whoever comes first.
+            # An unused place takes the action of the first environment.
             source = numpy.full(self._parts[i].count, own[0])
             source[self._place[own]] = own
             self._sources.append(source)
@@ -260,7 +259,7 @@ class Fleet:
     # --- what lanes do
 
     def parts(self, *values: Array) -> list[tuple[Any, ...]]:
-        """Lanes of every task that is flown, each with what is meant for it of arrays ``(count, ...)``."""
+        """Return the lanes of every task that is flown, each with what is meant for it of arrays ``(count, ...)``."""
         return [
             (self._parts[i], *(v[source] for v in values))
             for i, source in zip(self._flying, self._sources, strict=True)
@@ -283,7 +282,7 @@ class Fleet:
         return self.gather([part.step_reward(own, kind) for part, own in self.parts(action)])
 
     def observe(self) -> Array:
-        """Observation of every lane, batch first."""
+        """Return the observation of every lane, batch first."""
         if self.whole is not None:
             return self.whole.observe()
         return self.gather([part.observe() for (part,) in self.parts()])
@@ -301,7 +300,7 @@ class Fleet:
         return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
+        """Shorten the episodes that have just begun in some lanes by so many decisions, to one at least."""
         for lane, by in zip(lanes, decisions, strict=True):
             self._parts[self._part[lane]].shorten([int(self._place[lane])], by)
 
@@ -321,7 +320,7 @@ class Fleet:
         return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go on from a snapshot of lanes of the same tasks.
+        """Continue from a snapshot of lanes of the same tasks.
 
         Raises:
             ValueError: if their number differs.

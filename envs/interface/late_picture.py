@@ -1,4 +1,4 @@
-"""The picture of an episode that is flown again when somebody looks at it.
+"""Picture of an episode that is flown again on request.
 
 This module imports matplotlib; the environment imports it only when a render mode is asked for.
 """
@@ -13,9 +13,9 @@ from ..engine.lanes import Lanes
 
 
 class LatePicture:
-    """The picture of one episode, which is flown again when somebody looks.
+    """Picture of one episode, which is flown again on request.
 
-    Libraries ask for a render mode of environments that nobody watches (Stable-Baselines3's ``make_vec_env`` always),
+    Libraries ask for a render mode of environments that are not shown (Stable-Baselines3's ``make_vec_env`` always),
     and keeping what is drawn takes far longer than a step. So only the actions are kept: they and its identity fix an
     episode.
 
@@ -42,7 +42,7 @@ class LatePicture:
 
     @property
     def picture(self) -> EpisodePicture:
-        """The picture with all that has happened."""
+        """Return the picture of all steps so far."""
         lanes, picture = self._lanes, self._picture
         if self._identity is not None:
             lanes.begin(self._identity)

@@ -1,7 +1,7 @@
-"""What no policy can know, for critics in training: the episode's context, and how wrong the estimate is.
+"""Privileged information for critics in training: the episode's context, and how wrong the estimate is.
 
-A critic may be told more than the policy that it judges (asymmetric actor and critic; Pinto et al., 2018): it is needed
-in training only. The environment keeps the two apart and says in its metadata that it is privileged.
+A critic may be given more than the policy that it judges (asymmetric actor and critic; Pinto et al., 2018): it is
+needed in training only. The environment keeps the two apart and declares in its metadata that it is privileged.
 """
 
 from typing import Any
@@ -12,7 +12,8 @@ from ..contract.task import Task
 
 
 def in_sigmas(error: Array, covariance: Array, count: int, xp: Any) -> Array:
-    """Errors of the first lanes in units of their reported standard deviations, zero where that is, ``(count, C)``.
+    """Return the errors of the first lanes in units of their reported standard deviations, zero where that is,
+    ``(count, C)``.
 
     Args:
         error: ``(C, N)``.
@@ -27,7 +28,7 @@ def in_sigmas(error: Array, covariance: Array, count: int, xp: Any) -> Array:
 
 
 def context_shapes(task: Task) -> dict[str, tuple[int, ...]]:
-    """Shapes of the parts of an episode's context, without the batch."""
+    """Return the shapes of the parts of an episode's context, without the batch."""
     xp, noise = task.xp, task.noise
 
     def numbers(rows: int, value: float) -> Array:

@@ -1,4 +1,4 @@
-"""What the callers of an environment give, checked: options, seeds, options of a reset, actions."""
+"""Checks of the arguments of an environment: options, seeds, options of a reset, actions."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -83,7 +83,7 @@ def _action_error(expected: str, action: Array) -> ValueError:
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """What a user of either environment may choose beside the task and its parameters; see :class:`.TaskEnv`.
+    """Options of both environments beside the task and its parameters; see :class:`.TaskEnv`.
 
     Raises:
         ValueError: for a value that is none of the choices.

@@ -1,4 +1,4 @@
-"""What Gymnasium is told of an environment that was made: its :class:`~gymnasium.envs.registration.EnvSpec`."""
+"""Specification of an environment that was made, for Gymnasium: its :class:`~gymnasium.envs.registration.EnvSpec`."""
 
 import dataclasses
 import enum
@@ -14,7 +14,7 @@ from ..data.scenario_data import ScenarioData
 def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
     """Return a spec that knows how long an episode is, and whose keywords go through JSON.
 
-    Gymnasium registers one length for an id; here it follows from scenario and parameters. Only who asks is told:
+    Gymnasium registers one length for an id; here it follows from scenario and parameters. It is computed on request:
     no ``TimeLimit`` is put around the environment, which truncates by itself.
 
     Args:

@@ -1,4 +1,4 @@
-"""What an environment asks about every measurement, after the action."""
+"""Report of an environment on every measurement, after the action."""
 
 import functools
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from ..engine.reward import OWN_REWARDS
 
 
 class StepReport(NamedTuple):
-    """What is asked about, lanes last; the rest is None."""
+    """Requested quantities, lanes last; the others are None."""
 
     reward: Array
     """``(N,)``; of a relative reward before the reference's is taken away."""
@@ -31,8 +31,8 @@ def step_report(kind: str, errors: bool = False, details: bool = False, episode:
     Args:
         kind: of reward, one of :data:`.reward.OWN_REWARDS`.
         errors: whether error and covariance are asked about.
-        details: likewise.
-        episode: likewise.
+        details: whether ``info`` holds the details of the measurement.
+        episode: whether ``info`` holds the statistics of the episode.
     """
     reward = OWN_REWARDS[kind]
 

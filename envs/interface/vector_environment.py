@@ -70,7 +70,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             cost and what else an evaluation records.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
             given out.
-        context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
+        context: whether ``info["context"]`` holds what was drawn for the episode and what of it holds now
             (:meth:`.Task.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
             and of what is "privileged", the context and the error after the last action in units of its reported
@@ -336,7 +336,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.pictures.close()
 
     def _with_masks(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
-        """Gymnasium's form of what some sub-environments report: a mask beside every key."""
+        """Return Gymnasium's form of what some sub-environments report: a mask beside every key."""
         if not mask.any():
             return {}
         masked = {}
@@ -355,7 +355,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return lanes.copy() if self.backend != "torch" else tensor_on(lanes, self.device)
 
     def _final_observations(self, last: Any, done: numpy.ndarray) -> Array:
-        """Gymnasium's form: an object for each finished sub-environment, None elsewhere.
+        """Return Gymnasium's form: an object for each finished sub-environment, None elsewhere.
 
         With the torch backend one tensor, the last observation of every lane: taking it apart would cost a
         transfer for each lane.

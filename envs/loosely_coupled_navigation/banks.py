@@ -82,7 +82,7 @@ class Augmented(NamedTuple):
     drift: Array
     """Estimate of beta, ``(A, N)``, m/s."""
     coloured: Array
-    """Of eta, likewise."""
+    """Estimate of eta, ``(A, N)``, m/s."""
     covariance: ins_gnss.AugmentedCovariance
     """After the last measurement that was acted on, the same for all axes, ``(N,)`` each."""
     deviation: Array
@@ -102,7 +102,7 @@ class Schemes(NamedTuple):
     drift: Array
     """Estimate of beta by the augmented filter, ``(A, N)``, m/s."""
     coloured: Array
-    """Of eta, likewise."""
+    """Estimate of eta, ``(A, N)``, m/s."""
     covariance: ins_gnss.AugmentedCovariance
     """Of the augmented filter, the same for all axes, ``(N,)`` each."""
     seen: Innovations
@@ -111,7 +111,7 @@ class Schemes(NamedTuple):
 
 
 class KalmanBucyBank(Bank[Task, Measurement, Any]):
-    """What the banks share: the innovations that are shown, and the end of the observation."""
+    """Common base of the banks: the innovations in the observation, and its end."""
 
     parameters: LooselyCoupledNavigationParameters
     filters: tuple[str, ...] = ()
@@ -183,7 +183,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """What the receiver reports, and the innovations, as they are."""
+        """Reported deviation and innovations, without compression."""
         nominal = self.parameters.receiver_variance
         return (
             Quantity(
@@ -205,17 +205,17 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
         raise NotImplementedError
 
     def no_innovations(self, zero: Array) -> Innovations:
-        """Innovations at the start of the track, of the shape of ``zero``."""
+        """Return the innovations at the start of the track, of the shape of ``zero``."""
         return Innovations(zero, zero, zero, zero + 1.0, zero, zero + 1.0)
 
     def log_density(self, seen: Innovations) -> Array:
-        """Log-density of the innovations of each axis."""
+        """Return the log-density of the innovations of each axis."""
         return -0.5 * seen.normalised * seen.normalised - self.xp.log(
             math.sqrt(2.0 * math.pi) * seen.deviation
         )
 
     def consistency(self, state: Any, measurement: Measurement) -> dict[str, Array]:
-        """NIS and log-density of one filter, NaN without a measurement."""
+        """Return the NIS and log-density of one filter, NaN without a measurement."""
         xp, there = self.xp, measurement.available > 0.0
         nis = ordered_sum(state.seen.normalised * state.seen.normalised)
         return {
@@ -227,7 +227,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
     def update_innovations(
         self, before: Innovations, measurement: Measurement, position: Array, variance: Array
     ) -> Innovations:
-        """Innovations of predicted positions, and their averages; without a measurement these stand still.
+        """Return the innovations of predicted positions, and their averages; without a measurement these stand still.
 
         Args:
             before: at the measurement before.
@@ -256,7 +256,7 @@ NOISES = ("receiver", "coloured", "white")
 
 
 class NoiseBank(KalmanBucyBank):
-    """Control ``noise``: the augmented filter, which takes the noises to be what the action says."""
+    """Control ``noise``: the augmented filter, with the noises scaled by the action."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
 
@@ -267,7 +267,7 @@ class NoiseBank(KalmanBucyBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What every filter shows, and the deviation that this one predicts."""
+        """Observation of every filter, and the deviation that this one predicts."""
         nominal = math.sqrt(self.parameters.receiver_variance)
         return (
             *super().blocks,
@@ -298,7 +298,7 @@ class NoiseBank(KalmanBucyBank):
         )
 
     def predict_covariance(self, state: Augmented, action: Array) -> ins_gnss.AugmentedCovariance:
-        """Covariance predicted to the measurement with the noises of an action."""
+        """Return the covariance predicted to the measurement with the noises of an action."""
         p, xp = self.parameters, self.xp
         coloured, white = xp.exp(self.reach * math.log(p.process_scale) * action[1:])
         growth, displacement = p.variance_growth
@@ -307,7 +307,7 @@ class NoiseBank(KalmanBucyBank):
         return ins_gnss.predict_augmented(state.covariance, p.sampling, coloured * growth, white_growth)
 
     def receiver_variance(self, measurement: Measurement, action: Array) -> Array:
-        """Variance of a measurement by an action, ``(N,)``, m^2."""
+        """Return the variance of a measurement by an action, ``(N,)``, m^2."""
         p = self.parameters
         up, down = (self.reach * math.log(most) for most in (p.receiver_scale, p.receiver_reduction))
         scale = self.xp.exp(self.xp.where(action[0] > 0.0, up * action[0], down * action[0]))
@@ -342,15 +342,15 @@ class NoiseBank(KalmanBucyBank):
         )
 
     def mean(self, state: Augmented) -> Array:
-        """Position, ``(A, N)``, m."""
+        """Return the position, ``(A, N)``, m."""
         return state.position
 
     def covariance(self, state: Augmented) -> Array:
-        """Covariance of the filter, ``(A, A, N)``, m^2."""
+        """Return the covariance of the filter, ``(A, A, N)``, m^2."""
         return self.eye * state.covariance.position
 
     def records(self, state: Augmented, measurement: Measurement) -> dict[str, Array]:
-        """NIS and log-density (NaN without a measurement)."""
+        """Return the NIS and log-density (NaN without a measurement)."""
         return self.consistency(state, measurement)
 
 
@@ -388,15 +388,17 @@ class GainBank(KalmanBucyBank):
         return state._replace(position=position, variance=variance, seen=seen)
 
     def gain(self, action: Array) -> Array:
-        """Gain that an action sets, logarithmic from the paper's at 0 to 1 at 1 and to the smallest; zero at -1."""
+        """Return the gain that an action sets, logarithmic from the paper's at 0 to 1 at 1 and to the smallest;
+        zero at -1.
+        """
         middle, smallest = self.middle, math.log(self.parameters.smallest_gain)
         # Torch would choose between two numbers in float32.
         beyond = self.xp.where(action > 0.0, -middle * action, (middle - smallest) * action)
         return self.xp.where(action <= -1.0, 0.0, self.xp.exp(middle + beyond))
 
     def action_for_gain(self, gain: Any) -> Any:
-        """Action that sets gains from 0 to 1, NumPy: the inverse of :meth:`gain`; the smallest one and less count as
-        zero.
+        """Return the action that sets gains from 0 to 1, NumPy: the inverse of :meth:`gain`; the smallest one and
+        less count as zero.
         """
         smallest, middle = self.parameters.smallest_gain, self.middle
         beyond = numpy.log(numpy.maximum(gain, smallest)) - middle
@@ -416,18 +418,18 @@ class GainBank(KalmanBucyBank):
         )
 
     def mean(self, state: GainState) -> Array:
-        """Position, ``(A, N)``, m."""
+        """Return the position, ``(A, N)``, m."""
         return state.position
 
     def covariance(self, state: GainState) -> Array:
-        """Covariance that belongs to the gains used, ``(A, A, N)``, m^2.
+        """Return the covariance that belongs to the gains used, ``(A, A, N)``, m^2.
 
         It holds for the modelled noises, and for gains that do not depend on the innovations.
         """
         return self.eye * state.variance.modelled
 
     def records(self, state: GainState, measurement: Measurement) -> dict[str, Array]:
-        """NIS and log-density (NaN without a measurement), gain and K."""
+        """Return the NIS and log-density (NaN without a measurement), gain and K."""
         found = self.consistency(state, measurement)
         for i, ending in enumerate([f"_{axis}" for axis in self.axes] or [""]):
             found[f"gain{ending}"] = state.gain[i]
@@ -519,19 +521,19 @@ class SchemeBank(KalmanBucyBank):
         )
 
     def mean(self, state: Schemes) -> Array:
-        """Combination of the estimates, ``(A, N)``, m."""
+        """Return the combination of the estimates, ``(A, N)``, m."""
         return weighted_sum(state.weights, self.xp.moveaxis(state.position, 0, 1))
 
     def covariance(self, state: Schemes) -> Array:
-        """Covariance of the combination, the spread of the estimates included, ``(A, A, N)``, m^2."""
+        """Return the covariance of the combination, the spread of the estimates included, ``(A, A, N)``, m^2."""
         xp = self.xp
         variance = xp.concat([state.plain_variance[:, 0], state.covariance.position[None]])
         position = xp.moveaxis(state.position, 0, 1)
         return imm.combine(position, self.eye[..., None] * variance, state.weights)[1]
 
     def records(self, state: Schemes, measurement: Measurement) -> dict[str, Array]:
-        """Weights, the mean of the filters' NIS by them, of the filter believed, and the log-density of their mixture
-        (NaN without a measurement).
+        """Return the weights, the mean of the filters' NIS by them, of the filter believed, and the log-density of
+        their mixture (NaN without a measurement).
         """
         there = measurement.available > 0.0
         of_each = ordered_sum(self.xp.moveaxis(self.log_density(state.seen), 1, 0))

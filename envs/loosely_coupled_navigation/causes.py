@@ -1,4 +1,4 @@
-"""What makes a fusion of LooselyCoupledNavigation costly: outages, jamming, spoofing, unreported noise, outliers."""
+"""Causes of cost in LooselyCoupledNavigation: outages, jamming, spoofing, unreported noise, outliers."""
 
 from ..contract.faults import causes_of
 from .disturbances import DISTURBANCES

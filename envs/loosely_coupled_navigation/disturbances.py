@@ -1,4 +1,4 @@
-"""What may befall the receiver of LooselyCoupledNavigation: a class for each."""
+"""Disturbances of the receiver of LooselyCoupledNavigation: a class for each."""
 
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -34,7 +34,7 @@ def _is_unreported(moment: Moment) -> Array | None:
 
 
 def _within(window: str, phrase: str) -> Cause:
-    """Cause that holds in a window of the context."""
+    """Return the cause that holds in a window of the context."""
 
     def holds(moment: Moment) -> Array | None:
         return within(moment.measurement.number, moment.context[window]) if moment.knows(window) else None
@@ -43,7 +43,7 @@ def _within(window: str, phrase: str) -> Cause:
 
 
 def number_at(time: Array, parameters: LooselyCoupledNavigationParameters) -> Array:
-    """Number of the measurement nearest to a time in s."""
+    """Return the number of the measurement nearest to a time in s."""
     return namespace(time).round(time / parameters.sampling_interval)
 
 
@@ -59,7 +59,7 @@ class Levels(NamedTuple):
     level: Array
     """True one of this measurement, ``(N,)``."""
     report: Array
-    """What is said of it, ``(N,)``."""
+    """Report of it, ``(N,)``."""
 
 
 class NoiseChanges(Disturbance):
@@ -119,7 +119,7 @@ class NoiseChanges(Disturbance):
         }
 
     def records(self, state: Levels) -> dict[str, Array]:
-        """What is reported."""
+        """Return the reports."""
         return {"reported_deviation": state.report}
 
 
@@ -146,7 +146,7 @@ class ReceiverColour(ColouredErrors):
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """What is left of them from one measurement to the next, and the standard deviation of what they gain, m."""
+        """Return their decay from one measurement to the next, and the standard deviation of their gain, m."""
         return {"receiver_decay": state.process.decay, "receiver_kick": state.process.kick}
 
 
@@ -162,7 +162,7 @@ class Spell(NamedTuple):
 
 
 class _Once(Disturbance):
-    """What befalls the receiver once in an episode, with its probability, limits of its start and of its duration."""
+    """Disturbance of the receiver once in an episode, with its probability, limits of its start and of its duration."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
@@ -215,7 +215,7 @@ class _Hidden(_Once):
 
 
 class Jamming(_Hidden):
-    """The noise of the receiver rises; nobody says so. Its strength is the standard deviation over that without."""
+    """The noise of the receiver rises, without a report. Its strength is the standard deviation over that without."""
 
     name = "jamming"
     causes: ClassVar[tuple[Cause, ...]] = (_within("jamming", "under jamming"),)
@@ -233,7 +233,7 @@ class Jamming(_Hidden):
         return self.xp.where(jammed, state.strength * deviations, deviations)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Window and strength."""
+        """Return the window and strength."""
         return {**super().context(state), "jamming_gain": state.strength}
 
 
@@ -249,7 +249,7 @@ class Spoofing(_Hidden):
         return state._replace(strength=state.strength + rate)
 
     def pull(self, state: Spell) -> Array:
-        """How far every axis is off at this measurement, m, ``(N,)``."""
+        """Return the error of every axis at this measurement, m, ``(N,)``."""
         run = (state.strength * self.parameters.sampling_interval) * (state.number - state.window[0] + 1.0)
         return self.xp.where(within(state.number, state.window), run, 0.0)
 
@@ -258,7 +258,7 @@ class Spoofing(_Hidden):
         return state, reading + self.pull(state) if self.probability else reading
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Window and rate."""
+        """Return the window and rate."""
         return {**super().context(state), "spoofing_rate": state.strength}
 
 
@@ -270,7 +270,7 @@ class ReceiverOutliers(Outliers):
 
     @staticmethod
     def limits(parameters: LooselyCoupledNavigationParameters) -> tuple[float, float]:
-        """Those of the parameters, of an intensity."""
+        """Return the limits of the parameters, of an intensity."""
         return parameters.outlier_probability, math.sqrt(parameters.outlier_factor)
 
     def change_deviations(self, state: Array, deviations: Array) -> Array:

@@ -1,4 +1,4 @@
-r"""A bank of Kalman filters over what nobody says of LooselyCoupledNavigation: noise levels, coloured error, spoofing.
+r"""A bank of Kalman filters over the hidden faults of LooselyCoupledNavigation: noise levels, coloured error, spoofing.
 
 Every hypothesis is a pair: what the noises are (J points of the INS's drift, coloured and white noise and of the
 receiver's coloured error; the first is what the task models), and since when the receiver is pulled off (not at all, or
@@ -24,7 +24,7 @@ settings change what the fix is weighed with, this once:
 
 pulled: the receiver is pulled off, whenever that began; modelled: all noises are as modelled; s(l): how far the level
 lies above the reported variance, logarithmically, one for the highest. So f1 multiplies the odds of a pull as other
-hazards would, f2 is the prior of a fault, f3 says that the receiver has become worse or better and f4 that it errs now.
+hazards would, f2 is the prior of a fault, f3 shifts the level of the receiver and f4 scales its present error.
 Q is what the coloured and the white rate error of the INS add in a step and W what the receiver's coloured error gains:
 a prediction with ``f5 Q`` and ``f6 W``, as these only add. Without a fix nothing changes.
 """
@@ -76,7 +76,7 @@ class Memory(NamedTuple):
 
 
 class Weighing(NamedTuple):
-    """What a measurement says of predicted hypotheses, those without a pull first, H of both together."""
+    """Predicted hypotheses weighed by a measurement, those without a pull first, H of both together."""
 
     log_likelihood: Array
     """Of the measurement, ``(N,)``."""
@@ -166,7 +166,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return FaultState(initial.mean, initial.covariance, memory, Likelihood.unknown(none))
 
     def give_birth(self, free: Hypotheses) -> Hypotheses:
-        """Hypotheses of all noises but the modelled ones that are pulled from here on, ``(J - 1, 1)``."""
+        """Return the hypotheses of all noises but the modelled ones that are pulled from here on, ``(J - 1, 1)``."""
         xp = self.xp
         none = 0.0 * free.weights[1:]
         P = faults.FaultCovariance(
@@ -181,13 +181,15 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
 
     def since_onset(self, number: Array) -> Array:
-        """Measurements since the onset of each hypothesis of a pull, ``(B, N)``, at the number of a measurement."""
+        """Return the measurements since the onset of each hypothesis of a pull, ``(B, N)``, at the number of a
+        measurement.
+        """
         cycle = 1.0 * self.spacing * self.prior.onsets
         since = number - self.onsets
         return since - cycle * self.xp.floor(since / cycle)
 
     def age(self, number: Array) -> Array:
-        """Age of each pull, s, ``(B, N)``: a pull begins in the middle between two hypotheses."""
+        """Return the age of each pull, s, ``(B, N)``: a pull begins in the middle between two hypotheses."""
         return self.interval * (self.since_onset(number) + 0.5 * (self.spacing + 1))
 
     def change(self, free: Hypotheses, pulled: Hypotheses, number: Array) -> tuple[Hypotheses, Hypotheses]:
@@ -223,7 +225,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return free, pulled
 
     def merge(self, begun: Hypotheses, pulled: Hypotheses, staying: Array, hazard: Array) -> Hypotheses:
-        """What knows of no pull together with what ends, by their moments; S = 4, ``(J - 1, 1)``."""
+        """Merge hypotheses without a pull and those that end, by their moments; S = 4, ``(J - 1, 1)``."""
         xp = self.xp
         weights = xp.concat([begun.weights * staying, pulled.weights * hazard], axis=1)
         mean = xp.concat([begun.mean, pulled.mean], axis=3)[:4]
@@ -254,18 +256,18 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return state._replace(memory=memory)
 
     def heeds(self, measurement: Measurement) -> Array:
-        """Where there is a fix."""
+        """Return one where there is a fix."""
         return measurement.available
 
     def examine(self, state: FaultState, measurement: Measurement) -> Weighing:
-        """How a fix weighs the predicted hypotheses."""
+        """Weigh the predicted hypotheses by a fix."""
         return self.weigh(state.memory, measurement)
 
     def apply_factors(
         self, predicted: Memory, measurement: Measurement, logarithms: Array
     ) -> tuple[Memory, Weighing]:
-        """Hypotheses with the noises of a step multiplied by factors of these logarithms, ``(6, N)``, and how a fix
-        weighs them with all factors.
+        """Return the hypotheses with the noises of a step multiplied by factors of these logarithms, ``(6, N)``,
+        and how a fix weighs them with all factors.
         """
         xp = self.xp
         receiver, *noises = xp.exp(logarithms[3:])
@@ -290,7 +292,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return self.take(predicted, measurement, weighing)
 
     def likelihood(self, weighing: Weighing, measurement: Measurement) -> Likelihood:
-        """How well a fix was predicted; NaN where there is none."""
+        """Return the likelihood of a fix; NaN where there is none."""
         there = measurement.available > 0.0
         return Likelihood(
             self.xp.where(there, weighing.log_likelihood, math.nan),
@@ -382,7 +384,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
             fix: INS less receiver, m, ``(A, N)``.
             there: whether there is a fix, ``(N,)``.
             levels: variances of the receiver, ascending, m^2, ``(L, N)``.
-            q: their probabilities, likewise.
+            q: their probabilities, ``(L, N)``.
 
         Returns:
             INS less receiver as predicted and innovations, m, ``(A, J, M, N)``, direction of the update, and noise.
@@ -451,12 +453,12 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
 
 
 def _exponential(power: Any) -> Any:
-    """Exponential of a number, or of each of an array."""
+    """Return the exponential of a number, or of each of an array."""
     return math.exp(power) if isinstance(power, int | float) else namespace(power).exp(power)
 
 
 def _flat(h: Hypotheses) -> list[Array]:
-    """Arrays of a covariance in a row."""
+    """Return the arrays of a covariance in a row."""
     return [*h.covariance.ins, h.covariance.cross, h.covariance.faults]
 
 
@@ -466,7 +468,8 @@ def _covariance(arrays: list[Array]) -> faults.FaultCovariance:
 
 
 def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.FaultCovariance, ...]:
-    """What a step adds to the covariance of hypotheses by the INS, Q, and by the receiver's coloured error, W.
+    """Return the growth in a step of the covariance of hypotheses by the INS, Q, and by the receiver's coloured error,
+    W.
 
     Args:
         noises: of the hypotheses.
@@ -487,7 +490,7 @@ def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.Fau
 
 
 def add_noise(h: Hypotheses, steps: Sequence[faults.FaultCovariance], factors: Sequence[Array]) -> Hypotheses:
-    """Predicted hypotheses with the noises of a step multiplied, each by its factor, ``(N,)``."""
+    """Return the predicted hypotheses with the noises of a step multiplied, each by its factor, ``(N,)``."""
     inertial, wandering = steps
     more, further = (factor - 1.0 for factor in factors)
     ins = (P + more * Q for P, Q in zip(h.covariance.ins, inertial.ins, strict=True))

@@ -1,4 +1,4 @@
-"""What the bank over faults of LooselyCoupledNavigation expects at the start, and the noises that it tries."""
+"""Prior of the bank over faults of LooselyCoupledNavigation, and the noises that it tries."""
 
 import math
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from ..contract.observation import Array
 from .parameters import LooselyCoupledNavigationParameters
 
 LEVELS = tuple(100 ** (i / 3) for i in range(-2, 5))
-"""Variances of the receiver over the reported one that are told apart."""
+"""Variances of the receiver over the reported one that the bank distinguishes."""
 
 
 class FaultPrior(NamedTuple):
-    """What a bank expects before it has seen anything; times in s."""
+    """Prior of a bank; times in s."""
 
     points: int = 6
     """Points of noises beside the modelled one."""
@@ -78,8 +78,9 @@ a few percent less, and errs by nearly twice the variance that it states (ANEES 
 
 
 def spread_points(points: int, dimensions: int) -> numpy.ndarray:
-    """Points that fill the unit cube evenly, ``(points, dimensions)``: the Kronecker sequence of the powers of the
-    root of ``x^(d + 1) = x + 1`` (Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
+    """Return the points that fill the unit cube evenly, ``(points, dimensions)``: the Kronecker sequence of the
+    powers of the root of ``x^(d + 1) = x + 1`` (Roberts, "The unreasonable effectiveness of quasirandom
+    sequences", 2018).
     """
     root = 2.0
     for _ in range(60):
@@ -106,7 +107,7 @@ class Noises(NamedTuple):
 
 
 def draw_noises(prior: FaultPrior, p: LooselyCoupledNavigationParameters) -> Noises:
-    """Points of noises, the modelled one first, ``(J,)`` each."""
+    """Return the points of noises, the modelled one first, ``(J,)`` each."""
     interval = p.sampling_interval
     unit = spread_points(prior.points, 5).T
 

@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the estimator ``fault-bank``, steered; what its settings are, ``fault_bank.py`` says."""
+"""Control ``hypotheses``: the estimator ``fault-bank`` with settings that an action multiplies."""
 
 import math
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ class HypothesesState(NamedTuple):
     predicted: Array
     """Probabilities of groups of hypotheses before the fix, ``(G, N)``."""
     probabilities: Array
-    """After it, if the action is zero, likewise."""
+    """Probabilities of the groups after it, if the action is zero, ``(G, N)``."""
     levels: Array
     """Of the receiver's levels then, ``(L, N)``."""
     entropy: Array
@@ -63,7 +63,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What every filter shows, how well this one has predicted the fix, and what it believes."""
+        """Observation of every filter, likelihood of the fix, and probabilities of the hypotheses."""
         xp = self.xp
         nominal = 0.5 * self.parameters.axes * math.log(2.0 * math.pi * self.parameters.receiver_variance)
         return (
@@ -87,7 +87,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
             probability_block(
                 xp,
                 self.level_names,
-                "likewise of the receiver's variance over the reported one",
+                "probability then of the receiver's variance over the reported one",
                 name="level_probability",
                 value=lambda f: f.levels,
             ),
@@ -117,7 +117,9 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         )
 
     def group(self, weights: Array, age: Array) -> Array:
-        """Probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``, and of the age of pulls, s."""
+        """Return the probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``, and of the age of
+        pulls, s.
+        """
         xp, points, onsets = self.xp, self.own.prior.points, self.own.prior.onsets
         free = weights[: 1 + points]
         pulled = xp.reshape(weights[1 + points :], (points, onsets, weights.shape[-1]))

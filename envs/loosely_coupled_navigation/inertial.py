@@ -85,7 +85,7 @@ def inertial_recording(
         fixes: ``latitude``, ``longitude`` (degrees) and ``height`` (m), or ``x``, ``y``, ``z`` (m east, north, up of
             ``site``); optional ``sigma`` (m, of each axis) and ``velocity_east``, ``velocity_north``, ``velocity_up``
             (m/s, all three). They come at one interval; rows may lack.
-        truth: positions likewise; where it has no row within 1.5 s the truth is not known.
+        truth: true positions in the same form; without a row within 1.5 s the truth is unknown.
         rate_unit: ``degrees/s`` or ``rad/s``.
         acceleration_unit: ``m/s^2`` or ``g``.
         mounting: roll, pitch and yaw of the IMU's axes to forward, right, down of the vehicle, degrees.
@@ -292,7 +292,7 @@ def read_positions(data: Any, what: str, site: Sequence[float] | None) -> tuple[
 
 
 def geodetic_of_local(coordinates: numpy.ndarray, site: Sequence[float]) -> numpy.ndarray:
-    """Latitude, longitude (degrees) and height (m) of metres east, north and up of a site, ``(3, n)``.
+    """Return the latitude, longitude (degrees) and height (m) of metres east, north and up of a site, ``(3, n)``.
 
     Args:
         coordinates: ``(3, n)``, m.
@@ -321,7 +321,7 @@ def check_clocks(inertial: Any, clock: str, other: Any, its_clock: str, what: st
 
 
 def fix_deviations(fixes: Any, sigma: float | None) -> numpy.ndarray:
-    """Standard deviations of fixes, m, ``(n,)``, as they state them, else ``sigma``.
+    """Return the standard deviations of fixes, m, ``(n,)``, as they state them, else ``sigma``.
 
     Raises:
         ValueError: if neither is a positive number.
@@ -336,7 +336,9 @@ def fix_deviations(fixes: Any, sigma: float | None) -> numpy.ndarray:
 
 
 def differenced_velocities(fixes: Any, deviations: numpy.ndarray) -> Any:
-    """Fixes with velocities made of positions so far apart that their deviation is ``DIFFERENCED_SIGMA``."""
+    """Return the fixes with velocities made of positions so far apart that their deviation is
+    ``DIFFERENCED_SIGMA``.
+    """
     time = fixes.index.to_numpy()
     half = difference_half(deviations)
     after = numpy.clip(time + half, time[0], time[-1])
@@ -385,7 +387,7 @@ def aided_inertial(
 
 
 def regular_times(time: numpy.ndarray, end: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Times of measurements, s, and the fix at each, -1 where there is none.
+    """Return the times of measurements, s, and the fix at each, -1 where there is none.
 
     Args:
         time: of the fixes, s.

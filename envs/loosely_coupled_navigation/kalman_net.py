@@ -43,7 +43,7 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What control ``noise`` shows, and the estimated rate errors."""
+        """Observation of control ``noise``, and the estimated rate errors."""
         p = self.parameters
         unit = 1.0 / math.hypot(p.drift, p.coloured)
         return (
@@ -58,7 +58,7 @@ class KalmanNetBank(NoiseBank):
             Block(
                 "coloured",
                 lambda f, _: f.coloured * unit,
-                "estimated coloured rate error likewise",
+                "estimated coloured rate error over its deviation",
                 self.axes,
                 SIGNED_LOG,
             ),

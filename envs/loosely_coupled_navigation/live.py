@@ -14,7 +14,7 @@ class PositionInput(LiveInput):
     """The position by the INS at every measurement, and a fix where there is one."""
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return what is said in metres."""
+        """Return the values in metres."""
         values = {name: COLUMNS[name].live_text for name in ("ins", "fix", "sigma")}
         return values, {"ins": "m, position by the INS at the start; default: the mean"}
 

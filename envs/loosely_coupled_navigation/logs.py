@@ -21,12 +21,12 @@ COLUMNS = {
     ),
     "fix": Column(
         "m, position by the receiver, empty where there is none; with several axes fix_x, fix_y, fix_z",
-        live="m, position by the receiver, likewise; left out where there is none",
+        live="m, position by the receiver, on one axis; left out where there is none",
     ),
     "sigma": Column(
         "m, standard deviation of each axis of the fix, as reported; optional, default: the parameters'"
     ),
-    **{f"{kind}_{axis}": Column("likewise") for kind in ("ins", "fix") for axis in AXES},
+    **{f"{kind}_{axis}": Column("m, on this axis") for kind in ("ins", "fix") for axis in AXES},
 }
 
 
@@ -38,7 +38,7 @@ def measure(
     sigma: numpy.ndarray,
     p: Any,
 ) -> dict[str, numpy.ndarray]:
-    """Arrays of a measurement, of n rows of a table or of n tracks; a fix of some axes is none.
+    """Return the arrays of a measurement, of n rows of a table or of n tracks; a fix of some axes is none.
 
     Args:
         number: of the measurement, ``(n,)``.

@@ -63,11 +63,11 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     drift_factor: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
     """True over modelled standard deviation of beta, drawn log-uniformly in this interval."""
     coloured_factor: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
-    """True over modelled intensity of the coloured error, likewise."""
+    """True over modelled intensity of the coloured error, drawn in the same way."""
     white_factor: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
-    """True over modelled intensity of the white error, likewise."""
+    """True over modelled intensity of the white error, drawn in the same way."""
     receiver_factor: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
-    """True over nominal intensity of the receiver noise, likewise; every change draws anew."""
+    """True over nominal intensity of the receiver noise, drawn in the same way, anew at every change."""
 
     noise_changes: tuple[int, int] = parameter((0, 0), at_least=0, at_most=2, ascending=True)
     """Fewest and most changes of the receiver noise in the episode, 0 to 2, equally likely."""
@@ -103,13 +103,13 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     """Interval of the rate at which every axis is pulled off, m/s; ours: twice the noise of a sample at the end."""
 
     outlier_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That a measurement is an outlier, each one on its own; nobody says so."""
+    """Probability that a measurement is an outlier, each one on its own, without a report."""
     outlier_factor: float = parameter(100.0, above=0.0)
     """Intensity of the noise of an outlier over that of the others; ours: ten times the noise."""
 
     receiver_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Interval of the stationary standard deviation of the receiver's coloured error (first-order Gauss-Markov), beside
-    the white one, on each axis, m, drawn uniformly; nobody reports it."""
+    the white one, on each axis, m, drawn uniformly; it is not reported."""
     receiver_correlation_time: tuple[float, float] = parameter((2.0, 2.0), above=0.0, ascending=True)
     """Interval of the correlation time of that error, s, drawn log-uniformly; ours: multipath of a moving antenna,
     which lasts for seconds."""
@@ -211,6 +211,6 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         )
 
     def prior_covariance(self, none: Array) -> ins_gnss.AugmentedCovariance:
-        """Covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
+        """Return the covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
         drift, coloured = none + self.drift**2, none + self.coloured**2
         return ins_gnss.AugmentedCovariance(none, none, none, drift, none, coloured)

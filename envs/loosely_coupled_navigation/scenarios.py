@@ -99,7 +99,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "quiet",
-            "An INS better than modelled, nobody knows by how much: down to a tenth of the drift and a hundredth of "
+            "An INS better than modelled, by an unknown factor: down to a tenth of the drift and a hundredth of "
             "the intensities.",
             {
                 **_DRAWN,
@@ -118,7 +118,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "coloured-receiver",
             "Fixes with a coloured error of 0.6 to 1.2 m that lasts for 5 to 20 s beside the white one, unreported: "
-            "more, and longer, than in any training episode, and in 5 s hardly to be told from a bias.",
+            "more, and longer, than in any training episode, and in 5 s hardly distinguishable from a bias.",
             {
                 **_DRAWN,
                 "receiver_coloured": (0.6, 1.2),

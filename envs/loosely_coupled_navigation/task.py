@@ -3,7 +3,7 @@ r"""Loosely coupled navigation: an INS that drifts, corrected by a GNSS receiver
 After Benkafo and Lobaty, "Features of application of Kalman-Bucy filters in orientation and navigation
 complexes". The reference ``Xr`` is ``amplitude sin(rate t)``, or a sum of such harmonics that is drawn anew for every
 episode; the INS integrates it with the rate errors of :mod:`filtergym.filters.loosely_coupled`, the receiver measures
-it with white noise, and where the scenario says so with a coloured error e beside it. On every axis
+it with white noise, and in some scenarios with a coloured error e beside it. On every axis
 
     X += dXr + T beta + drive eta + dd,   eta = decay eta + de,   Z = Xr + e + sigma n
     Xh' = Xh + dX,   nu = Z - Xh',   Xh = Xh' + gain nu                                         (3)
@@ -67,22 +67,23 @@ class LooselyCoupledNavigation(Task):
     position. A filter without a measurement has the innovation zero, and its averages stand still. What is
     predicted under noise, for these as well, is predicted with the noises of the last action.
 
-    The increments of the INS are not shown: in ``paper`` the reference motion is always the same, so whoever knows it
-    by heart could read the rate errors off them. All that is shown depends on the errors alone, so that an agent does
-    the same whatever the motion. An estimator sees the increments; in every scenario but ``paper`` the motion is drawn
-    anew for every episode, and one that answers from the clock alone costs far more than the paper's filter.
+    The increments of the INS are not shown: in ``paper`` the reference motion is always the same, so an agent that
+    knows it by heart could read the rate errors off them. All that is shown depends on the errors alone, so that an
+    agent does the same whatever the motion. An estimator sees the increments; in every scenario but ``paper`` the
+    motion is drawn anew for every episode, and one that answers from the clock alone costs far more than the paper's
+    filter.
 
     ### Rewards
 
-    By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the squared error of position, summed over the axes, over
-    the nominal variance of a measurement (``N / sampling_interval``), in units of 0.02, its median under the action zero,
-    and x0 that of the action zero on the same noise. Outages and jamming rule the mean of x and are nobody's merit. "cost"
-    is ``-30 log(1 + x / 30)`` in units of 0.16, the mean cost of the paper's plain scheme.
+    By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the squared error of position, summed over the axes,
+    over the nominal variance of a measurement (``N / sampling_interval``), in units of 0.02, its median under the
+    action zero, and x0 that of the action zero on the same noise. Outages and jamming dominate the mean of x,
+    whatever a filter does. "cost" is ``-30 log(1 + x / 30)`` in units of 0.16, the mean cost of the paper's plain scheme.
 
     ### Starting State
 
     INS, estimate and reference agree at time zero. The rate errors, the noise levels and the times of
-    disturbances are drawn as the scenario says.
+    disturbances are drawn by the scenario.
 
     ### Episode End
 
@@ -91,8 +92,8 @@ class LooselyCoupledNavigation(Task):
     ### Arguments
 
     ``scenario``: "random" (default; noise levels over a decade, changes of the receiver noise, outages),
-    "paper", "outage", "jamming", "spoof-ramp", "quiet", "outliers", "coloured-receiver". ``control``: "noise", "gain", "hypotheses", "mode", "weights". Every field
-    of :class:`LooselyCoupledNavigationParameters` is a keyword.
+    "paper", "outage", "jamming", "spoof-ramp", "quiet", "outliers", "coloured-receiver". ``control``: "noise", "gain",
+    "hypotheses", "mode", "weights". Every field of :class:`LooselyCoupledNavigationParameters` is a keyword.
 
     ### Version History
 

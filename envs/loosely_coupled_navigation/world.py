@@ -48,7 +48,7 @@ class Truth(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What INS and receiver say; A axes."""
+    """Readings of INS and receiver; A axes."""
 
     number: Array
     """Number of the measurement, from 1 on, ``(N,)``; it is taken ``sampling_interval`` seconds after the one
@@ -85,7 +85,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         self.no_covariance: Array = task.constant(numpy.zeros((axes, axes)))[:, :, None]
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """What the receiver reports."""
+        """Return the deviation that the receiver reports."""
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
@@ -126,7 +126,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return truth, Initial(reference, self.no_covariance + zeros[0])
 
     def _motion(self, draws: Draws, zeros: Array) -> tuple[Array, Array]:
-        """Harmonics at the start, m, and how they turn; each ``(2, M, A, N)``."""
+        """Return the harmonics at the start, m, and how they turn; each ``(2, M, A, N)``."""
         xp, p = self.xp, self.parameters
         count, many = max(p.manoeuvres, 1), zeros[None] + xp.zeros((max(p.manoeuvres, 1), 1, 1))
         if p.manoeuvres:
@@ -183,7 +183,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return truth, measurement
 
     def state(self, truth: Truth) -> Array:
-        """Position, ``(A, N)``."""
+        """Return the position, ``(A, N)``."""
         return truth.reference
 
     def component_readings(self, measurement: Measurement) -> Array:
@@ -191,15 +191,15 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return self.mask_missing(measurement).fix
 
     def component_deviations(self, measurement: Measurement) -> Array:
-        """As the receiver reports it."""
+        """Return the deviation that the receiver reports."""
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def error_cost(self, error: Array) -> Array:
-        """Squared error of position, summed over the axes, over the nominal variance of a measurement."""
+        """Return the squared error of position, summed over the axes, over the nominal variance of a measurement."""
         return ordered_sum(error * error) / self.parameters.receiver_variance
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Whether there is a measurement, its noise, and what is reported of that."""
+        """Return whether there is a measurement, its noise, and the reported noise."""
         return {
             "available": truth.available,
             "receiver_deviation": truth.deviation,
@@ -207,8 +207,8 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Noise levels of INS and receiver, their changes and disturbances as numbers of measurements (the first in a
-        window and the first one after it), and what the receiver is like now.
+        """Return the noise levels of INS and receiver, their changes and disturbances as numbers of measurements
+        (the first in a window and the first one after it), and what the receiver is like now.
         """
         return {
             "drift_deviation": truth.drift_deviation,

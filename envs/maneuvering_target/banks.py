@@ -39,7 +39,7 @@ from .world import Measurement
 SCANS_SHOWN = 20
 """The clock in the observation saturates here: a filter has settled after about ten scans."""
 PERIODS_SHOWN = (0.01, 100.0)
-"""Likewise the time since the last measurement, scan periods."""
+"""Limits of the time since the last measurement, scan periods."""
 
 LARGEST_SHARE = 1e8
 """Of what an acceleration leaves over the covariance that the gains give."""
@@ -78,7 +78,7 @@ class AlphaBeta(NamedTuple):
     grown: Array = None
     """s for which the innovation of the last update had grown, ``(N,)``; None where that is the scan period."""
     since: Array = None
-    """s since that update, ``(N,)``; None likewise, for zero."""
+    """s since that update, ``(N,)``; None for zero."""
 
 
 class Filters(NamedTuple):
@@ -109,7 +109,7 @@ class Filters(NamedTuple):
 
 
 class RadarBank(Bank[TargetProblem, Measurement, Any]):
-    """What both banks share: the averages that are shown, and the end of the observation."""
+    """Common base of both banks: the averages in the observation, and its end."""
 
     parameters: ManeuveringTargetParameters
 
@@ -121,22 +121,24 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         self.average: str = f"exponential average over {self.parameters.averaging_measurements:g} scans"
 
     def exponential_average(self, measurement: Measurement, old: Array, new: Array) -> Array:
-        """Exponential average with a new value taken in, if there is one."""
+        """Return the exponential average with a new value taken in, if there is one."""
         return self.where_detected(measurement, self.forgetting * old + (1.0 - self.forgetting) * new, old)
 
     def interval(self, measurement: Measurement) -> float | Array:
-        """Seconds since the scan before."""
+        """Return the seconds since the scan before."""
         return self.T if self.regular else measurement.interval
 
     def time_since_last(self, measurement: Measurement) -> float | Array:
-        """Seconds since the last measurement, no fewer than :data:`SHORTEST`; a late one comes after negative ones."""
+        """Return the seconds since the last measurement, no fewer than :data:`SHORTEST`; a late one comes after
+        negative ones.
+        """
         if self.regular:
             return self.T
         least = SHORTEST * self.T
         return self.xp.where(self.xp.abs(measurement.elapsed) < least, least, measurement.elapsed)
 
     def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """One of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
+        """Return one of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
         if self.regular or then is otherwise:
             return then
         if isinstance(then, tuple):
@@ -145,7 +147,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         return self.xp.where(measurement.available > 0.0, then, otherwise)
 
     def surroundings(self) -> tuple[Block, ...]:
-        """Blocks of the measurement itself."""
+        """Return the blocks of the measurement itself."""
         xp, unit = self.xp, self.parameters.range_sigma**2
 
         def log_elapsed(state: Any, measurement: Measurement) -> Array:
@@ -271,12 +273,12 @@ class GainBank(RadarBank):
         )
 
     def alpha(self, action: Array) -> Array:
-        """Position gain that an action sets, linear over ``alpha_range``, ``(N,)``."""
+        """Return the position gain that an action sets, linear over ``alpha_range``, ``(N,)``."""
         low, high = self.parameters.alpha_range
         return 0.5 * (low + high) + (0.5 * (high - low)) * self.xp.clip(action[0], -1.0, 1.0)
 
     def action_for_alpha(self, alpha: Any) -> Any:
-        """Action that sets a position gain; the gain must lie within ``alpha_range``."""
+        """Return the action that sets a position gain; the gain must lie within ``alpha_range``."""
         low, high = self.parameters.alpha_range
         return (alpha - 0.5 * (low + high)) / (0.5 * (high - low))
 
@@ -294,8 +296,9 @@ class GainBank(RadarBank):
         return self.where_detected(measurement, after, missed)
 
     def covariance(self, state: AlphaBeta) -> Array:
-        """Covariance that belongs to the gains used, and what an acceleration since the measurement before the last
-        would leave of which these know nothing: one as large as usual, and as the last innovations say.
+        """Return the covariance that belongs to the gains used, and what an acceleration since the measurement
+        before the last would leave of which these know nothing: one as large as usual, and as the last
+        innovations say.
         """
         xp, f = self.xp, state
         T, since = (self.T, 0.0) if self.regular else (f.grown, f.since)
@@ -316,8 +319,8 @@ class GainBank(RadarBank):
         )
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
-        """Normalised innovation squared and log-density of the measurement as predicted (NaN where there is none), and
-        the gain.
+        """Return the normalised innovation squared and log-density of the measurement as predicted (NaN where there
+        is none), and the gain.
         """
         nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
         density = -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi)
@@ -452,23 +455,25 @@ class FilterBank(RadarBank):
         return state._replace(mean=self.xp.concat(updated), covariance=covariance)
 
     def _in_force(self, state: Filters, measurement: Measurement, after: Filters) -> Filters:
-        """Filters after an update, or where the scan missed the target as predicted, with the probabilities (13)."""
+        """Return the filters after an update, or where the scan missed the target as predicted, with the
+        probabilities (13).
+        """
         if self.regular:
             return after
         predicted = imm.softmax(state.log_predicted)
         return self.where_detected(measurement, after, state._replace(probabilities=predicted))
 
     def mean(self, state: Filters) -> Array:
-        """Combination of the filters (15), ``(4, N)``."""
+        """Return the combination of the filters (15), ``(4, N)``."""
         return weighted_sum(state.probabilities, state.mean)
 
     def covariance(self, state: Filters) -> Array:
-        """Covariance of the combination (16)."""
+        """Return the covariance of the combination (16)."""
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """NIS of the combined prediction, log-density of the measurement as the filters predict it (NaN where there is
-        none), and the weights.
+        """Return the NIS of the combined prediction, log-density of the measurement as the filters predict it (NaN
+        where there is none), and the weights.
         """
         predicted = self.xp.exp(state.log_predicted)
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
@@ -495,7 +500,7 @@ class GainsBank(FilterBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What every bank shows, and the gains."""
+        """Observation of every bank, and the gains."""
         each = tuple(str(j + 1) for j in range(self.count))
         return (
             *super().blocks,

@@ -1,4 +1,4 @@
-"""What makes a radar track of ManeuveringTarget costly: manoeuvres, scans that miss the target, outliers, range."""
+"""Causes of cost in ManeuveringTarget: manoeuvres, scans that miss the target, outliers, range."""
 
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment, bins, context_flag
 from ..contract.faults import causes_of

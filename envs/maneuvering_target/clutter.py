@@ -2,7 +2,7 @@
 
 False plots are a Poisson field over the whole plane, new in every scan. A tracker looks at a window about where it
 expects the target, so the plots of a scan are those in the window of the filter that is run: uniform, whatever the
-target does, and nothing tells which is whose. That closes a loop: the filter says what it estimates, and the radar
+target does, and their origin is unknown. That closes a loop: the filter gives its estimate, and the radar
 answers with the plots about it. The same random numbers make false plots at the same places of every filter's window.
 
 Filters that take one plot are given the nearest to their prediction, as a front end of any tracker does it; the rule is
@@ -20,7 +20,7 @@ from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
 
 
 class ReportedTrack(NamedTuple):
-    """What a filter tells the radar, to be answered with plots about it."""
+    """Estimate that a filter gives to the radar, which returns the plots around it."""
 
     mean: Array
     """Position and velocity after the scan before, ``(4, N)``."""
@@ -29,7 +29,7 @@ class ReportedTrack(NamedTuple):
 
 
 class Echo(NamedTuple):
-    """The plot of the target itself, which no competitor is told."""
+    """Plot of the target itself, unknown to competitors."""
 
     position: Array
     """m, ``(2, N)``."""
@@ -38,7 +38,7 @@ class Echo(NamedTuple):
 
 
 class ClutterState(NamedTuple):
-    """What is true of the plots."""
+    """Truth of the plots."""
 
     density: Array
     """False plots per square metre, ``(N,)``."""
@@ -60,7 +60,7 @@ class Clutter(Disturbance):
 
     @classmethod
     def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
-        """Whether there are any."""
+        """Return whether there are false plots."""
         return parameters.cluttered
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ClutterState:
@@ -71,8 +71,8 @@ class Clutter(Disturbance):
         )
 
     def count(self, uniform: Array, density: Array) -> Array:
-        """Poisson number of false plots in the window, one less than slots at most, by the inverse of its cumulative
-        distribution, ``(N,)``.
+        """Return the Poisson number of false plots in the window, one less than slots at most, by the inverse of
+        its cumulative distribution, ``(N,)``.
         """
         mean = density * self.parameters.window_area
         term = self.xp.exp(-mean)
@@ -128,8 +128,8 @@ class Clutter(Disturbance):
         )
 
     def predict(self, track: ReportedTrack, interval: Array, elapsed: Array) -> tuple[Array, Array]:
-        """Position that is expected, ``(2, N)``, and its covariance, ``(2, 2, N)``: at constant velocity, but for an
-        acceleration of ``gate_acceleration`` since the last plot.
+        """Return the position that is expected, ``(2, N)``, and its covariance, ``(2, 2, N)``: at constant
+        velocity, but for an acceleration of ``gate_acceleration`` since the last plot.
         """
         P, T = track.covariance, interval
         centre = track.mean[:2] + T * track.mean[2:]
@@ -139,9 +139,9 @@ class Clutter(Disturbance):
         return centre, carried + left * identity
 
     def context(self, state: ClutterState) -> dict[str, Array]:
-        """False plots per square kilometre."""
+        """Return the false plots per square kilometre."""
         return {"clutter_density": 1e6 * state.density}
 
     def records(self, state: ClutterState) -> dict[str, Array]:
-        """Whether the plot that the filter was given is false."""
+        """Return whether the plot of the filter is false."""
         return {"false_association": state.false_association}

@@ -28,7 +28,8 @@ class ConstantVelocityModel:
         self.identity: Array = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
 
     def motion(self, T: Array) -> tuple[Array, Array]:
-        """Transition matrix, and covariance of the process noise by an acceleration of 1 m/s^2, over intervals.
+        """Return the transition matrix, and covariance of the process noise by an acceleration of 1 m/s^2, over
+        intervals.
 
         Args:
             T: s, ``(N,)``.
@@ -40,13 +41,13 @@ class ConstantVelocityModel:
         return self.unmoved + T * self.moved, self.correlated * outer(by_acceleration, by_acceleration)
 
     def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """One of two tuples of arrays where the scan saw the target, the other where it missed it."""
+        """Return one of two tuples of arrays where the scan saw the target, the other where it missed it."""
         there = measurement.available > 0.0
         parts = zip(then, otherwise, strict=True)
         return type(then)(*(self.xp.where(there, seen, missed) for seen, missed in parts))
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
-        """How well a scan was predicted; NaN where it missed the target."""
+        """Return the likelihood of a scan; NaN where it missed the target."""
         there = measurement.available > 0.0
         log_likelihood, nis = (self.xp.where(there, values, math.nan) for values in (log_likelihood, nis))
         return Likelihood(log_likelihood, nis, 2.0 * measurement.available)
@@ -54,8 +55,9 @@ class ConstantVelocityModel:
     def update_estimate(
         self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
     ) -> kalman.Update:
-        """Kalman's update of a predicted mean and covariance with the measured position, or these themselves, which say
-        nothing of how likely they are; H is that of the position unless another one is given.
+        """Return Kalman's update of a predicted mean and covariance with the measured position, or these
+        themselves, which say nothing of how likely they are; H is that of the position unless another one is
+        given.
         """
         H = self.H if H is None else H
         result = kalman.update(*predicted, measurement.position, H, self.identity * measurement.variance)

@@ -1,6 +1,6 @@
 """Courses of the target of ManeuveringTarget: one class for each kind of flight.
 
-A course draws its flight, moves the target from scan to scan, says where it is between two, and tells of itself in
+A course draws its flight, moves the target from scan to scan, interpolates between two, and describes itself in
 the context. ``scan`` is the number of a scan, ``(N,)``; a motion is a position (m) and a velocity (m/s), ``(2, N)``
 each.
 """
@@ -24,7 +24,7 @@ CIRCLE = (0.0, 2.0 * math.pi)
 
 
 class Course(ABC):
-    """How the target flies.
+    """Course of the target.
 
     Args:
         task: with the parameters of the flight.
@@ -48,12 +48,13 @@ class Course(ABC):
 
     @abstractmethod
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
-        """Motion at a scan from that at the one before, both on time."""
+        """Return the motion at a scan from that at the one before, both on time."""
 
     def motion_at_early_scan(
         self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Motion at a scan that comes early by a share of the scan period; here :meth:`advance` knows every time.
+        """Return the motion at a scan that comes early by a share of the scan period; here :meth:`advance` knows every
+        time.
 
         Args:
             flight: of :meth:`begin`.
@@ -84,7 +85,7 @@ class Course(ABC):
         return (self.parameters.sampling_interval * (1.0 + (before - now))) * velocity, velocity
 
     def context(self, flight: Any, scan: Array, time: Array) -> dict[str, Array]:
-        """What the context tells of the flight.
+        """Return the context of the flight.
 
         Args:
             flight: of :meth:`begin`.
@@ -95,7 +96,7 @@ class Course(ABC):
 
 
 def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
-    """Motion after a time (s) on a circle, or a straight line, at constant speed; ``turn`` in rad/s."""
+    """Return the motion after a time (s) on a circle, or a straight line, at constant speed; ``turn`` in rad/s."""
     state = coordinated_turn.propagate(task.xp.concat([*motion, turn[None]]), time)
     return state[:2], state[2:4]
 
@@ -112,8 +113,8 @@ class Maneuvers(NamedTuple):
     """Scan number, included, ``(manoeuvres, N)``."""
     effect: Array
     """``(6, manoeuvres, N)``; one array, because the truth picks from all of it in every scan. Of a turn by theta what
-    velocity gains along itself, per velocity, cos(theta) - 1, and across, sin(theta), then position likewise, s; of
-    thrust the acceleration along x and y, m/s^2."""
+    velocity gains along itself, per velocity, cos(theta) - 1, and across, sin(theta), then the position in the same
+    form, s; of thrust the acceleration along x and y, m/s^2."""
     turn: Array = None
     """Angle turned in a scan, rad, ``(manoeuvres, N)``; None where no scan comes early: the effect is all then."""
 
@@ -130,7 +131,7 @@ class Maneuvered(Course):
     """Whether one may be a coordinated turn; otherwise all are thrust."""
 
     def advance(self, flight: Maneuvers, scan: Array, motion: Motion) -> Motion:
-        """Go straight, and add what the manoeuvre adds that is flown in the scan period."""
+        """Fly straight, and add the manoeuvre of the scan period."""
         T, (position, before) = self.parameters.sampling_interval, motion
         effect = self._pick(flight, flight.effect, scan)
         acceleration = effect[4:]
@@ -145,7 +146,7 @@ class Maneuvered(Course):
     def motion_at_early_scan(
         self, flight: Maneuvers, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Thrust is constant within a period, and so is the turn rate."""
+        """Return the thrust is constant within a period, and so is the turn rate."""
         T = self.parameters.sampling_interval
         time = T * (1.0 - early)
         turn, acceleration = (
@@ -181,7 +182,9 @@ class Maneuvered(Course):
         return ordered_sum(values[..., slot, :] for slot in range(values.shape[-2]))
 
     def context(self, flight: Maneuvers, scan: Array, time: Array) -> dict[str, Array]:
-        """First and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre; whether one is flown now."""
+        """Return the first and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre; whether one is
+        flown now.
+        """
         xp = self.xp
         # A manoeuvre that is not flown lies beyond the end.
         flown = flight.first <= self.parameters.horizon + 1
@@ -202,7 +205,7 @@ class StatedManeuver(Maneuvered):
     turns = False
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
-        """Nothing is drawn: the flight is always the same."""
+        """Draw nothing: the flight is always the same."""
         p, constant, once = self.parameters, self.task.constant, ones[None]
         first, last = p.maneuver_steps
         effect = constant((0.0, 0.0, 0.0, 0.0, *p.acceleration))[:, None, None] * once
@@ -280,14 +283,14 @@ class RandomStraight(Course):
         return None, motion
 
     def advance(self, flight: None, scan: Array, motion: Motion) -> Motion:
-        """Go straight."""
+        """Fly straight."""
         position, velocity = motion
         return position + self.parameters.sampling_interval * velocity, velocity
 
     def motion_at_early_scan(
         self, flight: None, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Go straight for a part of the scan period."""
+        """Fly straight for a part of the scan period."""
         position, velocity = before
         return position + (self.parameters.sampling_interval * (1.0 - early)) * velocity, velocity
 
@@ -317,7 +320,7 @@ class Legs(NamedTuple):
 
 
 def _times(one: Array, other: Array) -> Array:
-    """Product of vectors ``(2, N)`` taken for complex numbers."""
+    """Return the product of vectors ``(2, N)`` taken for complex numbers."""
     return namespace(one).stack(
         [one[0] * other[0] - one[1] * other[1], one[0] * other[1] + one[1] * other[0]]
     )
@@ -354,7 +357,9 @@ class LegCourse(Course):
         return Legs(xp.stack(begins)), start
 
     def advance(self, flight: Legs, scan: Array, motion: Motion) -> Motion:
-        """Motion at a scan, or between two: any number. The legs say where it is then, whatever was before."""
+        """Return the motion at a scan, or between two: any number. The legs say where it is then, whatever was
+        before.
+        """
         now = self.parameters.sampling_interval * scan
         leg = StepSignal(flight.begins, flight.time[1:]).at(now, self.xp)
         return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
@@ -371,7 +376,7 @@ class LegCourse(Course):
         return _times(there - position, deviation), _times(afterwards, deviation)
 
     def context(self, flight: Legs, scan: Array, time: Array) -> dict[str, Array]:
-        """Where legs begin (s), their turn rates (rad/s), and whether the target turns now."""
+        """Return the starts of the legs (s), their turn rates (rad/s), and whether the target turns now."""
         now = self.parameters.sampling_interval * time
         turn = StepSignal(flight.turn, flight.time[1:]).at(now, self.xp)
         return {"leg_time": flight.time, "leg_turn_rate": flight.turn, "maneuvering": turn != 0.0}
@@ -389,7 +394,7 @@ class Table(Course):
         """Rows x, y, vx, vy, ``(4, horizon + 2)``; of several flights one after another."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
-        """Nothing is drawn: the flight is always the same."""
+        """Draw nothing: the flight is always the same."""
         return None, (self.table[:2, 0, None] * ones, self.table[2:, 0, None] * ones)
 
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
@@ -403,16 +408,16 @@ class Table(Course):
         return on_time
 
     def _states(self, column: Array) -> Motion:
-        """States in a column of the table, a float, ``(2, N)`` each."""
+        """Return the states in a column of the table, a float, ``(2, N)`` each."""
         row = self.xp.astype(column, self.xp.int64)
         return self.table[:2, row], self.table[2:, row]
 
 
 class Tracks(NamedTuple):
-    """Which of several flights in a table is flown."""
+    """Choice of a flight in a table."""
 
     number: Array
-    """``(N,)``, as a float; likewise the columns of its first and last state."""
+    """``(N,)``, as a float, like the columns of its first and last state."""
     first: Array
     last: Array
 
@@ -438,7 +443,7 @@ class TableOfSeveral(Table):
         return self._states(self.xp.minimum(flight.first + scan, flight.last))
 
     def context(self, flight: Tracks, scan: Array, time: Array) -> dict[str, Array]:
-        """Number of the flight."""
+        """Return the number of the flight."""
         return {"flight": flight.number}
 
 

@@ -1,7 +1,7 @@
-"""What may go wrong with the radar of ManeuveringTarget, but for the times of its scans: a class for each.
+"""Disturbances of the radar of ManeuveringTarget, without those of its scan times: a class for each.
 
 Errors are along x and y, or, where measurements are polar, of range and azimuth, in units of the white ones' standard
-deviations. Nobody says any of it.
+deviations. None of it is reported.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class ColouredScanErrors(Disturbance):
 
     @classmethod
     def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
-        """Whether there may be any."""
+        """Return whether there may be coloured errors."""
         return parameters.coloured
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ColouredScanErrorsState:
@@ -48,7 +48,7 @@ class ColouredScanErrors(Disturbance):
         )
 
     def advance(self, state: ColouredScanErrorsState, step: DisturbanceInput) -> ColouredScanErrorsState:
-        """Let them wander."""
+        """Advance the errors by a scan."""
         process = GaussMarkov.sampled(state.deviation, state.correlation_time, step.interval, self.xp)
         return state._replace(level=process.advance(state.level, step.normals))
 
@@ -68,7 +68,7 @@ class Bias(Disturbance):
 
     @classmethod
     def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
-        """Whether there are any."""
+        """Return whether there is a bias."""
         return parameters.bias > 0.0
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:

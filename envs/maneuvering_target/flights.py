@@ -43,7 +43,9 @@ def _scenario_of_trajectory(trajectory: Trajectory, keywords: Mapping[str, Any])
 
 
 def _sampling(keywords: Mapping[str, Any]) -> tuple[float, int, int | None]:
-    """Sampling interval (s), scans for which an action holds, and the horizon if it is among the keywords."""
+    """Return the sampling interval (s), scans for which an action holds, and the horizon if it is among the
+    keywords.
+    """
     found: dict[str, Any] = {}
     for name in ("sampling_interval", "decision_interval", "horizon"):
         found[name] = getattr(ManeuveringTargetParameters, name) if name != "horizon" else None

@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the estimator ``semi-markov``, steered; what its settings are, ``semi_markov.py`` says."""
+"""Control ``hypotheses``: the estimator ``semi-markov`` with settings that an action multiplies."""
 
 import math
 from collections.abc import Sequence
@@ -43,11 +43,11 @@ class HypothesesState(NamedTuple):
     innovation: Array
     """Of all hypotheses together over its sigma, along and across the predicted velocity, ``(2, N)``."""
     prior: Array
-    """Logarithm of the sigma of the predicted position over that of the measurement, likewise."""
+    """Logarithm of the sigma of the predicted position over that of the measurement, ``(2, N)``."""
     predicted: Array
     """Probabilities of groups of hypotheses before the measurement, ``(G, N)``."""
     probabilities: Array
-    """After it, if the action is zero, likewise."""
+    """Probabilities of the groups after it, if the action is zero, ``(G, N)``."""
     entropy: Array
     """Of the hypotheses then, over the largest possible, ``(N,)``."""
 
@@ -105,7 +105,7 @@ class HypothesesBank(SettingsBank, RadarBank):
         return HypothesesState(own, own.likelihood, action, none, none, groups, groups, none[0])
 
     def group(self, probabilities: Array) -> Array:
-        """Probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``."""
+        """Return the probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``."""
         return self.xp.stack(
             [ordered_sum(probabilities[h] for h in members) for members in self.groups.values()]
         )

@@ -20,7 +20,7 @@ for State Estimation with Consistent Uncertainty Quantification" (2025). Reading
 itself; here with the noises of a Kalman gain, so that a network that knows nothing is a filter that works. They are not
 those of the covariance: what is good for one need not be for the other. (Factors of the gain's rows were as good, but
 could make the filter diverge.) Their dynamics are given; here the network also answers with the acceleration, the part
-of them that nobody knows.
+of them that are unknown.
 """
 
 import math
@@ -47,7 +47,7 @@ NOISE_RANGE = 20.0
 CAUTION = 5.0
 """Largest factor and divisor of the measurement's sigma in the gain alone."""
 AGILITY = 5.0
-"""Likewise of the acceleration's."""
+"""Largest factor and divisor of the deviation of the acceleration."""
 LARGEST_ACCELERATION = 8.0
 """Of what the network predicts along and across, m/s^2: one third more than any flight of ``random`` has."""
 LEAST_SPEED = 20.0
@@ -62,19 +62,19 @@ class KalmanNetState(NamedTuple):
     mean: Array
     """x, y (m), vx, vy (m/s), ``(4, N)``; predicted between :meth:`KalmanNetBank.predict` and the action."""
     covariance: Array
-    """``(4, 4, N)``; likewise, and then without process noise."""
+    """``(4, 4, N)``; between ``predict`` and the action without process noise."""
     acceleration: Array
     """Predicted for the time to the next scan, along and across, m/s^2, ``(2, N)``."""
     deviation: Array
-    """Standard deviation of the acceleration in the last scan, likewise."""
+    """Standard deviation of the acceleration in the last scan, ``(N,)``."""
     correction: Array
-    """Velocity corrected by in the last scan, likewise, m/s."""
+    """Correction of the velocity in the last scan, m/s."""
     innovation: Array
     """m, along and across the predicted velocity, ``(2, N)``."""
     prior: Array
-    """Variance of the predicted position with the noise of the last scan, likewise, m^2."""
+    """Variance of the predicted position with the noise of the last scan, m^2."""
     sensor: Array
-    """Variance of the measurement, likewise, m^2."""
+    """Variance of the measurement, m^2."""
     coupling: Array
     """Its correlation between along and across, ``(N,)``."""
 
@@ -84,12 +84,14 @@ STANDING = 1e-3
 
 
 def speed_of(velocity: Array, least: float = STANDING) -> Array:
-    """Speed, ``(N,)``, smoothly never below the least, m/s."""
+    """Return the speed, ``(N,)``, smoothly never below the least, m/s."""
     return (velocity[0] * velocity[0] + velocity[1] * velocity[1] + least**2) ** 0.5
 
 
 def frame_of(velocity: Array) -> Array:
-    """Rows of U^T: the direction of a velocity, and the one to its left, ``(2, 2, N)``; of what stands, the axes."""
+    """Return the rows of U^T: the direction of a velocity, and the one to its left, ``(2, 2, N)``; of what stands,
+    the axes.
+    """
     xp = namespace(velocity)
     moves = velocity[0] * velocity[0] + velocity[1] * velocity[1] > STANDING**2
     direction = velocity / speed_of(velocity)
@@ -100,12 +102,12 @@ def frame_of(velocity: Array) -> Array:
 def sensor_blocks(
     bank: Any, variances: Callable[..., Array], coupling: Callable[..., Array]
 ) -> Sequence[Block]:
-    """Blocks of the covariance of a measurement in the frame.
+    """Return the blocks of the covariance of a measurement in the frame.
 
     Args:
         bank: that shows them.
         variances: along and across, ``(2, N)``, m^2, of the bank's state and the measurement.
-        coupling: the correlation, ``(N,)``, likewise.
+        coupling: the correlation, ``(N,)``.
     """
     xp, p = bank.xp, bank.parameters
     return (
@@ -121,7 +123,7 @@ def sensor_blocks(
 
 
 def clock_blocks(bank: Any) -> Sequence[Block]:
-    """Blocks of the predicted speed, of the scan and of what it saw, for a bank with a ``mean``."""
+    """Return the blocks of the predicted speed, of the scan and of what it saw, for a bank with a ``mean``."""
     xp, p = bank.xp, bank.parameters
     return (
         Block(
@@ -146,7 +148,7 @@ def clock_blocks(bank: Any) -> Sequence[Block]:
 
 
 def sensor_covariance(measurement: Measurement, xp: Any) -> Array:
-    """Covariance of a measurement, ``(2, 2, N)``, m^2."""
+    """Return the covariance of a measurement, ``(2, 2, N)``, m^2."""
     none = 0.0 * measurement.variance[0]
     return xp.stack([xp.stack([measurement.variance[0], none]), xp.stack([none, measurement.variance[1]])])
 
@@ -216,7 +218,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         )
 
     def start(self, initial: Initial) -> KalmanNetState:
-        """Start where everyone starts."""
+        """Start at the initial estimate."""
         none = 0.0 * initial.mean[:2]
         sensor = self.xp.stack([initial.covariance[0, 0], initial.covariance[1, 1]])
         deviation = NOMINAL_ACCELERATION + none

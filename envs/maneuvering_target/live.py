@@ -18,14 +18,14 @@ VALUES = ("x", "y", "range", "azimuth", "sigma_x", "sigma_y", "range_sigma", "az
 
 
 def choose(condition: Any, first: Any, second: Any) -> Any:
-    """One of two numbers where a condition is a bool, else one of two in every place, as NumPy's ``where``."""
+    """Return one of two numbers where a condition is a bool, else one of two in every place, as NumPy's ``where``."""
     if condition.__class__ is bool:
         return first if condition else second
     return numpy.where(condition, first, second)
 
 
 def is_finite(number: Any) -> Any:
-    """Whether a float, or every number of an array, is finite."""
+    """Return whether a float, or every number of an array, is finite."""
     return math.isfinite(number) if number.__class__ is float else numpy.isfinite(number)
 
 
@@ -73,17 +73,17 @@ class PlotInput(LiveInput):
         moved = numpy.array([self.read(values, "odometry_x"), self.read(values, "odometry_y")])
         between = 0.5 * measurement.interval * (memory["velocity"] + velocity)
         moved = numpy.where(numpy.isfinite(moved), moved, between)
-        says = numpy.isfinite(moved).all(axis=0)
-        odometry = Odometry(numpy.where(says, moved, 0.0), says.astype(float))
+        is_known = numpy.isfinite(moved).all(axis=0)
+        odometry = Odometry(numpy.where(is_known, moved, 0.0), is_known.astype(float))
         return measurement._replace(odometry=odometry), {**after, "velocity": velocity}
 
     def _velocity(self, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Velocity by the second sensor, ``(2, N)``, of one track ``(2,)``, m/s; NaN where it says none."""
+        """Return the velocity by the second sensor, ``(2, N)``, of one track ``(2,)``, m/s; NaN where it has none."""
         heading = numpy.radians(self.read(values, "odometry_heading"))
         return east_north(self.read(values, "odometry_speed"), heading)
 
     def _position(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Position of a plot, x and y; NaN where there is none."""
+        """Return the position of a plot, x and y; NaN where there is none."""
         if "latitude" in values or "longitude" in values:
             return self._project(values)
         if "range" not in values:
@@ -93,7 +93,9 @@ class PlotInput(LiveInput):
         return (x, y) if self.lanes else (float(x), float(y))
 
     def _project(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Position of latitude and longitude, around the origin of the log that the filter was advised for."""
+        """Return the position of latitude and longitude, around the origin of the log that the filter was advised
+        for.
+        """
         twice = [name for name in VALUES[:4] if name in values]
         if twice:
             raise ValueError(f"a plot has {twice[0]} and latitude or longitude: leave one of them out")
@@ -132,7 +134,9 @@ class PlotInput(LiveInput):
         return {name: numpy.moveaxis(values, 0, -1) for name, values in begun.items()}
 
     def _variance(self, position: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Variances of a plot: as stated with it, else as the file of the filter says, else the radar's."""
+        """Return the variances of a plot: those stated with it, else those of the file of the filter, else the
+        radar's.
+        """
         p, usual = self.parameters, dict(self.task.recording.deviations)
         readings = LiveValues(self, values)
         stated = [readings.deviations("sigma_x"), readings.deviations("sigma_y")]

@@ -31,22 +31,22 @@ COLUMNS = {
     "x": Column("m, east of the radar"),
     "y": Column("m, north of it"),
     "range": Column("m, in place of x and y"),
-    "azimuth": Column("degrees clockwise from north, likewise"),
+    "azimuth": Column("degrees clockwise from north"),
     "latitude": Column("degrees, in place of x and y"),
-    "longitude": Column("degrees, likewise"),
+    "longitude": Column("degrees"),
     "altitude": Column("m above the ellipsoid, beside them; optional"),
     "sigma_x": Column(
         "m, standard deviation of x; optional, default: the parameter range_sigma, else how positions scatter"
     ),
-    "sigma_y": Column("m, likewise"),
+    "sigma_y": Column("m"),
     "range_sigma": Column("m, standard deviation of the range; optional, default: the parameter"),
     "azimuth_sigma": Column("degrees, of the azimuth; default: the parameter bearing_sigma"),
     "odometry_x": Column(
         "m, moved east since the row before, by a second sensor such as wheels and a compass; optional"
     ),
-    "odometry_y": Column("m, moved north, likewise"),
+    "odometry_y": Column("m, moved north"),
     "odometry_speed": Column("m/s, in place of both: the speed by that sensor"),
-    "odometry_heading": Column("degrees clockwise from north, likewise"),
+    "odometry_heading": Column("degrees clockwise from north"),
 }
 FINER = 10.0
 """Times that a stated deviation exceeds the resolution of positions where noise does not repeat one by chance."""
@@ -104,7 +104,7 @@ def read_log(columns: Columns) -> TrackLog:
         parameters["sampling_interval"] = interval
     seen = (rows >= 0) & there[rows]
     nominal = (assumed or columns.given.get("range_sigma", ManeuveringTargetParameters.range_sigma)) ** 2
-    said = {
+    found = {
         "scan": numpy.arange(1.0, len(rows) + 1.0),
         "position": numpy.where(seen[:, None], position[rows], 0.0),
         "variance": numpy.where(seen[:, None], variance[rows], nominal),
@@ -113,7 +113,7 @@ def read_log(columns: Columns) -> TrackLog:
         **_odometry(columns, rows),
     }
     return TrackLog(
-        said,
+        found,
         initial,
         rows,
         parameters,
@@ -131,7 +131,8 @@ def read_log(columns: Columns) -> TrackLog:
 
 
 def _typical_sigma(columns: Columns, there: numpy.ndarray) -> dict[str, float]:
-    """Median of the deviations that a table states, in place of the radar's; empty where it is that, or none is stated.
+    """Return the median of the deviations that a table states, in place of the radar's; empty where it is that, or
+    none is stated.
 
     Agents are shown deviations over this one, and errors cost in its square.
     """
@@ -151,7 +152,7 @@ def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray)
     Args:
         columns: of one track.
         position: m, ``(rows, 2)``; NaN where there is none.
-        sigma: of their errors, m, likewise.
+        sigma: of their errors, m, same shape.
     """
     measured = position
     if columns.origin is not None:  # x and y change with altitude, too
@@ -196,7 +197,7 @@ def two_plot_start(
 
     Args:
         position: of the two, ``(..., 2, 2)``, m.
-        variance: of their errors, likewise, m^2.
+        variance: of their errors, m^2, same shape.
         lasted: s, ``(..., 1)``.
     """
     before, first = position[..., 0, :], position[..., 1, :]
@@ -233,7 +234,7 @@ def start_track(
 
 
 def _positions(columns: Columns) -> numpy.ndarray:
-    """X and y, ``(rows, 2)``, m; NaN where there is no plot."""
+    """Return the X and y, ``(rows, 2)``, m; NaN where there is no plot."""
     if columns.has("x", "y"):
         return numpy.stack([columns["x"], columns["y"]], axis=1)
     if not columns.has("range", "azimuth"):
@@ -254,20 +255,23 @@ def _positions(columns: Columns) -> numpy.ndarray:
 
 
 def east_north(length: numpy.ndarray, angle: numpy.ndarray) -> numpy.ndarray:
-    """Vector east and north, ``(2, n)``, of a length and an angle clockwise from north, rad, ``(n,)`` each."""
+    """Return the vector east and north, ``(2, n)``, of a length and an angle clockwise from north, rad, ``(n,)``
+    each.
+    """
     return numpy.stack([length * numpy.sin(angle), length * numpy.cos(angle)])
 
 
 def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.ndarray) -> float:
-    """Deviation of x and y where nothing states it, m; zero where something does, or a radar has measured them.
+    """Return the deviation of x and y where nothing states it, m; zero where something does, or a radar has measured
+    them.
 
-    It is what ``--set range_sigma`` says, else how positions scatter about the line through their neighbours, which
+    It is that of ``--set range_sigma``, else the scatter of positions about the line through their neighbours, which
     motion only makes larger: who fits a filter fits it, too.
 
     Args:
         columns: of one track.
         position: of its plots, m, ``(n, 2)``.
-        time: s, likewise.
+        time: s, same shape.
     """
     if not columns.has("x") or columns.has("sigma_x") or columns.has("range_sigma"):
         return 0.0
@@ -277,7 +281,7 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
 
 
 def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
-    """Typical deviations, as columns would state them, and who says so."""
+    """Return the typical deviations, as columns would state them, and their source."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:
         if columns.has(*pair):
@@ -285,7 +289,7 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
             return medians, f"columns {pair[0]} and {pair[1]}"
     if assumed:
         named = "range_sigma" in columns.given
-        who = "as --set range_sigma says" if named else "as positions scatter about their neighbours"
+        who = "as --set range_sigma states" if named else "as positions scatter about their neighbours"
         return dict.fromkeys(pairs[0], assumed), f"{NO_DEVIATIONS} of x and y, assumed {who}"
     names = {"range_sigma": "range_sigma", "azimuth_sigma": "bearing_sigma"}
     values = {
@@ -296,7 +300,7 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
 
 
 def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
-    """Say which deviations are assumed where neither a column nor the user states one."""
+    """Return notes on the deviations that are assumed where neither a column nor the user states one."""
     if not is_assumed(source) or "range_sigma" in columns.given:
         return []
     return [f"{source}: {deviation_words(deviations)}"]
@@ -305,7 +309,9 @@ def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source:
 def _variances(
     columns: Columns, position: numpy.ndarray, there: numpy.ndarray, assumed: float = 0.0
 ) -> numpy.ndarray:
-    """Variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot. ``assumed`` is a deviation of both, m."""
+    """Return the variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot. ``assumed`` is a deviation
+    of both, m.
+    """
     variance = numpy.full(position.shape, numpy.nan)
     if columns.has("sigma_x", "sigma_y"):
         variance[there] = columns.only(there).sigmas("sigma_x", "sigma_y") ** 2
@@ -325,7 +331,7 @@ def _variances(
 
 
 def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Rows and times of all scans after the start; -1 for scans that have no row, put evenly into gaps."""
+    """Return the rows and times of all scans after the start; -1 for scans that have no row, put evenly into gaps."""
     before, now = columns.time[first:-1], columns.time[first + 1 :]
     scans = numpy.maximum(numpy.rint((now - before) / interval).astype(int), 1)
     if scans.max() > LARGEST_GAP + 1:
@@ -342,7 +348,7 @@ def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray
 
 
 def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Seconds since the scan before, and since the last one that had a plot.
+    """Return the seconds since the scan before, and since the last one that had a plot.
 
     Args:
         time: of the start, and of the scans, ``(1 + T,)``.
@@ -355,7 +361,7 @@ def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray
 
 
 def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """What a second sensor says of the motion between scans; nothing where there is none.
+    """Return the motion between scans by a second sensor; empty where there is none.
 
     Args:
         columns: of one track.
@@ -376,7 +382,9 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
 
 
 def _displacements(columns: Columns) -> numpy.ndarray | None:
-    """Displacement since the row before by the second sensor, ``(rows, 2)``, m; NaN where it says nothing."""
+    """Return the displacement since the row before by the second sensor, ``(rows, 2)``, m; NaN where it has
+    nothing.
+    """
     if columns.has("odometry_x", "odometry_speed"):
         raise ValueError("it has odometry_x and odometry_speed: leave one of them out")
     if columns.has("odometry_x"):
@@ -396,7 +404,9 @@ def scale_noise(measurement: Any, factor: Any) -> Any:
 
 
 def predict_position(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Position that an estimate predicts over the time to a measurement, and what was measured, m, ``(2, N)`` each."""
+    """Return the position that an estimate predicts over the time to a measurement, and what was measured, m, ``(2,
+    N)`` each.
+    """
     predicted = mean[:2] + measurement.interval * mean[2:4]
     return predicted, numpy.where(measurement.available > 0.0, measurement.position, numpy.nan)
 

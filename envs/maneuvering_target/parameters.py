@@ -61,7 +61,7 @@ class ManeuveringTargetParameters(TaskParameters):
     at T (k - j u), u uniform on [0, 1), drawn for every scan: later than scan k - 1, whose u differs (ours; the paper:
     never)."""
     glint_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That both errors of a scan are those of glint, each scan on its own; nobody says so (ours)."""
+    """Probability that both errors of a scan are those of glint, each scan on its own, without a report (ours)."""
     glint_factor: float = parameter(5.0, above=0.0, at_most=LARGEST_ERROR)
     """Their standard deviation over that of the others (ours)."""
     coloured_sigma: tuple[float, float] = parameter(
@@ -69,12 +69,12 @@ class ManeuveringTargetParameters(TaskParameters):
     )
     """Limits of the standard deviation of coloured errors along x and y, or of range and azimuth where measurements are
     polar, first-order Gauss-Markov, beside the white ones and in units of theirs; each episode draws its own, and
-    nobody says so (ours; the paper: none)."""
+    without a report (ours; the paper: none)."""
     coloured_time: tuple[float, float] = parameter((12.0, 60.0), above=0.0, ascending=True)
     """Limits of their correlation time, s; each episode draws its own (ours)."""
     bias: float = parameter(0.0, at_least=0.0, at_most=LARGEST_ERROR)
     """Constant errors along x and y, or of range and azimuth where measurements are polar, in units of the white ones'
-    standard deviations, are drawn within this for each episode, and nobody says so (ours; the paper: none)."""
+    standard deviations, are drawn within this for each episode, and without a report (ours; the paper: none)."""
     clutter_density: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Limits of the density of false plots, per square kilometre; each episode draws its own. A Poisson number of them
     lies in the window (ours; the paper: none)."""
@@ -133,18 +133,18 @@ class ManeuveringTargetParameters(TaskParameters):
 
     @property
     def regular(self) -> bool:
-        """Whether every scan sees the target, and nothing else, and none comes early."""
+        """Return whether every scan sees the target, and nothing else, and none comes early."""
         on_time = self.detection_probability == (1.0, 1.0) and self.scan_jitter == (0.0, 0.0)
         return on_time and not self.cluttered
 
     @property
     def cluttered(self) -> bool:
-        """Whether there are false plots."""
+        """Return whether there are false plots."""
         return self.clutter_density[1] > 0.0
 
     @property
     def coloured(self) -> bool:
-        """Whether errors may be coloured."""
+        """Return whether errors may be coloured."""
         return self.coloured_sigma[1] > 0.0
 
     @property

@@ -47,7 +47,7 @@ KINDS = {
 
 
 def ellipse_axes(covariance: numpy.ndarray) -> tuple[float, float, float]:
-    """Standard deviations along the two principal axes, larger first, and the direction of the larger.
+    """Return the standard deviations along the two principal axes, larger first, and the direction of the larger.
 
     Args:
         covariance: ``(2, 2)``.
@@ -78,7 +78,7 @@ class ManeuveringTargetPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Positions in km, innovation, gain or weights, position error with its reported sigma."""
+        """Return the positions in km, innovation, gain or weights, position error with its reported sigma."""
         estimator = state.filter
         true, measured = state.truth.position[:, 0], state.measurement.position[:, 0]
         if not state.measurement.available[0]:
@@ -136,7 +136,7 @@ class ManeuveringTargetPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Innovation, what is steered, error."""
+        """Return the innovation, what is steered, error."""
         axes: Sequence[str] = "xy"
         if self.model.control == "gain":
             steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
@@ -170,7 +170,7 @@ class ManeuveringTargetPicture(Picture):
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Scans of the manoeuvres."""
+        """Return the scans of the manoeuvres."""
         return self.maneuvers
 
     # --- panels

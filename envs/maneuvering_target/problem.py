@@ -1,4 +1,4 @@
-"""What world, filters and picture of ManeuveringTarget use of their task."""
+"""Parts of the task that world, filters and picture of ManeuveringTarget use."""
 
 from ..contract.task import Task
 from .parameters import ManeuveringTargetParameters

@@ -68,11 +68,11 @@ class RegularScans:
         return None, Scan(self.course.advance(flight, number, before), always, interval, interval)
 
     def time(self, scans: Any, number: Array) -> Array:
-        """Time of the current scan in scan periods, ``(N,)``."""
+        """Return the time of the current scan in scan periods, ``(N,)``."""
         return number
 
     def context(self, scans: Any) -> dict[str, Array]:
-        """What the context tells of the scans: here nothing."""
+        """Return the context of the scans: here empty."""
         return {}
 
 
@@ -88,7 +88,7 @@ class Reliability(NamedTuple):
     unseen: Array
     """s since the last scan that saw the target, zero if the current one does, ``(N,)``."""
     position: Array
-    """When the current scan would have come on time, m, ``(2, N)``; likewise the velocity, m/s."""
+    """When the current scan would have come on time, m, ``(2, N)``, and the velocity, m/s."""
     velocity: Array
 
 
@@ -123,22 +123,24 @@ class UnreliableScans(RegularScans):
         return scans, Scan(motion, available, interval, elapsed)
 
     def time(self, scans: Reliability, number: Array) -> Array:
-        """Time of the current scan in scan periods, ``(N,)``."""
+        """Return the time of the current scan in scan periods, ``(N,)``."""
         return number - scans.early
 
     def context(self, scans: Reliability) -> dict[str, Array]:
-        """Probability that scans see the target, and the share of the scan period by which they come early at most."""
+        """Return the probability that scans see the target, and the share of the scan period by which they come
+        early at most.
+        """
         return {"detection_probability": scans.detection_probability, "scan_jitter": scans.jitter}
 
 
 def has_regular_scans(recording: Recording | Feed, p: ManeuveringTargetParameters) -> bool:
-    """Whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
+    """Return whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
     if isinstance(recording, Feed):
         return recording.regular
     there = numpy.isfinite(recording.seconds)
-    said = recording.measurements
+    found = recording.measurements
     return all(
-        bool((said[name][there] == value).all())
+        bool((found[name][there] == value).all())
         for name, value in (
             ("available", 1.0),
             ("interval", p.sampling_interval),

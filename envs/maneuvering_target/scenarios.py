@@ -5,7 +5,7 @@ are legs that no training episode contains: time straight or turning (s) and tur
 flown exactly. Start, course, side and times are drawn for each episode around the stated ones, so that no flight can be
 learned by heart. ``paper`` is as printed, the same flight always: a policy could learn it by heart. In
 ``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar has one fault at a stated
-strength; likewise in ``glint``, ``biased`` and ``clutter``, whose faults no training episode holds.
+strength, as are those of ``glint``, ``biased`` and ``clutter``, whose faults no training episode holds.
 """
 
 from collections.abc import Mapping

@@ -39,7 +39,7 @@ SLOWEST = 30.0
 
 
 class SemiMarkovPrior(NamedTuple):
-    """What a semi-Markov filter expects of flights."""
+    """Prior of a semi-Markov filter on flights."""
 
     begin: float = 0.0157
     """Probability that a manoeuvre begins before a scan."""
@@ -143,7 +143,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
     """Gaussian sum over straight flight, constant thrust and coordinated turns with the time since each began.
 
     Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
-    distribution says, not geometrically. Turns to the left and to the right are kinds of their own, and so are gentle
+    distribution, not geometrically. Turns to the left and to the right are kinds of their own, and so are gentle
     and steep ones: about a turn rate of zero the extended filter would linearise where no turn is.
 
     Args:
@@ -180,7 +180,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         """Whose weights each of the first three settings multiplies, ``(3, H, 1)``."""
 
     def start(self, initial: Initial) -> SemiMarkovState:
-        """Start where everyone starts, long in straight flight."""
+        """Start at the initial estimate, long in straight flight."""
         xp, least = self.xp, semi_markov.LEAST_PROBABILITY
         none = 0.0 * initial.mean[0]
 
@@ -203,23 +203,23 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return SemiMarkovState(initial.mean, initial.covariance, Likelihood.unknown(none), packed)
 
     def begin_thrust(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """State with an acceleration that is not known, ``(6, N)`` and ``(6, 6, N)``."""
+        """Return the state with an acceleration that is not known, ``(6, N)`` and ``(6, 6, N)``."""
         none = 0.0 * mean[:2]
         variance = self.prior.thrust**2 + none[0]
         return self.xp.concat([mean, none]), self.augment(covariance, [variance, variance])
 
     def begin_turn(self, mean: Array, covariance: Array, turn: Turn) -> tuple[Array, Array]:
-        """State with the turn rate of a kind of turn, ``(5, N)`` and ``(5, 5, N)``."""
+        """Return the state with the turn rate of a kind of turn, ``(5, N)`` and ``(5, 5, N)``."""
         pace = self.xp.sqrt(self.squared_pace(mean))
         rate = turn.acceleration / pace
         return self.xp.concat([mean, rate[None]]), self.augment(covariance, [(turn.spread / pace) ** 2])
 
     def squared_pace(self, mean: Array) -> Array:
-        """Square of the speed that divides accelerations of turns, (m/s)^2."""
+        """Return the square of the speed that divides accelerations of turns, (m/s)^2."""
         return self.xp.clip(mean[2] ** 2 + mean[3] ** 2, SLOWEST**2, None)
 
     def augment(self, covariance: Array, variances: list[Array]) -> Array:
-        """Covariance of a state and further components that are independent of it and of each other."""
+        """Return the covariance of a state and further components that are independent of it and of each other."""
         n, none = covariance.shape[0], 0.0 * variances[0]
         size = range(n + len(variances))
         return self.xp.stack(
@@ -235,7 +235,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         )
 
     def switch(self, straight: AgedHypotheses, thrust: AgedHypotheses, *turns: AgedHypotheses) -> Tables:
-        """Let manoeuvres end and begin."""
+        """End and begin manoeuvres."""
         ages, turning = self.ages, self.prior.turning if self.turns else 0.0
         modes = [semi_markov.Mode(thrust, self.hazard, (1.0 - turning) * self.prior.begin, self.begin_thrust)]
         for table in turns:
@@ -275,13 +275,13 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return tuple(moved)
 
     def predict(self, state: SemiMarkovState, measurement: Measurement) -> SemiMarkovState:
-        """Let manoeuvres end and begin, and fly on to the scan."""
+        """End and begin manoeuvres, and predict to the scan."""
         switched = self.switch(*(table.unpack() for table in state.track))
         tables = self.fly(*switched, T=measurement.interval)
         return state._replace(track=tuple(table.pack() for table in tables))
 
     def heeds(self, measurement: Measurement) -> Array:
-        """Where the scan saw the target."""
+        """Return one where the scan saw the target."""
         return measurement.available
 
     def apply_factors(self, tables: Iterable[AgedHypotheses], logarithms: Array) -> list[AgedHypotheses]:
@@ -339,5 +339,5 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
 
 
 def _moved(table: AgedHypotheses, mean: Array, covariance: Array) -> AgedHypotheses:
-    """Hypotheses after the time update."""
+    """Return the hypotheses after the time update."""
     return table._replace(mean=mean, covariance=mirror_lower(covariance))

@@ -73,5 +73,5 @@ class RadarStudentBank(StudentBank[object, Measurement]):
         return (*sensor_blocks(self, variances, coupling), *clock_blocks(self))
 
     def turned_covariance(self, turn: Array, measurement: Measurement) -> Array:
-        """Covariance of a measurement in the frame, ``(2, 2, N)``, m^2."""
+        """Return the covariance of a measurement in the frame, ``(2, 2, N)``, m^2."""
         return product(product(turn, sensor_covariance(measurement, self.xp)), transpose(turn))

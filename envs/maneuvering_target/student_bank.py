@@ -38,13 +38,13 @@ GAIN_REACH = 5.0
 OFFSET_REACH = 2.0
 """Innovation, in sigmas, that a correction without one counts for at most."""
 DEVIATION_RANGE = 50.0
-"""Largest factor and divisor of a reported deviation, likewise; before what it shares with the components above."""
+"""Largest factor and divisor of a reported deviation; before what it shares with the components above."""
 COUPLING_REACH = 4.0
 """Largest entry of a Cholesky factor beside the diagonal, over that on it: correlations of up to 0.97."""
 
 
 class View(NamedTuple):
-    """What an environment says of a measurement and of the estimate predicted to it."""
+    """A measurement and the estimate predicted to it."""
 
     mean: Array
     """Predicted, ``(C, N)``."""
@@ -72,8 +72,8 @@ class StudentState(NamedTuple):
 class StudentBank(Bank[TaskT, Measurement, StudentState]):
     """An estimate that the action corrects; what an environment declares stands below.
 
-    A subclass says how the estimate moves and in which frame it is corrected (:meth:`rotate`, :meth:`look`), and what
-    else is shown (:attr:`features`).
+    A subclass defines how the estimate moves and in which frame it is corrected (:meth:`rotate`, :meth:`look`), and
+    what else is shown (:attr:`features`).
     """
 
     gain: ClassVar[Sequence[tuple[int, float]]]
@@ -106,7 +106,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
     @property
     @abstractmethod
     def features(self) -> Sequence[Block]:
-        """What is shown of the measurement beside the innovation, relative to the frame."""
+        """Return the features of the measurement beside the innovation, relative to the frame."""
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
@@ -133,7 +133,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         )
 
     def start(self, initial: Initial) -> StudentState:
-        """Start where everyone starts."""
+        """Start at the initial estimate."""
         frame, none = self.rotate(initial.mean), 0.0 * initial.mean
         motion = self.xp.stack([none[0]] * max(len(self.motions), 1))
         innovation = self.xp.stack([none[0]] * self.measured)

@@ -55,7 +55,8 @@ class ManeuveringTarget(TargetProblem):
     A flat `Box` of float64; `env.unwrapped.observation_fields` lists name, unit and scale of every component.
     `gain`: innovations over their predicted sigma, log(1 + normalised innovation squared), exponential
     averages of both, the share 1 - R/S of the innovation variance that is the filter's own, the last alpha,
-    the measurement sigma, scans since the start, whether this scan saw the target and the time since the last one that did.
+    the measurement sigma, scans since the start, whether this scan saw the target and the time since the last one that
+    did.
     Bank: the same for each filter, log-likelihoods relative to
     the largest, log predicted mode probabilities, last weights, under `gains` the last gains. Large values are
     compressed by sign(x) log(1 + |x|).
@@ -76,9 +77,9 @@ class ManeuveringTarget(TargetProblem):
 
     In the paper every scan sees the target, T seconds after the one before. With `detection_probability` below 1 some do
     not: `available` is 0 then, the measurement zero (an estimator gets NaN), the filters' state the predicted one and
-    the weights the predicted ones (13), whatever the action. With `scan_jitter` j scan k comes at T (k - j u), u uniform on [0, 1): the filters
-    predict over the time that has passed, and estimate and truth are those of that time. The velocity's gain is
-    beta over the time since the last measurement, for which the innovation has grown.
+    the weights the predicted ones (13), whatever the action. With `scan_jitter` j scan k comes at T (k - j u), u
+    uniform on [0, 1): the filters predict over the time that has passed, and estimate and truth are those of that time.
+    The velocity's gain is beta over the time since the last measurement, for which the innovation has grown.
 
     ## Episode End
 
@@ -95,7 +96,8 @@ class ManeuveringTarget(TargetProblem):
     """
 
     id = ID
-    # 2: scans may miss the target, and fields say so; under `gain` and `gains` the same action is another velocity gain then.
+    # 2: scans may miss the target, and fields say so; under `gain` and `gains` the same action is another velocity gain
+    # then.
     interface = 2
     Parameters = ManeuveringTargetParameters
     World: ClassVar[type[RadarWorld]] = RadarWorld

@@ -36,18 +36,18 @@ class Truth(NamedTuple):
 
 
 class Odometry(NamedTuple):
-    """What a second sensor says of the motion since the scan before: wheels and a compass, a camera, an INS."""
+    """Motion since the scan before by a second sensor: wheels and a compass, a camera, an INS."""
 
     displacement: Array
-    """x and y, m, ``(2, N)``; zero where it says nothing."""
+    """x and y, m, ``(2, N)``; zero without a reading."""
     available: Array
-    """1 if it says something, 0 if not, ``(N,)``."""
+    """1 with a reading, 0 without, ``(N,)``."""
 
 
 class Measurement(NamedTuple):
-    """What the radar says in a scan.
+    """Report of the radar on a scan.
 
-    Where there is clutter, what is said of one plot is of the nearest in the gate; a scan with none there missed the
+    Where there is clutter, fields of one plot are those of the nearest in the gate; a scan with none there missed the
     target.
     """
 
@@ -66,7 +66,7 @@ class Measurement(NamedTuple):
     """s since the last scan that saw the target, or the start of the track, ``(N,)``: the interval, unless that before
     missed it."""
     odometry: Odometry | None = None
-    """What a second sensor says of the motion; None except in recordings that have one. No bank reads it, and no agent
+    """Motion by a second sensor; None except in recordings that have one. No bank reads it, and no agent
     is shown it."""
     plots: Plots | None = None
     """All plots about the track; None where there is no clutter. No bank reads them, and no agent is shown them."""
@@ -139,12 +139,12 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return Truth(number, position, velocity, flight, scans, states), measurement
 
     def variances(self, position: Array) -> Array:
-        """Of a measurement of a position, m^2, ``(2, N)``."""
+        """Return the variances of a measurement of a position, m^2, ``(2, N)``."""
         return polar.cartesian_variances(position, self.parameters.range_sigma, self.bearing_sigma)
 
     def error_axes(self, position: Array) -> Array:
-        """What errors of one standard deviation do to the measured position, to first order, ``(2, 2, N)``: in columns
-        those along x and y or, where measurements are polar, of range and azimuth.
+        """Return the effect of errors of one standard deviation on the measured position, to first order, ``(2, 2,
+        N)``: in columns those along x and y or, where measurements are polar, of range and azimuth.
         """
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:
@@ -157,8 +157,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def _measure(
         self, position: Array, errors: Array, states: dict[str, Any]
     ) -> tuple[dict[str, Any], Array]:
-        """Measured position, m, ``(2, N)``, from errors in units of their standard deviations: range and azimuth are
-        read, or x and y. With it the states of disturbances.
+        """Return the measured position, m, ``(2, N)``, from errors in units of their standard deviations: range and
+        azimuth are read, or x and y. With it the states of disturbances.
         """
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:
@@ -170,7 +170,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return states, radius * xp.stack([xp.cos(azimuth), xp.sin(azimuth)])
 
     def state(self, truth: Truth) -> Array:
-        """Position and velocity, ``(4, N)``."""
+        """Return the position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
@@ -193,21 +193,21 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return self.xp.concat([position, position * math.nan])
 
     def component_deviations(self, measurement: Measurement) -> Array:
-        """Root of the position's variance."""
+        """Return the root of the position's variance."""
         sigma = self.xp.sqrt(measurement.variance)
         return self.xp.concat([sigma, sigma * math.nan])
 
     def error_cost(self, error: Array) -> Array:
-        """Squared position error over the squared range sigma."""
+        """Return the squared position error over the squared range sigma."""
         scaled = error[:2] * (1.0 / self.parameters.range_sigma)
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """What disturbances report."""
+        """Return the records of the disturbances."""
         return self.disturbances.records(truth.disturbances)
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """What course, scans and disturbances tell of themselves."""
+        """Return the context of course, scans and disturbances."""
         time = self.scans.time(truth.scans, truth.scan)
         return {
             **self.course.context(truth.flight, truth.scan, time),

@@ -176,8 +176,8 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
         used = numpy.asarray(labels.sum(axis=0) > 0.0, dtype=bool)
         self.labels: numpy.ndarray = labels[:, used]
-        self.confusion: numpy.ndarray = numpy.concatenate([recognition, redrawn])[used]
-        self.other_confusion = recognition
+        self.confusion: Array = task.constant(numpy.concatenate([recognition, redrawn])[used])
+        self.other_confusion: Array = task.constant(recognition)
         others = (1.0 - numpy.eye(self.classes)) / (self.classes - 1)
         self.others: numpy.ndarray = others @ composition
         """Probability of a second emitter's type by class of the target, ``(S, I)``."""

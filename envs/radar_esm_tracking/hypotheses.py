@@ -28,6 +28,8 @@ from .problem import RadarEsmProblem
 from .world import Measurement, Start
 
 READINGS = ("range", "range_rate")
+LEAST = 1e-9
+"""Least probability of a group that is shown: smaller ones are rounding."""
 
 
 class HypothesesState(NamedTuple):
@@ -44,7 +46,8 @@ class HypothesesState(NamedTuple):
     prior: Array
     """Logarithm of the predicted sigma of range and range rate over the radar's, ``(2, N)``."""
     predicted: Array
-    """Probabilities before the scan of classes that have not changed, then of those that have, ``(2 S, N)``."""
+    """Probabilities before the scan, at least :data:`LEAST`, of classes that have not changed, then of those that have,
+    ``(2 S, N)``."""
     probability: Array
     """The same after the scan, if the action is zero."""
     second_emitter: Array
@@ -113,7 +116,7 @@ class HypothesesBank(SettingsBank):
             action=xp.stack([none] * len(self.own.settings)),
             innovation=0.0 * initial.first.radar,
             prior=xp.stack([none, none]),
-            predicted=groups,
+            predicted=xp.clip(groups, LEAST, None),
             probability=groups,
             second_emitter=none,
             entropy=none,
@@ -158,7 +161,7 @@ class HypothesesBank(SettingsBank):
             likelihood=found.likelihood,
             innovation=class_fusion.whiten(cholesky(P + noise), measurement.radar - mean),
             prior=0.5 * xp.log(xp.stack([P[0, 0], P[1, 1]]) / R),
-            predicted=self.group(tracks.weights),
+            predicted=xp.clip(self.group(tracks.weights), LEAST, None),
             probability=self.group(after.weights),
             second_emitter=disturbed / every,
             entropy=-ordered_sum(p * imm.log_probabilities(p)) / math.log(size),

@@ -45,7 +45,7 @@ LEAST_STRENGTH = 1e-9
 
 
 class Prediction(NamedTuple):
-    """What the bank expects at a measurement, steps 1 to 4; M = 3 hypotheses."""
+    """Prediction of the bank for a measurement, steps 1 to 4; M = 3 hypotheses."""
 
     mean: Array
     """``(17, M, N)``."""
@@ -65,7 +65,7 @@ class Filters(NamedTuple):
     means: Array
     """After the update, ``(17, M, N)``; of a bank whose action sets the noise, before :meth:`act`, as predicted."""
     covariances: Array
-    """Likewise, packed, ``(153, M, N)``."""
+    """Predicted covariances, packed, ``(153, M, N)``."""
     log_predicted: Array
     """Logarithm of the predicted probabilities, ``(M, N)``."""
     log_likelihood: Array
@@ -91,7 +91,7 @@ class Filters(NamedTuple):
 
 
 class SatelliteBank(Bank[Task, Measurement, Any]):
-    """What all controls share: what each filter of a bank says by group of sensors, and what comes with it."""
+    """Common base of all controls: statistics of each filter of a bank by group of sensors."""
 
     task: NavigationProblem
     parameters: TightlyCoupledNavigationParameters
@@ -99,14 +99,14 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
 
     @property
     def actions(self) -> Sequence[str]:
-        """What the components of the action concern."""
+        """Names of the components of the action."""
         return self.hypotheses
 
     # --- what the agent is shown
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What each filter says by group of sensors, readings, what is missing, and the clock."""
+        """Statistics of each filter by group of sensors, readings, missing readings, and the clock."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in self.hypotheses]
@@ -172,7 +172,7 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
         )  # fmt: skip
 
     def _present(self, measurement: Measurement) -> Array:
-        """Readings of each group of sensors that are there, at least one, ``(4, 1, N)``."""
+        """Return the readings of each group of sensors that are there, at least one, ``(4, 1, N)``."""
         here = [ordered_sum(measurement.available[sensor.readings]) for sensor in self.task.sensors]
         return self.xp.stack([self.xp.clip(count, 1.0, None) for count in here])[:, None]
 
@@ -210,7 +210,7 @@ class HypothesisBank(SatelliteBank):
         )
 
     def _predict_hypotheses(self, state: Filters) -> Prediction:
-        """Steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
+        """Return the steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = imm.mix(state.means, unpack(state.covariances, gnss_ins.SIZE), chain.mixing)
@@ -218,7 +218,7 @@ class HypothesisBank(SatelliteBank):
         return Prediction(mean, pack(covariance), chain.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
-        """State that the tracking loops expect at the next measurement, ``(17, N)``."""
+        """Return the state that the tracking loops expect at the next measurement, ``(17, N)``."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = weighted_sum(chain.mixing, state.means[:, :, None])
@@ -260,7 +260,7 @@ class HypothesisBank(SatelliteBank):
     def _before_the_action(
         self, predicted: Prediction, update: extended_kalman.Correction
     ) -> tuple[Array, Array]:
-        """Means and covariances, packed, that :meth:`act` goes on from."""
+        """Return the means and covariances, packed, that :meth:`act` goes on from."""
         return update.mean, pack(update.covariance)
 
     def _update_hypotheses(
@@ -272,7 +272,7 @@ class HypothesisBank(SatelliteBank):
         thresholds: Sequence[Array] | None = None,
         cautions: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
-        """Steps 5 and 6 for every hypothesis."""
+        """Return the steps 5 and 6 for every hypothesis."""
         expected, rows = gnss_ins.observe(
             means,
             measurement.satellite_position[:, :, None],
@@ -293,7 +293,7 @@ class HypothesisBank(SatelliteBank):
         )
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
-        """Thresholds of the robust update for each reading; None: the paper's update."""
+        """Return the thresholds of the robust update for each reading; None: the paper's update."""
         return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
@@ -328,13 +328,13 @@ class HypothesisBank(SatelliteBank):
         )
 
     def covariance(self, state: Filters) -> Array:
-        """Of the combination (step 8)."""
+        """Return the covariance of the combination (step 8)."""
         covariances = unpack(state.covariances, gnss_ins.SIZE)
         return imm.combine(state.means, covariances, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Probabilities, NIS of the combination and its degrees, log-density of the measurement as predicted, whether a
-        rate is beyond its aperture.
+        """Return the probabilities, NIS of the combination and its degrees, log-density of the measurement as
+        predicted, whether a rate is beyond its aperture.
         """
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
@@ -348,7 +348,7 @@ class HypothesisBank(SatelliteBank):
 
 
 class NoiseBank(HypothesisBank):
-    """Control ``gain``: the action says how noisy the sensors are; the paper's probabilities."""
+    """Control ``gain``: the action scales the noise of the sensors; the paper's probabilities."""
 
     adapts_covariance = True
 
@@ -382,7 +382,7 @@ class NoiseBank(HypothesisBank):
         return self.weigh_by_bayes(state, exponent)
 
     def _variance(self, exponent: Array, state: Filters) -> list[Array]:
-        """Of the noise of every reading, ``(N,)`` each."""
+        """Return the variance of the noise of every reading, ``(N,)`` each."""
         xp, p, task = self.xp, self.parameters, self.task
         up, down = 2.0 * math.log(p.noise_scale), 2.0 * math.log(p.noise_reduction)
         factor = xp.exp(xp.where(exponent > 0.0, up * exponent, down * exponent))
@@ -393,11 +393,12 @@ class NoiseBank(HypothesisBank):
         ]
 
     def _thresholds(self, exponent: Array) -> Sequence[Array] | None:
-        """Of the robust update of every reading, ``(N,)`` each; None: the plain update."""
+        """Return the thresholds of the robust update of every reading, ``(N,)`` each; None: the plain update."""
         return None
 
     def covariance(self, state: Filters) -> Array:
-        """Of the combination, when it is steered times the short average of the NIS per reading if that is above one.
+        """Return the covariance of the combination, times the short average of the NIS per reading if that is above
+        one.
 
         Whether the action is right about the sensors, only the innovations tell. Left alone, it is the paper's bank
         with the paper's covariance.
@@ -411,13 +412,13 @@ class NoiseBank(HypothesisBank):
 class RobustBank(NoiseBank):
     """Control ``robust``: noise as under ``gain``, and what to do with a reading that repeats itself or is an outlier.
 
-    What a reading is shows only with the measurement, between two decisions; so the action says beforehand what is to
-    be done then.
+    What a reading is shows only with the measurement, between two decisions; so the action determines beforehand what
+    is to be done then.
     """
 
     @property
     def reach(self) -> float:
-        """How much of the noises' range an action of one is, as an exponent."""
+        """Return the share of the noises' range that an action of one has, as an exponent."""
         return self.parameters.noise_reach
 
     @property
@@ -427,7 +428,9 @@ class RobustBank(NoiseBank):
         return [*super().actions, "accelerometers_repeated", f"{ranges}_outliers", f"{rates}_outliers"]
 
     def _variance(self, exponent: Array, state: Filters) -> list[Array]:
-        """As under ``gain``; accelerometers that repeat their last reading are noisier by an action of their own."""
+        """Return the variances as under ``gain``; accelerometers that repeat their last reading are noisier by an
+        action of their own.
+        """
         xp, forces = self.xp, self.task.sensors[2].readings
         groups = len(self.task.sensors)
         variance = super()._variance(self.reach * exponent[:groups], state)
@@ -436,7 +439,7 @@ class RobustBank(NoiseBank):
         return [*variance[: forces.start], *(v * factor for v in variance[forces]), *variance[forces.stop :]]
 
     def _thresholds(self, exponent: Array) -> Sequence[Array]:
-        """Huber's for an action of 1, none for 0 or less."""
+        """Return Huber's for an action of 1, none for 0 or less."""
         sensors = self.task.sensors
         strength = self.xp.clip(exponent[len(sensors) + 1 :], LEAST_STRENGTH, None)
         none = math.inf + 0.0 * exponent[0]

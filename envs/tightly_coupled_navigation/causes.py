@@ -1,4 +1,4 @@
-"""What makes a solution of TightlyCoupledNavigation costly: each kind of motion, and each fault of a sensor."""
+"""Causes of cost in TightlyCoupledNavigation: each kind of motion, and each fault of a sensor."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""How the user of TightlyCoupledNavigation moves: legs drawn anew for every episode, or the paper's fixed ones.
+"""Motion of the user of TightlyCoupledNavigation: legs drawn anew for every episode, or the paper's fixed ones.
 
 Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so nothing
 is left to jump at step 2000. The truth was probably a sequence of states with V incremented and A = 0:
@@ -57,7 +57,7 @@ class Course:
         return self._fixed_legs(draws, zeros)
 
     def _fixed_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Legs of the paper's experiment, or one that is matched to hypothesis 3, velocity and heading."""
+        """Return the legs of the paper's experiment, or one that is matched to hypothesis 3, velocity and heading."""
         xp, p = self.xp, self.parameters
         # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
         draws.unit("legs", 15)
@@ -79,7 +79,7 @@ class Course:
         return legs, along * speed, heading
 
     def _random_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Legs of rest, straight flight and manoeuvre at random, velocity at the start and heading."""
+        """Return the legs of rest, straight flight and manoeuvre at random, velocity at the start and heading."""
         xp, p = self.xp, self.parameters
         columns: list[tuple[Array, ...]] = []
         start: Array = None
@@ -119,7 +119,9 @@ class Course:
         return legs, velocity, heading
 
     def leg_at(self, legs: Legs, k: Array) -> tuple[Array, Array]:
-        """Kind of the leg that step k belongs to, ``(N,)``, and the acceleration with which it begins, ``(3, N)``."""
+        """Return the kind of the leg that step k belongs to, ``(N,)``, and the acceleration with which it begins,
+        ``(3, N)``.
+        """
         kind, push = legs.kind[0], legs.acceleration[:, 0]
         for i in range(1, legs.start.shape[0]):
             begun = k > legs.start[i]

@@ -1,4 +1,4 @@
-"""What may go wrong with the sensors of TightlyCoupledNavigation: a class for each."""
+"""Disturbances of the sensors of TightlyCoupledNavigation: a class for each."""
 
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -47,7 +47,7 @@ def _is_pulled(moment: Moment) -> Array | None:
 
 
 class _OfSatellites(Disturbance):
-    """What concerns satellites, S of them; pseudoranges come first in the readings, then their rates."""
+    """Disturbance of satellites, S of them; pseudoranges come first in the readings, then their rates."""
 
     def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
@@ -56,11 +56,11 @@ class _OfSatellites(Disturbance):
         self.places: Array = task.constant(range(task.satellites))[:, None]
 
     def change_rows(self, values: Array, first: int, changed: Array) -> Array:
-        """Values of the readings, ``(m, N)``, with some of them changed, from the first on."""
+        """Return the values of the readings, ``(m, N)``, with some of them changed, from the first on."""
         return self.xp.concat([values[:first], changed, values[first + changed.shape[0] :]])
 
     def change_available(self, measurement: Any, first: int, kept: Array) -> Any:
-        """Measurement of which some readings are there only if one more number is above zero."""
+        """Return the measurement of which some readings are there only if one more number is above zero."""
         available = measurement.available
         changed = available[first : first + kept.shape[0]] * kept
         return measurement._replace(available=self.change_rows(available, first, changed))
@@ -80,7 +80,7 @@ class Fault(NamedTuple):
 
 
 class _Once(_OfSatellites):
-    """What happens for a while, once in an episode, with a probability."""
+    """Temporary disturbance, once in an episode, with a probability."""
 
     title: ClassVar[str]
     """Of the parameters of its probability and duration."""
@@ -105,14 +105,14 @@ class _Once(_OfSatellites):
         return state._replace(now=self.xp.astype(happens, state.now.dtype))
 
     def is_at(self, state: Fault) -> Array:
-        """Whether it happens to each satellite now, booleans ``(S, N)``."""
+        """Return whether it affects each satellite now, booleans ``(S, N)``."""
         chosen = self.places == state.satellites[0]
         for i in range(1, state.satellites.shape[0]):
             chosen = chosen | (self.places == state.satellites[i])
         return chosen & (state.now > 0.0)
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """First and last step, -1 where there is none."""
+        """Return the first and last step, -1 where there is none."""
         window = state.window
         return {self.name: self.xp.where(window[1] >= window[0], window, -1.0)}
 
@@ -147,7 +147,7 @@ class StuckAccelerometers(_Hidden):
         return state._replace(now=self.xp.where(step.number > 1.0, state.now, 0.0))
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Window, and whether it happens."""
+        """Return the window, and whether it happens."""
         return {**super().context(state), "stuck_now": state.now}
 
 
@@ -173,7 +173,7 @@ class NoisyRate(_Hidden):
         return self.change_rows(deviations, S, factor * deviations[S : 2 * S])
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Window and satellite."""
+        """Return the window and satellite."""
         return {**super().context(state), "noisy_satellite": state.satellites[0]}
 
 
@@ -196,7 +196,7 @@ class HiddenSatellites(_Once):
         return state, self.change_available(measurement, 0, self.xp.concat([seen, seen]))
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Window and satellites."""
+        """Return the window and satellites."""
         return {**super().context(state), "hidden_satellites": state.satellites}
 
 
@@ -280,7 +280,9 @@ class Reflections(_OfSatellites):
         )
 
     def advance(self, state: Reception, step: DisturbanceInput) -> Reception:
-        """C/N0 walks between its limits; where a multipath error has run out, a new one is drawn by the C/N0 now."""
+        """Return the C/N0 walks between its limits; where a multipath error has run out, a new one is drawn by the
+        C/N0 now.
+        """
         xp, p, S = self.xp, self.parameters, self.satellites
         if not p.urban:
             return state
@@ -311,11 +313,11 @@ class Reflections(_OfSatellites):
     def change_measurement(
         self, state: Reception, measurement: Any, step: DisturbanceInput
     ) -> tuple[Reception, Any]:
-        """Tell C/N0."""
+        """Change the C/N0."""
         return state, measurement._replace(cn0=state.cn0)
 
     def context(self, state: Reception) -> dict[str, Array]:
-        """Whether the episode is between houses."""
+        """Return whether the episode is between houses."""
         return {"urban": state.urban}
 
 
@@ -352,7 +354,7 @@ class Ramp(_Hidden):
         return Fault(window, satellite[None], xp.stack([jump, zero]), zero)
 
     def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
-        """Drift on."""
+        """Return the drift on."""
         p, jump = self.parameters, state.own[0]
         run = jump + (p.ramp_rate * p.sampling_interval) * (step.number - state.window[0] + 1.0)
         return super().advance(state._replace(own=self.xp.stack([jump, run])), step)
@@ -364,7 +366,7 @@ class Ramp(_Hidden):
         return errors + self.xp.where(self.is_at(state), state.own[1], 0.0)
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Window, satellite and the bias with which it begins."""
+        """Return the window, satellite and the bias with which it begins."""
         own = {"ramp_satellite": state.satellites[0], "ramp_jump": state.own[0]}
         return {**super().context(state), **own}
 
@@ -394,7 +396,7 @@ class Aperture(_OfSatellites):
         return state, self.change_available(measurement, 0, self.xp.astype(kept, feedback.dtype))
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Whether they do."""
+        """Return whether rates are outside the aperture."""
         return {"aperture": state}
 
 

@@ -2,12 +2,12 @@ r"""A bank of extended Kalman filters over motion and faults of TightlyCoupledNa
 
 Three hypotheses on the motion are kept, the paper's: rest, constant velocity, Singer manoeuvre. They follow each other
 as legs do: a manoeuvre begins with an acceleration that has nothing to do with the past, whatever was before it, also
-another manoeuvre; constant velocity follows a manoeuvre; nobody comes back to rest. So before each measurement a
+another manoeuvre; constant velocity follows a manoeuvre; rest does not return. So before each measurement a
 fourth hypothesis, "a manoeuvre has begun at this step", is made of the predictions of all three, with an acceleration
 of zero and the variance of the prior; after the measurement it is merged with the manoeuvre by moments.
 
 Each filter has, beside the 17 states of the paper, one error for every pseudorange (``filters/range_errors.py``). Under
-an open sky it is a Gauss-Markov process. Between houses, which the C/N0 tells, it holds for about a second and is then
+an open sky it is a Gauss-Markov process. Between houses, which the C/N0 shows, it holds for about a second and is then
 drawn anew, with a mean and a variance that depend on the C/N0. The update by a pseudorange tests each satellite for
 that: a pseudorange that has jumped is left to its own error and excluded from the position.
 
@@ -23,7 +23,7 @@ with:
 
     p'(begun) <- p'(begun) f1,  p'(manoeuvre) <- p'(manoeuvre) f2                          renormalised by Bayes' rule
     p_j / (1 - p_j) <- f3 p_j / (1 - p_j)
-    q'(l) <- q'(l) f4^s(l)                                                                 likewise
+    q'(l) <- q'(l) f4^s(l)                                                            renormalised
     Q <- Q f5,  R_k <- R_k f(5 + k)                                                        k = 1, 2, 3
 
 begun: a manoeuvre begins at this step; manoeuvre: one goes on; s(l): how far the level lies above the nominal one,
@@ -55,7 +55,7 @@ CN0_LIMITS = (30.0, 38.0, 44.0)
 
 
 class FaultPrior(NamedTuple):
-    """What a bank expects before it has seen anything."""
+    """Prior of a bank."""
 
     quiet: float = 1.0
     """Time from the start in which no leg ends, s."""
@@ -122,12 +122,12 @@ class Hypotheses(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """What the expectations of the bank are multiplied by at one measurement, ``(N,)`` or a number."""
+    """Factors of the prior at one measurement, ``(N,)`` or a number."""
 
     begun: Array = 1.0
     """Probability that a manoeuvre has begun at this step, before the readings are weighed."""
     manoeuvre: Array = 1.0
-    """Likewise that one goes on."""
+    """Factor of the odds that a manoeuvre goes on."""
     renewal: Array = 1.0
     """Odds that a range error has been drawn anew."""
     levels: Array = 1.0
@@ -146,7 +146,9 @@ UNCHANGED = Factors()
 
 
 class Posterior(NamedTuple):
-    """What the bank makes of a measurement; four hypotheses: those on the motion, and a manoeuvre that has begun."""
+    """Posterior of the bank after a measurement; four hypotheses: those on the motion, and a manoeuvre that has
+    begun.
+    """
 
     after: "FaultState"
     predicted: Array
@@ -158,7 +160,7 @@ class Posterior(NamedTuple):
     residual: Array
     """Of every reading at the predicted mean of each hypothesis, ``(m, 4, N)``."""
     between: Array
-    """Whether the C/N0 tells of houses, ``(N,)``."""
+    """Whether the C/N0 is that of a place between houses, ``(N,)``."""
     repeated: Array
     """Whether the accelerometers repeat their last readings exactly, ``(N,)``."""
 
@@ -293,12 +295,12 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         return mean, xp.concat([covariance, C[:, :, None]], axis=2), probabilities
 
     def _error_process(self, between: Array) -> tuple[Any, Any]:
-        """What is left of a range error after a step, and the variance that it gains, m^2; one for all, or a list."""
+        """Return the decay of a range error in a step, and the variance that it gains, m^2; one for all, or a list."""
         xp = self.xp
         return xp.where(between, 1.0, self.open_sky), xp.where(between, 0.0, self.gained)
 
     def _renewals(self, measurement: Measurement, between: Array, odds: Array) -> list[range_errors.Renewal]:
-        """How each range error may have been drawn anew."""
+        """Return the distributions of range errors that may have been drawn anew."""
         xp, prior = self.xp, self.prior
         first = measurement.number <= 1
         renewals = []
@@ -426,7 +428,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         )
 
     def _move_levels(self, levels: Array) -> Array:
-        """Probabilities of the levels after a step, ``(L, N)``."""
+        """Return the probabilities of the levels after a step, ``(L, N)``."""
         L = levels.shape[0]
         return self.xp.stack(
             [

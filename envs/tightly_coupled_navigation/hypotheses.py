@@ -51,7 +51,7 @@ class HypothesesState(NamedTuple):
     noisy: Array
     """Probability then that the noise of a rate is above its nominal level, ``(S, N)``."""
     between: Array
-    """1 where the C/N0 tells of houses, ``(N,)``."""
+    """1 where the C/N0 is that of a place between houses, ``(N,)``."""
 
     @property
     def probabilities(self) -> Array:
@@ -72,7 +72,7 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What the paper's bank shows, and what this one believes."""
+        """Observation of the paper's bank, and probabilities of this one."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         units = task.constant([0.5 * math.log(2.0 * math.pi * r) for r in task.sensor_variance])[:, None]
@@ -146,7 +146,7 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """As the paper's bank, likelihood and NIS as the estimator finds them."""
+        """Return the records of the paper's bank, likelihood and NIS as the estimator finds them."""
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
         return {

@@ -34,7 +34,8 @@ from .world import Measurement
 MANOEUVRE_RANGE = 30.0
 """Largest factor and divisor of the deviation of the acceleration."""
 CAUTION = 2.0
-"""Likewise of the deviation of a reading in the gain alone. Far larger ones can make a filter unstable."""
+"""Largest factor and divisor of the deviation of a reading in the gain alone. Far larger ones can make a filter
+unstable."""
 DROPPED = ("log_likelihood", "log_predicted")
 """Blocks that compare hypotheses."""
 
@@ -60,13 +61,13 @@ class KalmanNetBank(RobustBank):
 
     @property
     def actions(self) -> Sequence[str]:
-        """What ``robust`` has, the manoeuvre, and what the gain alone takes the sensors' noise for."""
+        """Actions of ``robust``, the manoeuvre, and the noise of the sensors in the gain alone."""
         groups = [sensor.name for sensor in self.task.sensors]
         return [*super().actions, "manoeuvre", *(f"caution_{name}" for name in groups)]
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What the paper's filters show of themselves, and how sure this one is."""
+        """Observation of the paper's filters, and deviations of this one."""
         xp, p = self.xp, self.parameters
         parts = {
             "position": (gnss_ins.POSITION, p.position_unit),
@@ -131,11 +132,11 @@ class KalmanNetBank(RobustBank):
         return self._combine(state, state.probabilities, exponent)
 
     def covariance(self, state: Filters) -> Array:
-        """Of the one filter."""
+        """Return the covariance of the one filter."""
         return unpack(state.covariances[:, 0], gnss_ins.SIZE)
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """As of the paper's bank, without probabilities."""
+        """Return the records of the paper's bank, without probabilities."""
         records = super().records(state, measurement)
         del records["mode_probability"]
         return records

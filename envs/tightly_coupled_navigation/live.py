@@ -1,4 +1,4 @@
-"""What receiver and inertial system say as they say it, as measurements of TightlyCoupledNavigation."""
+"""Live readings of receiver and inertial system, as measurements of TightlyCoupledNavigation."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,7 +22,7 @@ class ReceiverInput(LiveInput):
             "ins_angles": "heading, pitch and roll shown by the inertial system, rad",
             "cn0": f"carrier to noise density of each of {satellites} satellites, dB-Hz",
             "satellite_position": f"east, north, up of the site, m, (3, {satellites})",
-            "satellite_velocity": f"likewise, m/s, (3, {satellites})",
+            "satellite_velocity": f"velocities of the satellites, m/s, (3, {satellites})",
         }
         others = [name for name in self.initial._asdict() if name not in ("mean", "covariance")]
         return values, {name: f"shape {getattr(self.initial, name).shape[:-1]}" for name in others}

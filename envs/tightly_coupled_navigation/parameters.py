@@ -176,7 +176,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """Limits of the bias with which the drift begins, m. Ours."""
     pseudorange_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Limits of the stationary standard deviation of a coloured error (first-order Gauss-Markov) that every pseudorange
-    has beside the white one, each its own: diffuse multipath, atmosphere, ephemerides; m. Nobody states it. Ours."""
+    has beside the white one, each its own: diffuse multipath, atmosphere, ephemerides; m. It is not reported. Ours."""
     pseudorange_correlation_time: tuple[float, float] = parameter((10.0, 10.0), above=0.0, ascending=True)
     """Limits of its correlation time, s. Ours."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)

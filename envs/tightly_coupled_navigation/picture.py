@@ -49,7 +49,7 @@ class TightlyCoupledNavigationPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Positions in m, accelerations, weights, factors, innovations, errors."""
+        """Return the positions in m, accelerations, weights, factors, innovations, errors."""
         task, bank, S, lane = self.task, state.filter, self.task.satellites, 0
         error = self.model.error(state)[:, lane]
         P = numpy.diagonal(self.model.covariance(state)[:, :, lane])
@@ -100,7 +100,7 @@ class TightlyCoupledNavigationPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """What is steered, innovations, errors."""
+        """Return the strips: actions, innovations, errors."""
         hypotheses = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
         weights = {name: f"weight.{i}" for i, name in enumerate(hypotheses)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
@@ -132,7 +132,7 @@ class TightlyCoupledNavigationPicture(Picture):
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Steps on which the user manoeuvres."""
+        """Return the steps on which the user manoeuvres."""
         return self.motions[SINGER]
 
     # --- panels
@@ -236,7 +236,7 @@ class TightlyCoupledNavigationPicture(Picture):
 
 
 def _runs(flags: Sequence[bool]) -> list[tuple[float, float]]:
-    """Stretches of steps, counted from 1, over which a flag holds: from and to, half a step beyond."""
+    """Return the stretches of steps, counted from 1, over which a flag holds: from and to, half a step beyond."""
     steps = 1 + numpy.flatnonzero(flags)
     if not len(steps):
         return []
@@ -245,7 +245,7 @@ def _runs(flags: Sequence[bool]) -> list[tuple[float, float]]:
 
 
 def _segments(runs: Sequence[tuple[float, float]], row: float) -> tuple[list[float], list[float]]:
-    """Coordinates of one broken line along a row."""
+    """Return the coordinates of one broken line along a row."""
     x = [value for first, last in runs for value in (first, last, numpy.nan)]
     return x, [row] * len(x)
 

@@ -1,4 +1,4 @@
-"""What world, filters and picture of TightlyCoupledNavigation use of their task: sensors, satellites and models."""
+"""Parts of the task that world, filters and picture of TightlyCoupledNavigation use: sensors, satellites and models."""
 
 import numpy
 
@@ -53,11 +53,11 @@ class NavigationProblem(Task):
         self.transition: Array = constant(p.transition)
 
     def _row(self, number: Array) -> Array:
-        """Where a measurement stands in the tables; an episode that is over stays at the end."""
+        """Return the row of a measurement in the tables; an episode that is over stays at the end."""
         return self.xp.clip(number, None, self.horizon + 1)
 
     def satellites_at(self, number: Array) -> tuple[Array, Array]:
-        """Positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
+        """Return the positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
         row = self._row(number)
         return (
             self.xp.take(self._satellite_position, row, axis=2),

@@ -1,10 +1,11 @@
 r"""A bank over the faults of one pseudorange: the filter of healthy satellites, and one for a fault of each of them.
 
 Every member is a whole :class:`.FaultHypotheses`. In member j the error of pseudorange j may jump once in a while and
-then walks at random, so that the pseudorange says little of the position from the start on, and a fault that creeps in
-cannot have bent the estimate before it is found (solution separation: R. G. Brown and P. W. McBurney, Self-contained
-GPS integrity check using maximum solution separation, Navigation 35, 1988). At most one pseudorange is wrong. Faults
-begin at a rate h, of all satellites together, and last. With weights w0 of no fault and wj of that of satellite j,
+then walks at random, so that the pseudorange has little information on the position from the start on, and a fault that
+creeps in cannot have bent the estimate before it is found (solution separation: R. G. Brown and P. W. McBurney,
+Self-contained GPS integrity check using maximum solution separation, Navigation 35, 1988). At most one pseudorange is
+wrong. Faults begin at a rate h, of all satellites together, and last. With weights w0 of no fault and wj of that of
+satellite j,
 
     w0' = (1 - h T) w0,    wj' = wj + h T w0 / S,
 
@@ -39,7 +40,7 @@ class OneFault(FaultHypotheses):
         self.walk: Array = task.constant(walk**2 * task.common.T)
 
     def _error_process(self, between: Array) -> tuple[Any, Any]:
-        """That of the prior, but of its own pseudorange a random walk."""
+        """Return that of the prior, but of its own pseudorange a random walk."""
         kept, gained = super()._error_process(between)
         places = range(self.task.satellites)
         return [1.0 if j == self.wrong else kept for j in places], [
@@ -47,7 +48,7 @@ class OneFault(FaultHypotheses):
         ]
 
     def _renewals(self, measurement: Measurement, between: Array, odds: Array) -> list[range_errors.Renewal]:
-        """As the prior says of its own pseudorange; under an open sky no other jumps."""
+        """Return the prior of its own pseudorange; under an open sky no other jumps."""
         found = super()._renewals(measurement, between, odds)
         return [
             one if j == self.wrong else one._replace(probability=self.xp.where(between, one.probability, 0.0))
@@ -118,11 +119,11 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
         return SatelliteFaultState(members, weights, found)
 
     def mean(self, state: SatelliteFaultState) -> Array:
-        """Of all members together, ``(17, N)``."""
+        """Return the mean of all members together, ``(17, N)``."""
         return weighted_sum(state.weights, self.xp.stack([member.mean for member in state.members], axis=1))
 
     def covariance(self, state: SatelliteFaultState) -> Array:
-        """Likewise, ``(17, 17, N)``."""
+        """Return the covariance of all members together, ``(17, 17, N)``."""
         means = self.xp.stack([member.mean for member in state.members], axis=1)
         covariances = self.xp.stack([member.covariance for member in state.members], axis=2)
         found: Array = imm.combine(means, covariances, state.weights)[1]

@@ -79,10 +79,10 @@ class TightlyCoupledNavigation(NavigationProblem):
 
     ## Rewards
 
-    By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the cost over 0.1, the median of what the paper's algorithm
-    costs in an episode of `random`, and x0 that of the action zero on the same flight and noise. The cost is the squared
-    error of position (unit 7.4 m) plus that of velocity (unit 0.25 m/s), the errors of a fix from one epoch alone. The
-    unit of the other rewards is 10, between that median and the mean, 60, which is a few lost tracks'.
+    By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the cost over 0.1, the median of what the paper's
+    algorithm costs in an episode of `random`, and x0 that of the action zero on the same flight and noise. The cost is
+    the squared error of position (unit 7.4 m) plus that of velocity (unit 0.25 m/s), the errors of a fix from one epoch
+    alone. The unit of the other rewards is 10, between that median and the mean, 60, which is a few lost tracks'.
 
     ## Starting State
 
@@ -95,10 +95,10 @@ class TightlyCoupledNavigation(NavigationProblem):
 
     ## Arguments
 
-    Every field of `TightlyCoupledNavigationParameters` is a keyword, among them `satellites` (slots; fewer than four: the filter
-    coasts on what is left), `increment_sigma` of hypothesis 2, sensor sigmas, faults, and `aperture`: the
-    tracking loops, steered by the combined prediction, lose a rate that is 9.36 m/s or a range that is 293 m
-    away from it.
+    Every field of `TightlyCoupledNavigationParameters` is a keyword, among them `satellites` (slots; fewer than four:
+    the filter coasts on what is left), `increment_sigma` of hypothesis 2, sensor sigmas, faults, and `aperture`: the
+    tracking loops, steered by the combined prediction, lose a rate that is 9.36 m/s or a range that is 293 m away from
+    it.
 
     ## Version History
 
@@ -184,7 +184,9 @@ class TightlyCoupledNavigation(NavigationProblem):
     )
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
-        """State that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a manoeuvre."""
+        """Return the state that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a
+        manoeuvre.
+        """
         return gnss_ins.advance(mean, self.axis[:, :, SINGER], self.common.T, self.common.decay)
 
 

@@ -50,7 +50,7 @@ class Truth(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What receiver and inertial system say; S satellites, m = 2 S + 6 readings."""
+    """Readings of receiver and inertial system; S satellites, m = 2 S + 6 readings."""
 
     number: Array
     """Of the measurement, counted from 1, ``(N,)`` integers; one takes ``sampling_interval`` seconds."""
@@ -175,7 +175,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return truth, measurement
 
     def _move(self, truth: Truth, k: Array, normals: Array) -> tuple[Array, Array, Array]:
-        """State at step k, the hypothesis it follows, and whether its acceleration has jumped."""
+        """Return the state at step k, the hypothesis it follows, and whether its acceleration has jumped."""
         xp, common, c = self.xp, self.task.common, self.clock_root
         moved = gnss_ins.advance(truth.state, self.task.axis[:, :, SINGER], common.T, common.decay)
         w = xp.reshape(normals[:9], (3, 3, *normals.shape[1:]))
@@ -190,7 +190,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     # --- judgement
 
     def error_cost(self, error: Array) -> Array:
-        """Squared position and velocity errors over those of a single-epoch fix."""
+        """Return the squared position and velocity errors over those of a single-epoch fix."""
         p, x, v = self.parameters, error[gnss_ins.POSITION], error[gnss_ins.VELOCITY]
         return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
 
@@ -210,8 +210,8 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Legs, what disturbances report, and what holds now: the true hypothesis, the noise of every reading over the
-        nominal one, and what pseudoranges are off by.
+        """Return the legs, what disturbances report, and what holds now: the true hypothesis, the noise of every
+        reading over the nominal one, and what pseudoranges are off by.
         """
         return {
             "leg_start": truth.legs.start,

@@ -30,7 +30,7 @@ def _plain(cell: str) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table; a bar within a cell is escaped."""
+    """Return the lines of a Markdown table; a bar within a cell is escaped."""
     return [
         "| " + " | ".join(header) + " |",
         "|" + "---|" * len(header),

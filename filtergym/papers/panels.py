@@ -20,7 +20,9 @@ def panels(rows: int, columns: int, size: tuple[float, float], **keywords: Any) 
 
 
 def looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Colour and line of each name; unlike :func:`~..figures.styles` neighbours differ in their dashes too."""
+    """Return the colour and line of each name; unlike :func:`~..figures.styles` neighbours differ in their dashes
+    too.
+    """
     return {
         name: style | {"linestyle": LINES[i % len(LINES)]}
         for i, (name, style) in enumerate(styles(list(names)).items())

@@ -49,12 +49,14 @@ class Quantity(NamedTuple):
 
 
 def means(values: numpy.ndarray) -> numpy.ndarray:
-    """Mean over the runs ``(runs, ...)``, and over every bootstrap sample of them, ``(1 + resamples, ...)``."""
+    """Return the mean over the runs ``(runs, ...)``, and over every bootstrap sample of them, ``(1 + resamples,
+    ...)``.
+    """
     return _resampling(len(values)).means(values)
 
 
 def quantity(samples: numpy.ndarray) -> Quantity:
-    """Value and uncertainty of a quantity, ``(1 + resamples,)``."""
+    """Return the value and uncertainty of a quantity, ``(1 + resamples,)``."""
     if len(samples) == 1:
         return Quantity(*[float(samples[0])] * 3)
     value, low, high = percentile_interval(samples).tolist()
@@ -62,12 +64,12 @@ def quantity(samples: numpy.ndarray) -> Quantity:
 
 
 def mean(values: numpy.ndarray) -> Quantity:
-    """Mean over the runs ``(runs,)``."""
+    """Return the mean over the runs ``(runs,)``."""
     return quantity(means(values))
 
 
 def band(samples: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Bounds of the 95 % interval of curves, ``(1 + resamples, ...)``."""
+    """Return the bounds of the 95 % interval of curves, ``(1 + resamples, ...)``."""
     _, low, high = percentile_interval(samples)
     return low, high
 

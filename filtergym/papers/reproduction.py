@@ -1,4 +1,4 @@
-"""What a reproduction of a paper consists of.
+"""Parts of a reproduction of a paper.
 
 A folder beside this file is a paper: ``experiment`` (what is run and computed), ``claims`` (a table of statements,
 which :func:`judge_claims` reads, and the quantities that they rest on; tables of results), ``figures``. Its
@@ -24,7 +24,7 @@ from .grid import Grid, markdown_table
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]
 Progress = Callable[[int], None]
-"""Told of units of work done."""
+"""Called with the units of work done."""
 UNCERTAINTY = (
     '± is one standard error, by bootstrap over the runs; "certainly" means by a 95 % bootstrap interval.'
 )
@@ -48,7 +48,7 @@ def compute_units(results: Any, progress: Progress, workers: Workers | None = No
 
     Args:
         results: tuples, named ones too, lists and dictionaries, in which :func:`later` left units of work.
-        progress: told of units done.
+        progress: called with the units done.
         workers: who does them; default: this process, one after the other.
     """
     units: list[Later] = []
@@ -79,12 +79,12 @@ def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
 
 
 def verdict_if(holds: bool) -> Verdict:
-    """Verdict on a claim that holds or does not."""
+    """Return the verdict on a claim that holds or does not."""
     return "reproduced" if holds else "not reproduced"
 
 
 def verdict_of(holds: Iterable[bool]) -> Verdict:
-    """Verdict on a claim with several parts: reproduced if all of them hold, in part if some do."""
+    """Return the verdict on a claim with several parts: reproduced if all of them hold, in part if some do."""
     parts = list(holds)
     return "reproduced" if all(parts) else "reproduced in part" if any(parts) else "not reproduced"
 
@@ -95,7 +95,7 @@ class Claim:
 
     key: str
     statement: str
-    """What the paper says, in our words; or the question, where it is silent."""
+    """Claim of the paper, in our words; or the question, where it is silent."""
     measured: str
     """The figures, with their uncertainty."""
     method: str
@@ -108,7 +108,7 @@ class Statement(NamedTuple):
 
     key: str
     statement: str
-    """What the paper says, in our words; or the question, where it is silent."""
+    """Claim of the paper, in our words; or the question, where it is silent."""
     measured: str
     method: str
     verdict: Callable[[Any], Verdict] | Verdict = "paper is silent"
@@ -143,7 +143,7 @@ class Reproduction:
     """What made it."""
 
     def markdown(self, suffix: str = "png") -> str:
-        """Claims, tables and figures as one page, which shows files of figures that end in a suffix."""
+        """Return the claims, tables and figures as one page, which shows files of figures that end in a suffix."""
         lines = [f"# {self.title}", ""]
         if self.command:
             lines += [f"Made by `{self.command}`.", ""]

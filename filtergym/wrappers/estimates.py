@@ -7,7 +7,8 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ..baselines.problem import import_problem
+from ..baselines.problem import Problem
+from ..baselines.state_space import state_space_baselines
 from ..compiler.functions import round_up_lanes
 from ..envs.contract.filter import Initial
 from ..envs.data.recorded_world import Feed
@@ -32,38 +33,38 @@ LARGEST = 1e38
 """Mean or variance of a filter that is lost, as observations of 32 bits cannot hold more: it begins anew."""
 CONTROLS = ("noise", "gain")
 """What an action may change of the filter."""
-_IDS: dict[tuple[Any, ...], tuple[str, Any]] = {}
-"""Environments of state-space models of this process, with model and sensors, by these."""
+_PROBLEMS: dict[tuple[Any, ...], tuple[Problem, Any]] = {}
+"""State-space models of this process, with the objects by which they are found."""
 
 
-def state_space_id(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSensor]) -> str:
-    """Return the id of the environment of a state-space model, which is made once.
+def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSensor]) -> Problem:
+    """Return the estimation problem of a model and sensors, which is defined once.
 
     Raises:
         ValueError: for a model that :func:`filtergym.state_space` refuses.
     """
     fields = [one.name for one in dataclasses.fields(Sensor) if one.name != "interval"]
     key = (id(model), *((name, *(_key(getattr(one, f)) for f in fields)) for name, one in sensors.items()))
-    if key in _IDS:
-        return _IDS[key][0]
-    Q, name = model.matrix("noise"), f"wrapped/Model{len(_IDS) + 1}-v0"
-    state_space(
-        name,
-        f=model.f,
-        Q=lambda dt: [[number * dt for number in row] for row in Q.tolist()],
-        sensors={
-            label: Sensor(**{field: getattr(one, field) for field in fields})
-            for label, one in sensors.items()
-        },
-        mean=model.mean,
-        covariance=model.matrix("covariance"),
-        names=tuple(model.names),
-        angles=dict(model.angles),
-        inputs={one: Input() for one in model.inputs},
-        sampling_interval=model.interval,
-    )
-    _IDS[key] = name, (model, sensors)
-    return name
+    if key not in _PROBLEMS:
+        Q = model.matrix("noise")
+        task = state_space(
+            f"wrapped/Model{len(_PROBLEMS) + 1}-v0",
+            f=model.f,
+            Q=lambda dt: [[number * dt for number in row] for row in Q.tolist()],
+            sensors={
+                name: Sensor(**{field: getattr(one, field) for field in fields})
+                for name, one in sensors.items()
+            },
+            mean=model.mean,
+            covariance=model.matrix("covariance"),
+            names=tuple(model.names),
+            angles=dict(model.angles),
+            inputs={one: Input() for one in model.inputs},
+            sampling_interval=model.interval,
+            registered=False,
+        )
+        _PROBLEMS[key] = Problem(task, state_space_baselines(task)), (model, sensors)
+    return _PROBLEMS[key][0]
 
 
 def _key(value: Any) -> Any:
@@ -116,7 +117,7 @@ class Estimates:
     ) -> None:
         self._arguments = model, sensors, competitor, control, show, lanes
         self.model, self._lanes, self._show = model, lanes, show
-        problem = import_problem(state_space_id(model, sensors))
+        problem = define_problem(model, sensors)
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
         scenario = dataclasses.replace(

@@ -16,7 +16,7 @@ class VarianceReduction(NamedTuple):
 
 
 def variance_reduction(alpha: Array, beta: Array) -> VarianceReduction:
-    """Steady variance-reduction ratios of an alpha-beta filter.
+    """Return the steady variance-reduction ratios of an alpha-beta filter.
 
     Textbook results (Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999), with
     ``d = alpha (4 - 2 alpha - beta)``: position ``(2 alpha^2 + 2 beta - 3 alpha beta) / d``, velocity
@@ -46,7 +46,7 @@ def propagate_error(
     beta: Array,
     T: float,
 ) -> ErrorMoments:
-    """Exact moments of the error over one scan, known gains, known manoeuvre of the target.
+    """Return the exact moments of the error over one scan, known gains, known manoeuvre of the target.
 
     The error of the filter is linear in its initial error, the measurement noise and what the target does
     beyond straight flight, so its mean and covariance follow without Monte Carlo:

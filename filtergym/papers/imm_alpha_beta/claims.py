@@ -36,7 +36,7 @@ SPAN = f"{SECTION[0]}-{SECTION[1]}"
 
 
 def improvement_verdict(section: Sequence[Quantity], parts: Sequence[Quantity]) -> Verdict:
-    """Verdict on "substantially smaller error on the manoeuvre section".
+    """Return the verdict on "substantially smaller error on the manoeuvre section".
 
     Args:
         section: relative change over the whole section, of position and of velocity.
@@ -102,7 +102,7 @@ def comparisons(r: Results) -> dict[str, Comparison]:
 
 
 class GridFinding(NamedTuple):
-    """Where on the gain grid an error is smallest."""
+    """Minimum of an error on the gain grid."""
 
     minimum: float
     gains: tuple[float, float]
@@ -117,7 +117,7 @@ class GridFinding(NamedTuple):
 
 
 def inside_box() -> numpy.ndarray:
-    """Cells of the grid within the recommended gains, ``(6, 8)``."""
+    """Return the cells of the grid within the recommended gains, ``(6, 8)``."""
     low, high = numpy.array(LOW_GAINS), numpy.array(HIGH_GAINS)
     inside_low = (low >= LOW_BOX[0] - 1e-9) & (low <= LOW_BOX[1] + 1e-9)
     inside_high = (high >= HIGH_BOX[0] - 1e-9) & (high <= HIGH_BOX[1] + 1e-9)
@@ -125,7 +125,9 @@ def inside_box() -> numpy.ndarray:
 
 
 def grid_errors(grid: numpy.ndarray, window: tuple[int, int] | None) -> numpy.ndarray:
-    """RMS of a window (None: the peak) in every cell, position and velocity, ``(2, 1 + resamples, 6, 8)``."""
+    """Return the RMS of a window (None: the peak) in every cell, position and velocity, ``(2, 1 + resamples, 6,
+    8)``.
+    """
     return numpy.moveaxis(rms(grid, window), (3, 2), (0, 1))
 
 
@@ -147,12 +149,12 @@ def grid_finding(errors: numpy.ndarray) -> GridFinding:
 
 
 def findings(r: Results, likelihood: Likelihood, window: tuple[int, int] | None) -> list[GridFinding]:
-    """Best gains for position and for velocity."""
+    """Return the best gains for position and for velocity."""
     return [grid_finding(errors) for errors in grid_errors(r.grids[likelihood], window)]
 
 
 def box_verdict(found: Sequence[GridFinding]) -> Verdict:
-    """Verdict on "the smallest error is in the recommended box", for position and velocity.
+    """Return the verdict on "the smallest error is in the recommended box", for position and velocity.
 
     A component holds if its minimum is in the box in ``CERTAIN`` of the bootstrap samples and no cell
     outside comes within ``NEAR_MINIMUM``. All hold: "reproduced"; none has its minimum there for certain:
@@ -164,7 +166,7 @@ def box_verdict(found: Sequence[GridFinding]) -> Verdict:
 
 
 def dominance_verdict(straight: Sequence[Quantity], turn: Quantity) -> Verdict:
-    """Verdict on "mode 1 dominates on the straight legs, mode 2 in the turn".
+    """Return the verdict on "mode 1 dominates on the straight legs, mode 2 in the turn".
 
     Args:
         straight: mean probability of mode 1 on each straight window.
@@ -174,14 +176,14 @@ def dominance_verdict(straight: Sequence[Quantity], turn: Quantity) -> Verdict:
 
 
 def ramps_begun(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
-    """Scans at which the adaptive filter began a ramp after the first one, ``(episodes, K)`` booleans."""
+    """Return the scans at which the adaptive filter began a ramp after the first one, ``(episodes, K)`` booleans."""
     alarms = numpy.abs(alpha - high) < 1e-9
     alarms[:, 0] = False
     return alarms
 
 
 def pair(squares: numpy.ndarray, window: tuple[int, int] | None) -> list[str]:
-    """Position and velocity RMS of a window, or their peaks: ``135.68 ± 0.31``, ``27.123 ± 0.021``."""
+    """Return the position and velocity RMS of a window, or their peaks: ``135.68 ± 0.31``, ``27.123 ± 0.021``."""
     position, velocity = map(quantity, rms(squares, window).T)
     return [f"{position:.2f}", f"{velocity:.3f}"]
 
@@ -209,7 +211,7 @@ AGAINST = (
 
 
 def _verdict_against(i: int, quantities: Any) -> Verdict:
-    """Verdict on C1 against one of those opponents."""
+    """Return the verdict on C1 against one of those opponents."""
     comparison: Comparison = quantities.against[i]
     return comparison.verdict
 
@@ -297,7 +299,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     comparison = comparisons(r)
     imm, adaptive = r.main["imm"].squares, r.main["adaptive"].squares
     best = findings(r, "gains used", WINDOWS["all"])
@@ -347,7 +349,9 @@ def _grid_text(found: Sequence[GridFinding]) -> str:
 
 
 def _handover(mean: numpy.ndarray) -> str:
-    """When the mean probability of mode 1, ``(K,)``, falls below one half in the turn, and comes back."""
+    """Return the scans at which the mean probability of mode 1, ``(K,)``, falls below one half in the turn, and
+    comes back.
+    """
     first = WINDOWS["turn"][0]
     scans = numpy.arange(1, len(mean) + 1)
     below = scans[(scans >= first) & (mean < 0.5)]
@@ -363,7 +367,7 @@ def _handover(mean: numpy.ndarray) -> str:
 
 
 def _straight(imm: numpy.ndarray, adaptive: numpy.ndarray) -> str:
-    """RMS on both straight legs, IMM against adaptive filter."""
+    """Return the RMS on both straight legs, IMM against adaptive filter."""
     straight = []
     for window in (WINDOWS["pre"], WINDOWS["post"]):
         rows = zip(pair(imm, window), pair(adaptive, window), changes(imm, adaptive, window), strict=True)
@@ -376,14 +380,14 @@ def _straight(imm: numpy.ndarray, adaptive: numpy.ndarray) -> str:
 
 
 def _detection_shares(alarms: numpy.ndarray, begins: int) -> str:
-    """Share of episodes by the scan of their first alarm, of those without one before the turn begins."""
+    """Return the share of episodes by the scan of their first alarm, of those without one before the turn begins."""
     later = alarms[:, begins - 1 :][~alarms[:, : begins - 1].any(axis=1)]
     detected = numpy.where(later.any(axis=1), later.argmax(axis=1) + begins, 0)
     return ", ".join(f"{k}: {(detected == k).mean():.3f}" for k in range(begins, begins + 4))
 
 
 def _readings(r: Results) -> str:
-    """Verdict on C2 and the best gains under the other readings of the covariance."""
+    """Return the verdict on C2 and the best gains under the other readings of the covariance."""
     return "; ".join(
         f"{LIKELIHOODS[kind]}: {box_verdict(found)} (position minimum at {found[0].gains[0]:g} / "
         f"{found[0].gains[1]:g}, box {found[0].inside_excess:+.1%} above it; velocity at {found[1].gains[0]:g} / "
@@ -394,7 +398,7 @@ def _readings(r: Results) -> str:
 
 
 def _others(comparison: Mapping[str, Comparison]) -> str:
-    """Experiments by their verdict on C1, against each adaptive filter."""
+    """Return the experiments by their verdict on C1, against each adaptive filter."""
     others: dict[tuple[str, Verdict], list[str]] = {}
     for name, change in comparison.items():
         experiment, _, opponent = name.partition("; against ")
@@ -408,7 +412,7 @@ def _others(comparison: Mapping[str, Comparison]) -> str:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Tables of the report; RMS along x, position in m / velocity in m/s."""
+    """Return the tables of the report; RMS along x, position in m / velocity in m/s."""
 
     def row(name: str, squares: numpy.ndarray, later: int = 0) -> list[str]:
         last = squares.shape[1]

@@ -50,7 +50,7 @@ NAMES = {
     "adaptive": "adaptive filter",
     "adaptive-rearm": "adaptive filter, re-arming",
     "kalman-imm": "IMM over two Kalman filters (acceleration 0 and 2.775 m/s^2)",
-    "known-turn": "Kalman filter told the turn's scans",
+    "known-turn": "Kalman filter given the turn's scans",
     "known-input-bound": "Cramer-Rao bound, acceleration known",
 }
 COMPARED_POLICIES = ("imm", "adaptive", "adaptive-rearm")
@@ -69,7 +69,9 @@ def mean_squares(error: numpy.ndarray) -> numpy.ndarray:
 
 
 def rms(squares: numpy.ndarray, window: tuple[int, int] | None) -> numpy.ndarray:
-    """Root of the mean over a window of scans, both ends included, of squares ``(..., K, 2)``; None: peak."""
+    """Return the root of the mean over a window of scans, both ends included, of squares ``(..., K, 2)``; None:
+    peak.
+    """
     if window is None:
         return numpy.sqrt(squares.max(axis=-2))
     return numpy.sqrt(squares[..., window[0] - 1 : window[1], :].mean(axis=-2))

@@ -14,7 +14,7 @@ from .gain_schedules import ramp_schedule
 
 
 def figures(r: Results) -> dict[str, tuple[Any, str]]:
-    """Figures and their captions."""
+    """Return the figures and their captions."""
     return {
         "figure_2_trajectory": (
             draw_trajectory(r), "Figure 2: the flight; one episode's measurements and estimate."
@@ -118,7 +118,7 @@ def draw_probabilities(r: Results) -> Any:
 
 
 def draw_gain_grid(r: Results) -> Any:
-    """Whole-run RMS of every pair of gains, with the recommended box and the cells close to the minimum."""
+    """Return the whole-run RMS of every pair of gains, with the recommended box and the cells close to the minimum."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Rectangle
 

@@ -29,7 +29,7 @@ class Flight(NamedTuple):
 
 
 def maneuver_flight(parameters: ManeuveringTargetParameters) -> Flight:
-    """X coordinate of a flight with one manoeuvre at stated scans (the paper's), K scans long."""
+    """Return the X coordinate of a flight with one manoeuvre at stated scans (the paper's), K scans long."""
     p, T = parameters, parameters.sampling_interval
     first, last = p.maneuver_steps
     scans = numpy.arange(1, p.horizon + 1)
@@ -55,7 +55,7 @@ class MeanSquares(NamedTuple):
 
 
 def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:
-    """Exact mean square of the error under a schedule of gains, beta by equation (21).
+    """Return the exact mean square of the error under a schedule of gains, beta by equation (21).
 
     Args:
         flight: what is followed; the track starts with the errors of (24).
@@ -87,7 +87,7 @@ def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:
 def ramp_schedule(
     low: float, high: float, horizon: int, detection: int | None = None, ramp_scans: int = 7
 ) -> numpy.ndarray:
-    """Position gains of the paper's adaptive filter when a manoeuvre is detected at a given scan, ``(K,)``.
+    """Return the position gains of the paper's adaptive filter when a manoeuvre is detected at a given scan, ``(K,)``.
 
     The gain falls linearly from ``high`` at scan 1 to ``low`` at scan 1 + ``ramp_scans``; at the detection it
     jumps to ``high`` and falls again.
@@ -100,9 +100,9 @@ def ramp_schedule(
 
 
 def best_schedule(flight: Flight) -> numpy.ndarray:
-    """Position gains of least summed mean-square position error: a floor for schedules, ``(K,)``.
+    """Return the position gains of least summed mean-square position error: a floor for schedules, ``(K,)``.
 
-    It is told the whole flight, so no causal policy should be expected to reach it; one that reacts to the
+    It is given the whole flight, so no causal policy should be expected to reach it; one that reacts to the
     data may do better all the same.
     """
     from scipy.optimize import minimize

@@ -17,7 +17,7 @@ from .alpha_beta_errors import variance_reduction
 
 
 class Recording(NamedTuple):
-    """What a radar saw of N episodes of K scans, and what was true."""
+    """Measurements of a radar and truth of N episodes of K scans."""
 
     start: numpy.ndarray
     """Estimate at scan 0: x, y (m), vx, vy (m/s), ``(4, N)``."""
@@ -38,7 +38,7 @@ Likelihood = Literal["gains used", "no spread", "Kalman", "R/(1-alpha)", "steady
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to fill what the paper leaves open; the default is the canonical one."""
+    """One way to fill the gaps of the paper; the default is the canonical one."""
 
     gains: tuple[float, ...] = (0.3, 0.7)
     stay: float = 0.9
@@ -53,13 +53,13 @@ class Reading:
 
 
 def _diagonal(values: numpy.ndarray) -> numpy.ndarray:
-    """Diagonal matrices ``(d, d, ...)`` of ``(d, ...)``."""
+    """Return the diagonal matrices ``(d, d, ...)`` of ``(d, ...)``."""
     d = len(values)
     return numpy.eye(d).reshape(d, d, *[1] * (values.ndim - 1)) * values
 
 
 def _kalman_covariance(P: numpy.ndarray, R: numpy.ndarray) -> numpy.ndarray:
-    """Covariance ``(2 d, 2 d, M, N)`` after an update with the optimal gain; R is ``(d, N)``."""
+    """Return the covariance ``(2 d, 2 d, M, N)`` after an update with the optimal gain; R is ``(d, N)``."""
     n, modes, lanes = len(P), P.shape[2], P.shape[3]
     repeated = _diagonal(numpy.tile(R, (1, modes)))
     nothing = numpy.zeros((n, modes * lanes))

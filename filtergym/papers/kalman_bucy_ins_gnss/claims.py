@@ -111,12 +111,12 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     a, b = roots(r)
     p, gains = PARAMETERS, dict(zip(("white", "reduced", "best"), GAINS.values(), strict=True))
 
     def change(name: str, other: str) -> Quantity:
-        """Relative change of the root mean square error, paired."""
+        """Return the relative change of the root mean square error, paired."""
         return quantity(numpy.sqrt(r.squares[name] / r.squares[other]) - 1.0)
 
     return {
@@ -141,7 +141,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Tables of the report."""
+    """Return the tables of the report."""
     a, b = roots(r)
     theory, exact, agreement = r.example.theory, exact_root_mean_squares(), riccati_agreement()
     return [

@@ -38,7 +38,7 @@ NAMES = {
     "best-constant": "plain, best constant gain",
     "augmented-gain": "plain, gain steered by an augmented filter",
     "augmented": "augmented",
-    "matched": "augmented, told the noise levels (reference)",
+    "matched": "augmented, given the noise levels (reference)",
 }
 DRIFTING = ("plain-white", "plain-reduced", "best-constant", "augmented")
 EXAMPLE_POLICIES = ("plain-white", "plain-reduced", "augmented")
@@ -132,7 +132,7 @@ def _model() -> tuple[Any, Any, Any, Any, Any]:
 
 
 def exact_plain(intensity: float, riccati: bool) -> float:
-    """Exact root mean square error from 2.5 to 5 s of the plain scheme, m."""
+    """Return the exact root mean square error from 2.5 to 5 s of the plain scheme, m."""
     p = PARAMETERS
     dynamics, growth, _, _, P = _model()
     Phi, Qd = van_loan(dynamics, growth, p.sampling_interval)
@@ -152,7 +152,7 @@ def exact_plain(intensity: float, riccati: bool) -> float:
 
 
 def exact_root_mean_squares() -> dict[str, float]:
-    """Exact root mean square error from 2.5 to 5 s, m, of every policy of ``NAMES`` that has a theory."""
+    """Return the exact root mean square error from 2.5 to 5 s, m, of every policy of ``NAMES`` that has a theory."""
     p = PARAMETERS
 
     def root(gain: list[float] | None) -> float:
@@ -194,7 +194,7 @@ class Agreement(NamedTuple):
 
 
 def closed_form(times: Any) -> numpy.ndarray:
-    """Covariance (5) of example (a)."""
+    """Return the covariance (5) of example (a)."""
     return kalman_bucy.riccati_scalar(A, INTENSITY, 1.0 / RECEIVER, 0.0, times)
 
 

@@ -11,7 +11,7 @@ from .experiment import DRIFT, GAINS, INTENSITY, LONG, NAMES, PARAMETERS, A, Res
 
 
 def figures(r: Results) -> dict[str, tuple[Any, str]]:
-    """Figures and their captions."""
+    """Return the figures and their captions."""
     return {
         "figure_2": (
             draw_first_order(r),
@@ -35,7 +35,7 @@ def _times(count: int) -> numpy.ndarray:
 
 
 def draw_first_order(r: Results) -> Any:
-    """Reference, process and estimate of one run, and root mean square differences over time."""
+    """Return the reference, process and estimate of one run, and root mean square differences over time."""
     figure, axes = panels(2, 1, (8.0, 7.2))
     time = r.example.time
     theta = kalman_bucy.moments(A, U, INTENSITY, 0, 0, time).covariance[:, 0, 0]
@@ -58,7 +58,7 @@ def draw_first_order(r: Results) -> Any:
 
 
 def draw_instruments(r: Results) -> Any:
-    """What the instruments say."""
+    """Draw the readings of the instruments."""
     figure, axes = panels(1, 1, (8.0, 3.6))
     run = r.paths["plain-reduced"]
     time = _times(len(run["ins"]))
@@ -73,7 +73,7 @@ def draw_instruments(r: Results) -> Any:
 
 
 def draw_estimates(r: Results) -> Any:
-    """Estimates of the same run, and their errors."""
+    """Return the estimates of the same run, and their errors."""
     figure, axes = panels(2, 1, (8.0, 7.2))
     reference = r.paths["plain-reduced"]["reference"]
     time = _times(len(reference))

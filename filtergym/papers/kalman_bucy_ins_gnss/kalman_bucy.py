@@ -53,7 +53,7 @@ def _information(C: ArrayLike, Q: ArrayLike, size: int) -> Matrix:
 
 
 def riccati_scalar(a: float, w: float, s: float, R0: float, times: ArrayLike) -> Matrix:
-    """Covariance (5) of a scalar model with constant coefficients, in closed form.
+    """Return the covariance (5) of a scalar model with constant coefficients, in closed form.
 
     With ``gamma = sqrt(a^2 + w s)`` and ``u = tanh(gamma t) / gamma`` (``t`` where gamma is zero),
     ``R = (R0 (1 + a u) + w u) / (1 + (s R0 - a) u)``. It equals the usual form
@@ -93,7 +93,7 @@ def riccati_hamiltonian(
     R0: ArrayLike,
     times: ArrayLike,
 ) -> Matrix:
-    """Covariance (5) by the exponential of the Hamiltonian matrix, exact for constant coefficients.
+    """Return the covariance (5) by the exponential of the Hamiltonian matrix, exact for constant coefficients.
 
     ``d/dt [P1; P2] = [[-A^T, C^T Q^-1 C], [BGB^T, A]] [P1; P2]``, ``P1(0) = I``, ``P2(0) = R0``,
     ``R = P2 P1^-1``. P1 grows without limit and its columns become parallel, so the solution is restarted.
@@ -136,7 +136,7 @@ def riccati_hamiltonian(
 def riccati_ode(
     A: ArrayLike, BGBt: ArrayLike, C: ArrayLike, Q: ArrayLike, R0: ArrayLike, times: ArrayLike
 ) -> Matrix:
-    """Covariance (5) by numerical integration (Runge-Kutta of order 8, relative tolerance 1e-11).
+    """Return the covariance (5) by numerical integration (Runge-Kutta of order 8, relative tolerance 1e-11).
 
     Arguments, result and errors as in :func:`riccati_hamiltonian`.
     """
@@ -173,7 +173,7 @@ class Moments(NamedTuple):
 def moments(
     A: ArrayLike, U: ArrayLike, BGBt: ArrayLike, m0: ArrayLike, Theta0: ArrayLike, times: ArrayLike
 ) -> Moments:
-    """Mean and covariance of the process by equations (6), exact for constant coefficients and input.
+    """Return the mean and covariance of the process by equations (6), exact for constant coefficients and input.
 
     Args:
         A: ``(n, n)``, 1/s.
@@ -226,7 +226,7 @@ def sampled_covariance(
     duration: float,
     gain: ArrayLike | None = None,
 ) -> SampledCovariance:
-    """Error covariance of the filter that samples every ``step`` seconds, exact.
+    """Return the error covariance of the filter that samples every ``step`` seconds, exact.
 
     The measurement of one step has the variance ``Q / step``. The optimal sampled filter agrees with (5) at
     first order only, ``updated = R (1 - K step / 2)`` and ``predicted = R (1 + K step / 2)`` (scalar C = 1);

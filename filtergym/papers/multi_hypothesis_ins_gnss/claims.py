@@ -42,7 +42,7 @@ COORDINATE_LOSS = 0.10
 
 
 def matched_verdict(coordinates: Sequence[Quantity], others: Sequence[Quantity]) -> Verdict:
-    """Verdict on "at most 10 % in coordinates, the other components close".
+    """Return the verdict on "at most 10 % in coordinates, the other components close".
 
     Args:
         coordinates: ratios of the RMS position error, adaptive to matched.
@@ -55,7 +55,7 @@ def matched_verdict(coordinates: Sequence[Quantity], others: Sequence[Quantity])
 
 
 def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verdict:
-    """Verdict on "the loss comes from the weights of the other channels".
+    """Return the verdict on "the loss comes from the weights of the other channels".
 
     Reproduced if the loss in coordinates vanishes (less than 0.1 %) where the other channels have less than a
     thousandth of the weight, is certain where they have most, and the settings come in the same order by
@@ -71,17 +71,17 @@ def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verd
 
 
 def in_band(found: Loss) -> bool:
-    """Whether the tracks are lost when the paper says."""
+    """Return whether the tracks are lost in the paper's time."""
     return found.rate > 0.95 and BAND[0] <= found.median <= BAND[1]
 
 
 def loss_verdict(increment: Loss, kinematic: Loss) -> Verdict:
-    """Verdict on "the non-adaptive measurer loses track 0.5 to 1 s after the manoeuvre begins"."""
+    """Return the verdict on "the non-adaptive measurer loses track 0.5 to 1 s after the manoeuvre begins"."""
     return verdict_of([in_band(increment), in_band(kinematic)])
 
 
 def adaptation_verdict(with_rates: Sequence[Wait], without: Wait) -> Verdict:
-    """Verdict on "adaptation takes 0.01 to 0.45 s".
+    """Return the verdict on "adaptation takes 0.01 to 0.45 s".
 
     Reproduced if every mean lies within the band and the band is filled: one step at the lower end, and at the
     upper end at least two thirds of 0.45 s, with all sensors in use; in part if without rates only.
@@ -97,7 +97,7 @@ def adaptation_verdict(with_rates: Sequence[Wait], without: Wait) -> Verdict:
 
 
 def stability_verdict(found: Sequence[Loss]) -> Verdict:
-    """Verdict on "the adaptive measurer stays stable"."""
+    """Return the verdict on "the adaptive measurer stays stable"."""
     return "reproduced" if all(f.rate == 0.0 for f in found) else "not reproduced"
 
 
@@ -105,7 +105,7 @@ def stability_verdict(found: Sequence[Loss]) -> Verdict:
 
 
 def matched_ratios(runs: dict[str, Run]) -> list[Quantity]:
-    """RMS of the adaptive measurer over Singer's on Singer's motion: position, velocity, acceleration."""
+    """Return the RMS of the adaptive measurer over Singer's on Singer's motion: position, velocity, acceleration."""
     return [ratio(runs[ADAPTIVE], runs["Singer"], c, MATCHED_WINDOW) for c in range(3)]
 
 
@@ -173,7 +173,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     increment, kinematic = r.courses.values()
     adaptive, free, best = (increment[name] for name in (ADAPTIVE, "Singer, no aperture", "known mode"))
     few = len(free.nis)
@@ -232,7 +232,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Tables of the report."""
+    """Return the tables of the report."""
     header = [
         "filter",
         "leg",

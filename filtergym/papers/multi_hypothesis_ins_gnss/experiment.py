@@ -105,7 +105,7 @@ class Run(NamedTuple):
         return Run(*(series[first:end] for series in self))
 
     def rms(self, component: int, window: tuple[int, int]) -> numpy.ndarray:
-        """Root of the mean square over runs and the steps of a window, ``(1 + resamples,)``."""
+        """Return the root of the mean square over runs and the steps of a window, ``(1 + resamples,)``."""
         return numpy.sqrt(means(self.squares[:, window[0] - 1 : window[1], component].mean(axis=1)))
 
     @property
@@ -115,7 +115,7 @@ class Run(NamedTuple):
 
 
 def ratio(ours: Run, theirs: Run, component: int, window: tuple[int, int]) -> Quantity:
-    """Ratio of RMS errors, paired."""
+    """Return the ratio of RMS errors, paired."""
     return quantity(ours.rms(component, window) / theirs.rms(component, window))
 
 
@@ -252,7 +252,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
 
 
 class Loss(NamedTuple):
-    """How many tracks are lost, and when."""
+    """Lost tracks: their number, and times."""
 
     rate: float
     median: float
@@ -269,7 +269,7 @@ class Loss(NamedTuple):
 
 
 def loss(run: Run, motion: int) -> Loss:
-    """Loss of track after the motion that begins on a step."""
+    """Return the loss of track after the motion that begins on a step."""
     outside = lasting(run.outside[:, motion - 1 :])
     lost = outside.any(axis=1)
     if not lost.any():
@@ -295,7 +295,7 @@ class Wait(NamedTuple):
 
 
 def waits_of(run: Run, before: int, after: int) -> Wait:
-    """Adaptation times of one kind of switch."""
+    """Return the adaptation times of one kind of switch."""
     found = switches(run.true_mode, run.probability)
     waits = numpy.array([s.wait * T for s in found if (s.before, s.after) == (before, after)])
     finite = waits[numpy.isfinite(waits)]

@@ -16,7 +16,7 @@ LEAST = 0.01
 
 
 def figures(r: Results) -> dict[str, tuple[Any, str]]:
-    """Figures and their captions."""
+    """Return the figures and their captions."""
     runs, few = (len(r.courses["increment"][name].nis) for name in (ADAPTIVE, "Singer"))
     return {
         "figure_1_errors": (
@@ -92,7 +92,7 @@ def draw_probabilities(r: Results) -> Any:
 
 
 def draw_loss_times(r: Results) -> Any:
-    """Loss time of Singer's filter at every setting, with the band of the paper."""
+    """Return the loss time of Singer's filter at every setting, with the band of the paper."""
     figure, grid = panels(1, 1, (8.0, 4.6))
     axis = grid[0, 0]
     lost, kept = (style["color"] for style in styles(["lost", "kept"]).values())
@@ -115,7 +115,7 @@ def draw_loss_times(r: Results) -> Any:
 
 
 def draw_matched(r: Results) -> Any:
-    """Loss against the matched filter over the mean weight of the other channels."""
+    """Return the loss against the matched filter over the mean weight of the other channels."""
     figure, grid = panels(1, 1, (8.0, 4.4))
     axis = grid[0, 0]
     names = [name for name, _ in COMPONENTS[:3]]

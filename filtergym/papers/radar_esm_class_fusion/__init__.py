@@ -2,13 +2,13 @@
 
 The paper shows curves without legible numbers. Its experiment leaves open the duration, the manoeuvre noise,
 the composition of the classes and the rest that :class:`.RadarEsmTrackingParameters` marks "ours", so claims
-are tested on sizes that those choices give, and a list of variants says what depends on them.
+are tested on sizes that those choices give, and a list of variants shows what depends on them.
 
 Errors of a filter of one fixed class are exact (covariance recursion of truth and error together); those of
 the adaptive filter are root-mean-squares over episodes.
 
 Reading: the "posterior" deviations of figures 2 to 4 belong to one run "corresponding to figure 1", so they
-are most likely the filters' own; both those and the errors really made are drawn and told apart.
+are most likely the filters' own; both those and the actual errors are drawn, each by its name.
 """
 
 from ...evaluation.running.parallel import Workers

@@ -35,14 +35,15 @@ SECONDS = (2, 5, 10, 20, 30, 60)
 
 
 def recognition_verdict(at_30: Sequence[Quantity]) -> Verdict:
-    """Verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNITION_PROBABILITY`` in all classes,
-    in some, or in none.
+    """Return the verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNITION_PROBABILITY`` in all
+    classes, in some, or in none.
     """
     return verdict_of(m.low >= RECOGNITION_PROBABILITY for m in at_30)
 
 
 def approach_verdict(excess: Sequence[Sequence[Quantity]]) -> Verdict:
-    """Verdict on D2: the error is within ``CLOSE`` of the ideal filter's, late in all classes, or sooner in some.
+    """Return the verdict on D2: the error is within ``CLOSE`` of the ideal filter's, late in all classes, or sooner in
+    some.
 
     Args:
         excess: relative excess of the RMSE of each class, at 10-30 s and after 30 s.
@@ -53,7 +54,7 @@ def approach_verdict(excess: Sequence[Sequence[Quantity]]) -> Verdict:
 
 
 class Variant(NamedTuple):
-    """What a variant of the experiment gives for one class."""
+    """Result of a variant of the experiment for one class."""
 
     recognised: float
     """Median time of the first P >= 0.9, s."""
@@ -67,7 +68,7 @@ class Variant(NamedTuple):
 
 
 def variant(r: Results, name: str, s: int) -> Variant:
-    """Results of a variant for targets of one class."""
+    """Return the results of a variant for targets of one class."""
     fused, radar = r.variants[name]
     of = fused.true_class == s
     if not of.any():
@@ -172,7 +173,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     early, middle, _ = WINDOWS.values()
     printed, joint = r.fixed_type["quasi-optimal"], r.fixed_type["joint-type"]
     fighter = (printed.true_class == 2) & (printed.true_type == 1)
@@ -238,7 +239,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Tables of the report."""
+    """Return the tables of the report."""
     errors = [
         [
             f"{name} {component}, {unit}",

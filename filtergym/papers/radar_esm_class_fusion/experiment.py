@@ -23,7 +23,7 @@ COMPONENTS = (("range", "m"), ("range rate", "m/s"), ("acceleration", "m/s²"))
 CLASSES = ("S0", "S1", "S2")
 INTERVAL = RadarEsmTrackingParameters.sampling_interval
 WORTHLESS_RATE = 1e4
-"""m/s: a radial velocity measured with this error says no more than two ranges half a second apart."""
+"""m/s: a radial velocity with this error is no better than two ranges half a second apart."""
 
 
 def channel_error_covariance(
@@ -33,7 +33,7 @@ def channel_error_covariance(
     channel: int,
     start: numpy.ndarray,
 ) -> numpy.ndarray:
-    """Exact error covariance of the filter of one class on a target of another, ``(n, n, K + 1)``.
+    """Return the exact error covariance of the filter of one class on a target of another, ``(n, n, K + 1)``.
 
     Truth and error e = estimate - truth obey one linear recursion of 2 n states,
 
@@ -76,7 +76,7 @@ def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
 
 
 def leaking(probability: float) -> tuple[tuple[float, ...], ...]:
-    """Class transition matrix that leaves each class with a probability, equally for the others."""
+    """Return the class transition matrix that leaves each class with a probability, equally for the others."""
     return tuple(
         tuple(1.0 - probability if i == j else probability / 2.0 for j in range(3)) for i in range(3)
     )
@@ -99,12 +99,12 @@ STEPS = 3 * len(CLASSES) + 2 + 2 + 2 * len(VARIANTS)
 
 
 def parameters(variant: str = "as in the main experiment") -> RadarEsmTrackingParameters:
-    """Parameters of scenario ``paper`` in a variant."""
+    """Return the parameters of scenario ``paper`` in a variant."""
     return make_task(RadarEsmTracking, "paper", **VARIANTS[variant]).parameters
 
 
 def exact_mean_squares(p: RadarEsmTrackingParameters, target: int, channel: int) -> numpy.ndarray:
-    """Exact mean square error of one class's filter on a target of another, scans 1 to K, ``(3, K)``."""
+    """Return the exact mean square error of one class's filter on a target of another, scans 1 to K, ``(3, K)``."""
     models, start = RadarEsmTracking.design_models(p)
     channels = class_fusion.design_channels(models, start, p.horizon)
     joint = numpy.zeros((6, 6))
@@ -117,12 +117,12 @@ def exact_mean_squares(p: RadarEsmTrackingParameters, target: int, channel: int)
 
 
 def rms(mean_square: numpy.ndarray, window: tuple[int, int]) -> float:
-    """Root of the mean over a window of scans, of a mean square ``(K,)``."""
+    """Return the root of the mean over a window of scans, of a mean square ``(K,)``."""
     return math.sqrt(mean_square[window[0] - 1 : window[1]].mean())
 
 
 class Run(NamedTuple):
-    """What is kept of a policy over some episodes; ``of`` chooses some of them."""
+    """Records of a policy over some episodes; ``of`` chooses some of them."""
 
     error: numpy.ndarray
     """Estimate minus truth, ``(episodes, K, 3)``."""
@@ -150,23 +150,25 @@ class Run(NamedTuple):
         return mean(self.true_probability[of][:, round(second / INTERVAL) - 1])
 
     def recognition(self, share: float, of: Any = ...) -> float:
-        """Time by which a share of the runs has had P(true class) >= 0.9 once, s; infinite if fewer have."""
+        """Return the time by which a share of the runs has had P(true class) >= 0.9 once, s; infinite if fewer
+        have.
+        """
         sure = self.true_probability[of] >= SURE
         return _quantile(numpy.where(sure.any(axis=1), sure.argmax(axis=1), math.inf), share)
 
     def settling(self, share: float) -> float:
-        """Time after which a share of the runs keeps P(true class) >= 0.9 to the end, s."""
+        """Return the time after which a share of the runs keeps P(true class) >= 0.9 to the end, s."""
         unsure = self.true_probability < SURE
         last = numpy.where(unsure.any(axis=1), unsure.shape[1] - unsure[:, ::-1].argmax(axis=1), 0)
         return _quantile(numpy.where(last < unsure.shape[1], last, math.inf), share)
 
     def wrong(self) -> numpy.ndarray:
-        """Whether a wrong class has P >= 0.9, ``(episodes, K)``."""
+        """Return whether a wrong class has P >= 0.9, ``(episodes, K)``."""
         other = numpy.arange(len(CLASSES)) != self.true_class[:, None, None]
         return ((self.probability >= SURE) & other).any(axis=2)
 
     def sure_and_wrong(self, of: Any = ...) -> Quantity:
-        """Share of runs that end with P >= 0.9 for a wrong class."""
+        """Return the share of runs that end with P >= 0.9 for a wrong class."""
         return mean(self.wrong()[of][:, -1].astype(float))
 
     def calibration(self, window: tuple[int, int]) -> list[Quantity]:
@@ -217,12 +219,12 @@ class Results(NamedTuple):
     """Adaptive filter and radar alone, by name of the variant."""
 
     def excess(self, s: int, component: int, window: tuple[int, int]) -> Quantity:
-        """RMSE of the adaptive filter over the ideal one's on targets of class s, minus one."""
+        """Return the RMSE of the adaptive filter over the ideal one's on targets of class s, minus one."""
         ideal = rms(self.exact[s, s][component], window)
         return quantity(numpy.sqrt(self.fused[s].mean_square(component, window)) / ideal - 1.0)
 
     def gain(self, s: int, component: int, window: tuple[int, int]) -> Quantity:
-        """RMSE of the non-adaptive filter over the adaptive one's."""
+        """Return the RMSE of the non-adaptive filter over the adaptive one's."""
         fixed = rms(self.exact[s, 2][component], window)
         return quantity(fixed / numpy.sqrt(self.fused[s].mean_square(component, window)))
 

@@ -15,7 +15,7 @@ FILTERS = {"non-adaptive": 1.8, "ideal": 3.2, "synthesised": 1.4}
 
 
 def figures(r: Results) -> dict[str, tuple[Any, str]]:
-    """Figures and their captions."""
+    """Return the figures and their captions."""
     found = {
         "figure_1_probabilities": (draw_probabilities(r), "Figure 1: class probabilities, true class S0.")
     }
@@ -61,7 +61,7 @@ def draw_probabilities(r: Results) -> Any:
 
 
 def draw_deviation(r: Results, component: int) -> Any:
-    """Figures 2 to 4: deviation of a component on S0, as the filters report it and as it is."""
+    """Return the figures 2 to 4: deviation of a component on S0, as the filters report it and as it is."""
     from matplotlib.lines import Line2D
 
     figure, grid = panels(1, 1, (8.0, 4.2))
@@ -94,7 +94,7 @@ def draw_deviation(r: Results, component: int) -> Any:
 
 
 def draw_classes(r: Results) -> Any:
-    """Errors really made in the acceleration, all three classes."""
+    """Return the errors really made in the acceleration, all three classes."""
     figure, grid = panels(1, 3, (11.0, 3.8))
     for s, axis in enumerate(grid[0]):
         squares = (r.exact[s, 2][2], r.exact[s, s][2], (r.fused[s].error[:, :, 2] ** 2).mean(axis=0))
@@ -115,7 +115,7 @@ def draw_classes(r: Results) -> Any:
 
 
 def draw_fixed_type(r: Results) -> Any:
-    """Share of runs that are sure of a wrong class over time, for targets of one type each."""
+    """Return the share of runs that are sure of a wrong class over time, for targets of one type each."""
     figure, grid = panels(1, 2, (10.0, 3.9))
     names = {"quasi-optimal": "printed rule (8)", "joint-type": "joint posterior of type and class"}
     for name, style in looks(names).items():

@@ -29,7 +29,7 @@ SCALES = (0.01, 1.0, 100.0)
 
 
 def _excess(datasets: dict[str, Any]) -> str:
-    """Cost of the paper's filter above that of the filter told the noise, and its consistency."""
+    """Return the cost of the paper's filter above that of the filter given the noise, and its consistency."""
     ours, best = (datasets[name]["cost"].values.mean(axis=1) for name in ("kalman", "matched"))
     nees = datasets["kalman"]["nees"].values.mean() / datasets["kalman"].sizes["component"]
     return f"{quantity(means(ours) / means(best) - 1.0):.0%}, NEES {nees:.1f} per coordinate"
@@ -99,7 +99,7 @@ CLAIMS = (
     Statement(
         "8",
         "What happens when the noise is not constant and not known, as the paper assumes?",
-        "cost of the paper's filter above that of the filter told the noise: {excess}",
+        "cost of the paper's filter above that of the filter given the noise: {excess}",
         "scenario random, {r.episodes} episodes, same noise; a consistent filter has NEES 1 per coordinate",
     ),
 )
@@ -107,7 +107,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """What the claims rest on."""
+    """Return the quantities of the claims."""
     plants = ("P, H = I", "U")
     ours = P, U = [r.noise[plant]["kalman"] for plant in plants]
     raw = [r.noise[plant]["raw-sensors"] for plant in plants]
@@ -152,7 +152,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Tables of the report."""
+    """Return the tables of the report."""
     rows = []
     for case, loops in r.noise.items():
         for name, s in loops.items():

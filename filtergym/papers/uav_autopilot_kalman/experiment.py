@@ -1,4 +1,4 @@
-"""The loop of aircraft, filter and controller: its runs, and what linear theory says about it."""
+"""The loop of aircraft, filter and controller: its runs, and its linear theory."""
 
 import math
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ class Signals:
     """Control plus white noise, plant P; control, plant U."""
 
     def text(self, name: str, digits: int = 4, times: slice = STEADY_WINDOW) -> str:
-        """Mean of a signal over runs and time."""
+        """Return the mean of a signal over runs and time."""
         return f"{mean(getattr(self, name)[:, times].mean(axis=1)):.{digits}f}"
 
     def variance(self, name: str) -> float:
@@ -119,12 +119,12 @@ class Results(NamedTuple):
     """Datasets of the policies of ``RANDOM`` on scenario ``random``, by plant."""
 
     def response(self, case: str) -> numpy.ndarray:
-        """Output after a unit step, ``(K - STEP_TIME + 1,)``."""
+        """Return the output after a unit step, ``(K - STEP_TIME + 1,)``."""
         # Linear loop, same noise: the difference of the runs is the response without noise, exactly.
         return (self.step[case].output - self.noise[case]["kalman"].output).mean(axis=0)[STEP_TIME - 1 :]
 
     def transient(self, case: str) -> tuple[float, float, float]:
-        """Overshoot, time to 90 % and time to stay within 5 %, s."""
+        """Return the overshoot, time to 90 % and time to stay within 5 %, s."""
         y, T = self.response(case), interval(self.step[case].task)
         outside = numpy.flatnonzero(numpy.abs(y - 1.0) > 0.05)
         return max(float(y.max()) - 1.0, 0.0), float(numpy.argmax(y >= 0.9)) * T, float(outside[-1] + 1) * T
@@ -186,31 +186,31 @@ def matrices(task: UavAutopilot) -> Loop:
 
 
 def interval(task: UavAutopilot) -> float:
-    """T, s."""
+    """Return the T, s."""
     return float(task.parameters.value("sampling_interval"))
 
 
 def innovation_variance(task: UavAutopilot) -> float:
-    """Settled variance of the output's innovation."""
+    """Return the settled variance of the output's innovation."""
     d, shown = task.design, task.measured.index(task.output)
     return float((d.H @ d.steady.predicted @ d.H.T + d.R)[shown, shown])
 
 
 def spectrum(values: numpy.ndarray, T: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Frequencies, Hz, and averaged periodogram, unit squared per Hz."""
+    """Return the frequencies, Hz, and averaged periodogram, unit squared per Hz."""
     n = values.shape[1]
     power = (numpy.abs(numpy.fft.rfft(values, axis=1)) ** 2).mean(axis=0) * T / n
     return numpy.fft.rfftfreq(n, T), power
 
 
 def flatness(values: numpy.ndarray) -> float:
-    """Geometric over arithmetic mean of the averaged periodogram: one for white noise."""
+    """Return the geometric over arithmetic mean of the averaged periodogram: one for white noise."""
     power = spectrum(values, 1.0)[1]
     return float(numpy.exp(numpy.log(power).mean()) / power.mean())
 
 
 def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Spectra of the nodes of the settled loop, white-noise input, from its transfer functions."""
+    """Return the spectra of the nodes of the settled loop, white-noise input, from its transfer functions."""
     (F, B, H, L, K, Q, R), T = matrices(task), interval(task)
     n, m = len(F), len(R)
     loop = linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)
@@ -245,7 +245,7 @@ def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, nu
 
 
 def settled_output(task: UavAutopilot, predicts_command: bool) -> float:
-    """Output at which a unit command settles.
+    """Return the output at which a unit command settles.
 
     Args:
         task: whose loop it is.
@@ -274,7 +274,7 @@ def loop_theory(task: UavAutopilot, scale: float) -> tuple[float, float, float]:
 
 
 def covariances(task: UavAutopilot, **changes: Any) -> numpy.ndarray:
-    """Recursion (12): sigma of the output's estimate, gain on the integrating mode, ``(2, TWO_MINUTES)``.
+    """Return the recursion (12): sigma of the output's estimate, gain on the integrating mode, ``(2, TWO_MINUTES)``.
 
     The mode's coordinate is ``w^T x`` with ``w^T F = w^T``, scaled to contain the output once.
     """
@@ -296,7 +296,7 @@ def covariances(task: UavAutopilot, **changes: Any) -> numpy.ndarray:
 
 
 def covariance_curves(task: UavAutopilot) -> dict[str, numpy.ndarray]:
-    """Recursion (12) of plant U where its correcting term bounds the covariance and where it does not."""
+    """Return the recursion (12) of plant U where its correcting term bounds the covariance and where it does not."""
     names = [c.name for c in task.components]
     H = numpy.eye(len(names))
     rate, elevator = names.index("rate"), names.index("elevator")
