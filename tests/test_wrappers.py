@@ -14,6 +14,7 @@ from filtergym import Sensor
 from filtergym.wrappers import (
     CLASSIC_CONTROL,
     EnvironmentModel,
+    EnvironmentSensor,
     EstimatedObservation,
     NoisyObservation,
     fit_model,
@@ -180,7 +181,7 @@ def readings_of(sensors, steps, model=None, name="Pendulum-v1", lanes=200):
 
 def test_noise_has_the_covariance_that_is_stated():
     R = [[0.04, 0.01], [0.01, 0.09]]
-    values, received = readings_of({"both": {"h": ["angle", "rate"], "R": R}}, 100)
+    values, received = readings_of({"both": {"h": ["angle", "rate"], "R": R}}, 100, name="CartPole-v1")
     # 20,000 independent numbers: their variance is known to 1 %.
     np.testing.assert_allclose(np.cov(values.reshape(-1, 2).T), R, atol=0.003)
     np.testing.assert_allclose(values.mean(axis=(0, 1)), 0.3, atol=0.01)
@@ -230,6 +231,67 @@ def test_agents_meet_the_same_noise():
         angle = np.arctan2(*env.unwrapped._get_obs()[[1, 0]].astype(float))
         found.append(env.reading.values[0, 0] - angle)
     assert found[0] == pytest.approx(found[1], abs=1e-12)
+
+
+def test_a_measured_angle_is_an_angle_in_whatever_form_it_is_named():
+    forms = [
+        {"h": "angle", "R": 0.01}, {"h": 0, "R": 0.01}, {"h": [[1.0, 0.0]], "R": 0.01},
+        EnvironmentSensor(h="angle", R=0.01), Sensor(h=[[1.0, 0.0]], R=[[0.01]]),
+    ]  # fmt: skip
+    found = []
+    for sensor in forms:
+        env = wrapped("Pendulum-v1", {"encoder": sensor}, show=ALL)
+        env.reset(seed=3)
+        found.append([env.step([2.0])[0] for _ in range(100)])
+        assert np.abs(np.array(found)[..., -1]).max() < np.pi
+    for one in found[1:]:
+        np.testing.assert_array_equal(one, found[0])
+
+
+def test_lanes_without_a_seed_go_on():
+    env = vector.NoisyObservation(
+        gymnasium.make_vec("Pendulum-v1", num_envs=3, vectorization_mode="sync"), ENCODER
+    )
+    env.reset(seed=[4, 5, None])
+    env.reset(seed=[None, 8, None])
+    single = NoisyObservation(gymnasium.make("Pendulum-v1"), ENCODER)
+    single.reset(seed=4)
+    single.reset()
+    np.testing.assert_array_equal(env.reading.values[0], single.reading.values[0])
+    single.reset(seed=8)
+    np.testing.assert_array_equal(env.reading.values[1], single.reading.values[0])
+
+
+def test_mixed_readings_have_the_same_bits_in_any_number_of_lanes():
+    R = [[0.04, 0.01, 0.02], [0.01, 0.09, 0.03], [0.02, 0.03, 0.05]]
+    sensors = {"mixed": {"h": np.random.default_rng(0).normal(size=(3, 4)), "R": R}}
+    found = [readings_of(sensors, 20, name="CartPole-v1", lanes=count)[0] for count in (1, 5, 64)]
+    for one in found[1:]:
+        np.testing.assert_array_equal(one[:, :1], found[0])
+
+
+def test_readings_of_whole_numbers_are_not_whole():
+    env = gymnasium.make("MountainCar-v0")
+    env.observation_space = gymnasium.spaces.Box(0, 255, (2,), dtype=np.uint8)
+    env = NoisyObservation(env, {"position": {"h": np.int64(0), "R": 1e-4}})
+    found, _ = env.reset(seed=0)
+    assert found.dtype == np.float32
+    assert found == pytest.approx(env.unwrapped.state[0], abs=0.06)
+
+
+def test_a_filter_that_is_lost_begins_anew():
+    model = EnvironmentModel(
+        names=("p", "v"), f=lambda x, dt: [x[0] * 1e12, x[1]], interval=1.0, noise=(1.0, 1.0), mean=(0.5, 0.1),
+        covariance=(1.0, 4.0),
+    )  # fmt: skip
+    env = NoisyObservation(gymnasium.make("MountainCar-v0"), {"v": {"h": 1, "R": 1.0}}, model)
+    env = EstimatedObservation(env, show=("mean", "deviation"))
+    env.reset(seed=0)
+    found = np.array([env.step(1)[0] for _ in range(20)])
+    assert np.isfinite(env.estimates.mean).all()
+    lost = found[:, 0] == 0.5
+    assert 0 < lost.sum() < 20
+    np.testing.assert_allclose(found[lost] - np.array([0.5, 0.1, 1.0, 2.0]), 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("control", ["noise", "gain"])
@@ -363,6 +425,24 @@ def pendulum(**sensor):
         (lambda: pendulum(delay=-1), "delay of a sensor"),
         (lambda: pendulum(quantum=-1), "quantum of a sensor"),
         (lambda: pendulum(speed=1), "must be a Sensor, or a mapping"),
+        (lambda: pendulum(h=["angle", "rate"]), "one sensor to each kind"),
+        (lambda: pendulum(h=True), "component True"),
+        (lambda: pendulum(R=np.nan), "positive definite"),
+        (
+            lambda: NoisyObservation(
+                gymnasium.wrappers.TimeAwareObservation(gymnasium.make("CartPole-v1")), ENCODER
+            ),
+            "the observation has 5 fields",
+        ),
+        (lambda: NoisyObservation(gymnasium.make("Pendulum-v1", g=9.81), ENCODER), "g = 9.81"),
+        (
+            lambda: EstimatedObservation(
+                NoisyObservation(
+                    gymnasium.wrappers.RescaleAction(gymnasium.make("Pendulum-v1"), -1, 1), ENCODER
+                )
+            ),
+            "below wrappers that change the action",
+        ),
         (lambda: NoisyObservation(gymnasium.make("Pendulum-v1"), {}), "at least one"),
         (lambda: NoisyObservation(gymnasium.make("Pendulum-v1"), ENCODER, model="Pong"), "one of CartPole"),
         (

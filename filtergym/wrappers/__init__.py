@@ -79,6 +79,14 @@ def check_model(
             f"the action space is {space}, and the model takes {', '.join(model.inputs)}: give the model "
             "action=, a function from actions to these inputs"
         )
+    bounded = isinstance(space, gymnasium.spaces.Box) and space.is_bounded()
+    if model in CLASSIC_CONTROL.values() and bounded:
+        largest = inputs_of(model, numpy.full((1, *space.shape), 1e9))  # type: ignore[misc]
+        if (largest != space.high).any():  # type: ignore[attr-defined]
+            raise ValueError(
+                f"the action space is {space}, and the model takes actions of the environment itself: let "
+                "EstimatedObservation stand below wrappers that change the action, or give a model with action="
+            )
     if model.inputs:
         example: Any = gymnasium.vector.utils.create_empty_array(space, 1, fn=numpy.zeros)
         found = inputs_of(model, example)
@@ -119,6 +127,34 @@ def joint_space(env: gymnasium.Space[Any], own: gymnasium.Space[Any] | None) -> 
     return gymnasium.spaces.Tuple((env, own))
 
 
+def readings_of(
+    space: Any, model: EnvironmentModel | None, given: Any, lanes: int
+) -> tuple[dict[str, EnvironmentSensor], Readings, gymnasium.spaces.Box]:
+    """Return sensors, their readings, and the space of these in one lane.
+
+    Raises:
+        ValueError: for sensors that do not fit, or observations of which the model makes no state.
+    """
+    size = n = space.shape[0]
+    if model is not None:
+        n = len(model.names)
+        try:
+            fits = model.state(numpy.zeros((1, size))).shape == (1, n)
+        except IndexError:
+            fits = False
+        if not fits:
+            raise ValueError(
+                f"the observation has {size} fields, of which the model does not make its state of {n}, "
+                f"{', '.join(model.names)}: let NoisyObservation stand below wrappers that change the observation, or "
+                "give a model whose state= reads it"
+            )
+    sensors, interval = sensors_of(model, given, size)
+    readings = Readings(sensors, n, interval, lanes)
+    dtype: Any = space.dtype if numpy.issubdtype(space.dtype, numpy.floating) else numpy.dtype(numpy.float32)
+    limit = readings.limit.astype(dtype)
+    return sensors, readings, gymnasium.spaces.Box(-limit, limit, dtype=dtype)
+
+
 class NoisyObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """Readings of sensors in place of the full observation.
 
@@ -131,7 +167,8 @@ class NoisyObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Re
         sensors: by their names: :class:`filtergym.Sensor`, :class:`EnvironmentSensor`, or mappings of their fields,
             such as ``{"encoder": {"h": "angle", "R": 0.01}}``, which a spec stores as JSON.
         model: of the environment, whose state the sensors read, see :func:`.models.find_model`; default: that of the
-            environment where it is known; otherwise its observation is the state, and ``h`` numbers its fields.
+            environment where it is known; otherwise its observation is the state, ``h`` numbers its fields, and the
+            ``interval`` of a sensor is one of steps.
 
     Raises:
         ValueError: for an observation that is no vector, and sensors that do not fit.
@@ -142,27 +179,20 @@ class NoisyObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Re
             self, sensors=sensors, model=model, _disable_deepcopy=True
         )
         gymnasium.Wrapper.__init__(self, env)
-        self.fields = size = check_observations(env.observation_space, env.spec)
+        self.fields = check_observations(env.observation_space, env.spec)
         self.model = find_model(model, env.spec)
-        self.sensors, interval = sensors_of(self.model, sensors, size)
-        n = size if self.model is None else len(self.model.names)
-        self._readings = Readings(self.sensors, n, interval, 1)
-        dtype: Any = env.observation_space.dtype
-        limit = self._readings.limit.astype(dtype)
-        self.observation_space = gymnasium.spaces.Box(-limit, limit, dtype=dtype)
+        self.sensors, self._readings, self.observation_space = readings_of(
+            env.observation_space, self.model, sensors, 1
+        )
         self.reading: Reading | None = None
         """The last readings, of one lane, not rounded to the type of the observation."""
-        self._is_seeded = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
         """Begin an episode of the environment, and its readings."""
         observation, info = self.env.reset(seed=seed, options=options)
-        if seed is None and not self._is_seeded:
-            seed = int(numpy.random.SeedSequence().generate_state(1)[0])
-        self._is_seeded = True
-        self.reading = self._readings.begin(ONE, self._state(observation), None if seed is None else [seed])
+        self.reading = self._readings.begin(ONE, self._state(observation), [seed])
         return self._show(info)
 
     def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
@@ -179,7 +209,6 @@ class NoisyObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Re
     def _show(self, info: dict[str, Any]) -> tuple[numpy.ndarray, dict[str, Any]]:
         assert self.reading is not None
         values = self.reading.values[0].astype(self.observation_space.dtype)
-        numpy.clip(values, self.observation_space.low, self.observation_space.high, out=values)  # type: ignore[attr-defined]
         return values, {**info, "available": self.reading.available[0].copy()}
 
 

@@ -29,6 +29,8 @@ from .readings import Array, EnvironmentSensor, Reading
 
 PARTS = ("observation", "mean", "deviation", "nis", "innovation")
 """What an observation may hold of an estimate."""
+LARGEST = 1e38
+"""Mean or variance of a filter that is lost, as observations of 32 bits cannot hold more: it begins anew."""
 CONTROLS = ("noise", "gain")
 """What an action may change of the filter."""
 _PROBLEMS: dict[tuple[Any, ...], tuple[Problem, Any]] = {}
@@ -142,6 +144,8 @@ class Estimates:
         self._width = round_up_lanes(lanes)
         self._pad = numpy.minimum(numpy.arange(self._width), lanes - 1)
         self._no_action = numpy.zeros((self._width, *(own.action_space.shape or ())))
+        self._begun: Any = None
+        """Filters of all lanes at the start of an episode, made once."""
         self._motion = own.task.definition.filters[0].f
         self._h = own.task.definition.filters[0].h
         numbers = [one for one, channel in zip(sensors.values(), own.task.definition.channels, strict=True)
@@ -188,8 +192,10 @@ class Estimates:
     def _restart(self, lanes: Array) -> None:
         model, N = self.model, self._width
         mean = numpy.repeat(numpy.array(model.mean, dtype=float)[:, None], N, axis=1)
-        covariance = numpy.repeat(model.matrix("covariance")[:, :, None], N, axis=2)
-        begun = self._own.start_filter(Initial(mean, covariance))
+        if self._begun is None:
+            covariance = numpy.repeat(model.matrix("covariance")[:, :, None], N, axis=2)
+            self._begun = self._own.start_filter(Initial(mean, covariance))
+        begun = self._begun
         if not lanes.all():
             begun = select_nested(lanes[self._pad], begun, self._update.state)
         self._update.go_on(begun, ())
@@ -237,7 +243,8 @@ class Estimates:
         )
         shown: tuple[Array, ...] = present.T.copy(), numpy.sqrt(variance.T), nis
         for i, period in self.turns:
-            shown[0][:, i] -= period * numpy.rint(shown[0][:, i] / period)
+            angle = shown[0][:, i]
+            angle -= period * numpy.rint(angle / period)
         if lanes is not None:
             old = self.mean, self.deviation, self.nis
             shown = tuple(
@@ -245,8 +252,11 @@ class Estimates:
                 for new, before in zip(shown, old, strict=True)
             )
         self.mean, self.deviation, self.nis = shown
-        if not numpy.isfinite(numpy.sum(mean) + numpy.sum(variance)):
-            self._restart(~(numpy.isfinite(mean).all(axis=0) & numpy.isfinite(variance).all(axis=0)))
+        if not abs(mean.sum()) + variance.sum() < LARGEST:
+            lost = ~((abs(mean) < LARGEST).all(axis=0) & (variance < LARGEST).all(axis=0))
+            self._restart(lost)
+            deviation = numpy.sqrt(numpy.diag(self.model.matrix("covariance")))
+            self.mean[lost], self.deviation[lost], self.nis[lost] = self.model.mean, deviation, 0.0
 
     def _align(self, lanes: Array | None, reading: Reading, inputs: Array) -> tuple[Array, Array, Array]:
         """Return the readings of the time for which the slowest sensor has come, and the inputs until then."""
@@ -317,4 +327,4 @@ class Estimates:
             else:
                 value = getattr(self, name)
                 parts.append(value[:, None] if value.ndim == 1 else value)
-        return numpy.concatenate(parts, axis=1).astype(dtype)
+        return (parts[0] if len(parts) == 1 else numpy.concatenate(parts, axis=1)).astype(dtype, order="C")

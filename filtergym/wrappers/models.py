@@ -129,9 +129,9 @@ CLASSIC_CONTROL = {
         covariance=(numpy.pi**2 / 3.0, 1.0 / 3.0),
         inputs=("torque",),
         angles={"angle": "rad"},
-        state=lambda o: numpy.stack([numpy.arctan2(o[:, 1], o[:, 0]), o[:, 2]], axis=1),
-        observation=lambda x: numpy.stack([numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), x[:, 1]], axis=1),
-        action=lambda action: numpy.clip(action, -2.0, 2.0),
+        state=lambda o: numpy.array([numpy.arctan2(o[:, 1], o[:, 0]), o[:, 2]]).T,
+        observation=lambda x: numpy.array([numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), x[:, 1]]).T,
+        action=lambda action: numpy.minimum(numpy.maximum(action, -2.0), 2.0),
     ),
     "MountainCarContinuous": EnvironmentModel(
         names=("position", "velocity"),
@@ -141,7 +141,7 @@ CLASSIC_CONTROL = {
         mean=(-0.5, 0.0),
         covariance=(0.2**2 / 12.0, 1e-10),
         inputs=("force",),
-        action=lambda action: numpy.clip(action, -1.0, 1.0),
+        action=lambda action: numpy.minimum(numpy.maximum(action, -1.0), 1.0),
     ),
     "Acrobot": EnvironmentModel(
         names=("angle_1", "angle_2", "rate_1", "rate_2"),
@@ -152,13 +152,12 @@ CLASSIC_CONTROL = {
         covariance=(0.2**2 / 12.0,) * 4,
         inputs=("torque",),
         angles={"angle_1": "rad", "angle_2": "rad"},
-        state=lambda o: numpy.stack(
-            [numpy.arctan2(o[:, 1], o[:, 0]), numpy.arctan2(o[:, 3], o[:, 2]), o[:, 4], o[:, 5]], axis=1
-        ),
-        observation=lambda x: numpy.stack(
-            [numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), numpy.cos(x[:, 1]), numpy.sin(x[:, 1]), x[:, 2], x[:, 3]],
-            axis=1,
-        ),
+        state=lambda o: numpy.array(
+            [numpy.arctan2(o[:, 1], o[:, 0]), numpy.arctan2(o[:, 3], o[:, 2]), o[:, 4], o[:, 5]]
+        ).T,
+        observation=lambda x: numpy.array(
+            [numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), numpy.cos(x[:, 1]), numpy.sin(x[:, 1]), x[:, 2], x[:, 3]]
+        ).T,
         action=lambda action: numpy.asarray(action, dtype=float)[:, None] - 1.0,
     ),
 }  # fmt: skip
@@ -190,6 +189,10 @@ def find_model(model: Any, spec: Any) -> EnvironmentModel | None:
             if isinstance(found, EnvironmentModel):
                 return found
         found = CLASSIC_CONTROL.get(name.rpartition("/")[2].rpartition("-v")[0] or name)
+        if found is not None and model is None and spec.kwargs.get("g", 10.0) != 10.0:
+            raise ValueError(
+                f"the model of {name} is that of g = 10, and this one has g = {spec.kwargs['g']}: give model="
+            )
         if found is not None or model is None:
             return found
     raise ValueError(

@@ -77,27 +77,37 @@ def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) ->
         places = _component_places(name, values["h"], names)
         if places is not None:
             turning = {angles.get(names[place]) for place in places}
-            wraps = turning.pop() if len(turning) == 1 else None
+            if len(turning) > 1 and values.get("wraps") is None:
+                raise ValueError(
+                    f"the sensor {name!r} measures {', '.join(names[place] for place in places)}, of which angles wrap "
+                    "and others do not: give one sensor to each kind"
+                )
+            wraps = values.get("wraps") or turning.pop()
             R = values["R"] if callable(values["R"]) else numpy.asarray(values["R"], dtype=float)
             R = numpy.diag(numpy.broadcast_to(R, len(places))) if not callable(R) and R.ndim == 0 else R
-            values = {"wraps": wraps, **values, "h": numpy.eye(len(names))[places], "R": R}
+            values = {**values, "wraps": wraps, "h": numpy.eye(len(names))[places], "R": R}
         found[str(name)] = EnvironmentSensor(**values)
     return found
 
 
 def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | None:
-    """Return the places of components that are named or numbered; None for a matrix or a function."""
-    listed = [h] if isinstance(h, str | int) else h
-    if not isinstance(listed, Sequence) or not all(isinstance(one, str | int) for one in listed):
+    """Return the places of components that are named, numbered or chosen by a matrix; None for any other h."""
+    if not callable(h) and numpy.shape(h)[1:] == (len(names),):
+        rows = numpy.asarray(h, dtype=float)
+        is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
+        return rows.argmax(axis=1).tolist() if is_choice and len(rows) else None
+    kinds = (str, int, numpy.integer)
+    listed: Any = [h] if isinstance(h, kinds) else h
+    if not isinstance(listed, Sequence) or not all(isinstance(one, kinds) for one in listed):
         return None
     places = []
     for one in listed:
-        known = one in names if isinstance(one, str) else 0 <= one < len(names)
+        known = one in names if isinstance(one, str) else not isinstance(one, bool) and 0 <= one < len(names)
         if not known:
             raise ValueError(
                 f"the sensor {sensor!r} measures component {one!r}, and the state has {len(names)}: {', '.join(names)}"
             )
-        places.append(names.index(one) if isinstance(one, str) else one)
+        places.append(names.index(one) if isinstance(one, str) else int(one))
     return places
 
 
@@ -121,7 +131,7 @@ class Readings:
 
     Attributes:
         channels: places of the sensors among the m numbers.
-        limit: of each number, half a turn of an angle, else infinity, ``(m,)``.
+        limit: of each number, half a turn of an angle but for rounding, else infinity, ``(m,)``.
     """
 
     def __init__(
@@ -140,22 +150,26 @@ class Readings:
             numpy.array([getattr(one, name) for one in of_each]) for name in ("bias", "quantum", "delay")
         )
         self.periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in of_each])
-        self.limit = 0.5 * self.periods
+        self.limit = numpy.nextafter(0.5 * self.periods, numpy.inf)
         self._turning, self._rounded = numpy.isfinite(self.periods), self.quantum > 0.0
         self._size = m
         self._is_linear = all(one.matrix is not None and not numpy.any(one.offset) for one in self._functions)
         self._is_linear &= not any(isinstance(root, VectorFunction) for root in self._noises)
         if self._is_linear:
-            self._rows = numpy.concatenate([one.matrix for one in self._functions])
-            self._root = numpy.zeros((m, m))
-            for channel, root in zip(self.channels, self._noises, strict=True):
-                self._root[channel.places, channel.places] = root
+            rows = numpy.concatenate([one.matrix for one in self._functions])
+            root = numpy.zeros((m, m))
+            for channel, own in zip(self.channels, self._noises, strict=True):
+                root[channel.places, channel.places] = own
+            is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
+            self._chosen = rows.argmax(axis=1) if is_choice else None
+            self._diagonal = numpy.diag(root) if not numpy.tril(root, -1).any() else None
+            self._rows, self._root = rows, root
         self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self.channels)
-        self._turn = numpy.where(self._turning, self.periods, 0.0)
-        self._per_turn = numpy.where(self._turning, 1.0 / self.periods, 0.0)
+        self._turn = numpy.where(self._turning, self.periods, 1.0)
         self._is_exact = not (self._turning.any() or self._rounded.any())
         self._each, self._all_made = numpy.arange(lanes), numpy.ones((lanes, m), dtype=bool)
         self._identities = numpy.zeros((2, lanes), dtype=numpy.uint64)
+        self._is_seeded = numpy.zeros(lanes, dtype=bool)
         self.steps = numpy.zeros(lanes, dtype=numpy.int64)
         """Since the start of each lane's episode."""
         self._block = numpy.zeros((BLOCK, 2 * m + len(sensors), lanes))
@@ -181,7 +195,7 @@ class Readings:
         R = numpy.asarray(one.R, dtype=float)
         R = numpy.diag(numpy.broadcast_to(R, count)) if R.ndim == 0 else R
         try:
-            if R.shape != (count, count):
+            if R.shape != (count, count) or not numpy.isfinite(R).all():
                 raise numpy.linalg.LinAlgError
             return numpy.linalg.cholesky(R)
         except numpy.linalg.LinAlgError:
@@ -190,21 +204,26 @@ class Readings:
                 f"{numpy.asarray(one.R).tolist()}"
             ) from None
 
-    def begin(self, lanes: Array, state: Array, seeds: Sequence[int] | None) -> Reading:
+    def begin(self, lanes: Array, state: Array, seeds: Sequence[int | None] | None) -> Reading:
         """Begin episodes of some lanes, and return the first readings; they are received at once, but for the delay.
 
         Args:
             lanes: which begin, booleans ``(N,)``.
             state: of all lanes, ``(N, n)``.
-            seeds: of all lanes; None: each goes on with its next episode.
+            seeds: of all lanes; None, of all or of one: it goes on with its next episode, at first of a random seed.
         """
-        if seeds is not None:
-            self._identities[0, lanes] = (
-                numpy.array(seeds, dtype=numpy.uint64) ^ numpy.uint64(STREAM << 32)
-            )[lanes]
-            self._identities[1, lanes] = 0
-        else:
-            self._identities[1, lanes] += numpy.uint64(1)
+        given: Sequence[int | None] = [None] * self._lanes if seeds is None else seeds
+        goes_on = lanes & self._is_seeded & (seeds is None)
+        self._identities[1, goes_on] += numpy.uint64(1)
+        for lane in numpy.flatnonzero(lanes & ~goes_on).tolist():
+            seed = given[lane]
+            if seed is None and not self._is_seeded[lane]:
+                seed = int(numpy.random.SeedSequence().generate_state(1)[0])
+            if seed is None:
+                self._identities[1, lane] += numpy.uint64(1)
+            else:
+                self._identities[:, lane] = int(seed) ^ STREAM << 32, 0
+                self._is_seeded[lane] = True
         self.steps[lanes] = 0
         self._fill(lanes)
         row = self._row()
@@ -226,7 +245,7 @@ class Readings:
         """
         self.steps += 1 if lanes is None else lanes
         late = self.steps - self._filled >= BLOCK
-        if late.any():
+        if late[0] if self._lanes == 1 else late.any():
             self._fill(late)
         row = self._row()
         made = self._all_made if self._is_steady else self._made(row[2 * self._size :])
@@ -273,8 +292,10 @@ class Readings:
     def _measure(self, state: Array, row: Array) -> Array:
         """Return what all sensors measure now, ``(N, m)``."""
         if self._is_linear:
-            measured = state @ self._rows.T + row[: self._size].T @ self._root.T
-            return self.finish(measured + self._offset)
+            normals = row[: self._size].T
+            measured = _product(state, self._rows) if self._chosen is None else state[:, self._chosen]
+            noise = _product(normals, self._root) if self._diagonal is None else normals * self._diagonal
+            return self.finish(measured + noise + self._offset)
         x = state.T
         values = numpy.empty((self._lanes, self._size))
         for channel, h, root in zip(self.channels, self._functions, self._noises, strict=True):
@@ -282,9 +303,9 @@ class Readings:
             if isinstance(root, VectorFunction):
                 count = channel.size
                 root = numpy.linalg.cholesky(root.value(x, numpy).T.reshape(-1, count, count))
-                noise = numpy.einsum("nij,jn->ni", root, normals)
+                noise = sum((root[:, :, k] * normals[k][:, None] for k in range(count)), numpy.zeros(()))
             else:
-                noise = (root @ normals).T if channel.size > 1 else root[0, 0] * normals.T
+                noise = _product(normals.T, root)
             values[:, channel.places] = h.value(x, numpy).T + noise
         return self.finish(values + self._offset)
 
@@ -296,11 +317,14 @@ class Readings:
             quantum = numpy.where(self._rounded, self.quantum, 1.0)
             values = numpy.where(self._rounded, numpy.round(values / quantum) * quantum, values)
         if self._turning.any():
-            turns = numpy.where(
-                self._turning, numpy.round(values / numpy.where(self._turning, self.periods, 1.0)), 0.0
-            )
-            values = values - turns * numpy.where(self._turning, self.periods, 0.0)
+            turned = values - numpy.rint(values / self._turn) * self._turn
+            values = turned if self._turning.all() else numpy.where(self._turning, turned, values)
         return values
+
+
+def _product(vectors: Array, matrix: Array) -> Array:
+    """Return ``vectors @ matrix.T``, summed in one order for any number of lanes, as BLAS does not."""
+    return sum((vectors[:, k, None] * column for k, column in enumerate(matrix.T)), numpy.zeros(()))
 
 
 def sensors_of(

@@ -13,11 +13,12 @@ from . import (
     find_readings,
     inputs_of,
     joint_space,
+    readings_of,
     split_action,
 )
 from .estimates import Estimates
 from .models import find_model
-from .readings import Reading, Readings, sensors_of
+from .readings import Reading
 
 __all__ = ["EstimatedObservation", "NoisyObservation"]
 
@@ -37,14 +38,11 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def __init__(self, env: VectorEnv[Any, Any, Any], sensors: Any, model: Any = None) -> None:
         super().__init__(env)
-        self.fields = size = check_observations(env.single_observation_space, env.spec)
+        self.fields = check_observations(env.single_observation_space, env.spec)
         self.model = find_model(model, env.spec)
-        self.sensors, interval = sensors_of(self.model, sensors, size)
-        n = size if self.model is None else len(self.model.names)
-        self._readings = Readings(self.sensors, n, interval, env.num_envs)
-        dtype: Any = env.single_observation_space.dtype
-        limit = self._readings.limit.astype(dtype)
-        self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=dtype)
+        self.sensors, self._readings, self.single_observation_space = readings_of(
+            env.single_observation_space, self.model, sensors, env.num_envs
+        )
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, env.num_envs
         )
@@ -57,7 +55,6 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         self.began = self.every
         """Lanes that began an episode in the last step."""
         self._ended = ~self.every
-        self._is_seeded = False
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -66,11 +63,8 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         mask = (options or {}).get("reset_mask")  # Gymnasium takes it out of the options
         observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         lanes = self.every if mask is None else numpy.asarray(mask, dtype=bool)
-        if seed is None and not self._is_seeded:
-            seed = int(numpy.random.SeedSequence().generate_state(1)[0])
-        self._is_seeded = True
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        self.reading = self._readings.begin(lanes, self._state(observations), seeds)  # type: ignore[arg-type]
+        self.reading = self._readings.begin(lanes, self._state(observations), seeds)
         self.final, self.began = None, lanes
         self._ended = self._ended & ~lanes
         return self._show(infos)
@@ -118,8 +112,7 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         return state if self.model is None else self.model.state(state)
 
     def _typed(self, values: numpy.ndarray) -> numpy.ndarray:
-        space: Any = self.single_observation_space
-        return numpy.clip(values.astype(space.dtype), space.low, space.high)
+        return values.astype(self.single_observation_space.dtype)
 
     def _show(self, infos: dict[str, Any]) -> tuple[numpy.ndarray, dict[str, Any]]:
         assert self.reading is not None
