@@ -179,8 +179,11 @@ class NoisyObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Re
             self, sensors=sensors, model=model, _disable_deepcopy=True
         )
         gymnasium.Wrapper.__init__(self, env)
-        self.fields = check_observations(env.observation_space, env.spec)
-        self.model = find_model(model, env.spec)
+        self.fields: int = check_observations(env.observation_space, env.spec)
+        self.model: EnvironmentModel | None = find_model(model, env.spec)
+        self.sensors: dict[str, EnvironmentSensor]
+        self._readings: Readings
+
         self.sensors, self._readings, self.observation_space = readings_of(
             env.observation_space, self.model, sensors, 1
         )
@@ -245,13 +248,15 @@ class EstimatedObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.util
         gymnasium.Wrapper.__init__(self, env)
         self._sensors: NoisyObservation = find_readings(env, NoisyObservation)
         found = self._sensors.model if model is None else find_model(model, env.spec)
-        self.model = check_model(found, self._sensors, env.action_space)
+        self.model: EnvironmentModel = check_model(found, self._sensors, env.action_space)
         shown = check_shown(show, self.model)
-        self._estimates = Estimates(self.model, self._sensors.sensors, competitor, control, shown, 1)
+        self._estimates: Estimates = Estimates(
+            self.model, self._sensors.sensors, competitor, control, shown, 1
+        )
         dtype: Any = self._sensors.observation_space.dtype
-        self.observation_space = self._estimates.space(dtype)
-        self.action_space = joint_space(env.action_space, self._estimates.action_space)
-        self._joins = isinstance(self.action_space, gymnasium.spaces.Box)
+        self.observation_space: Any = self._estimates.space(dtype)
+        self.action_space: Any = joint_space(env.action_space, self._estimates.action_space)
+        self._joins: bool = isinstance(self.action_space, gymnasium.spaces.Box)
 
     @property
     def estimates(self) -> Estimates:

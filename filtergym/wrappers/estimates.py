@@ -116,7 +116,8 @@ class Estimates:
         lanes: int,
     ) -> None:
         self._arguments = model, sensors, competitor, control, show, lanes
-        self.model, self._lanes, self._show = model, lanes, show
+        self.model: EnvironmentModel = model
+        self._lanes, self._show = lanes, show
         problem = define_problem(model, sensors)
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
@@ -132,7 +133,7 @@ class Estimates:
                     f"competitor must be an estimator, one of {', '.join(known)}, got {competitor!r}"
                 )
             own = put_in_loop(own, maker, "estimator", str(competitor), lanes)
-        self.action_space = None if control is None else own.action_space
+        self.action_space: Any = None if control is None else own.action_space
         self._own, world = own, own.task.world
         self._is_compiled = can_step(own, report_estimate)
         self._is_asked = not self._is_compiled or control is not None
@@ -153,8 +154,8 @@ class Estimates:
         delays = numpy.array([one.delay for one in numbers])
         self._behind, self._held = int(delays.max()), int(delays.max()) - delays
         """Steps for which each number waits for the slowest."""
-        self.periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in numbers])
-        self.turns = [
+        self.periods: Array = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in numbers])
+        self.turns: list[tuple[int, float]] = [
             (i, PERIODS[model.angles[one]]) for i, one in enumerate(model.names) if one in model.angles
         ]
         m, p = len(numbers), len(model.inputs)
@@ -163,10 +164,10 @@ class Estimates:
         self._available = numpy.zeros((depth, lanes, m), dtype=bool)
         self._inputs = numpy.zeros((depth + 1, lanes, p))
         self._steps = numpy.zeros(lanes, dtype=numpy.int64)
-        self.mean = numpy.zeros((lanes, len(model.names)))
-        self.deviation = numpy.zeros_like(self.mean)
-        self.nis = numpy.zeros(lanes)
-        self.innovation = numpy.zeros((lanes, m))
+        self.mean: Array = numpy.zeros((lanes, len(model.names)))
+        self.deviation: Array = numpy.zeros_like(self.mean)
+        self.nis: Array = numpy.zeros(lanes)
+        self.innovation: Array = numpy.zeros((lanes, m))
         self._filtered = self.mean.T
         """Means of the filters, ``(n, N)``."""
         self._each, self._no_inputs = numpy.arange(lanes), numpy.zeros((lanes, p))

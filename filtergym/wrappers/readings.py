@@ -15,7 +15,7 @@ import numpy
 
 from ..compiler.counter_numbers import numbers
 from ..compiler.vector_functions import VectorFunction
-from ..envs.linear.sensors import EARLY, Sensor
+from ..envs.linear.sensors import EARLY, Channel, Sensor
 from ..filters.angles import PERIODS
 from ..own_equations import trace_measurement
 from ..own_sensors import find_channels
@@ -137,20 +137,25 @@ class Readings:
     def __init__(
         self, sensors: Mapping[str, EnvironmentSensor], size: int, interval: float, lanes: int
     ) -> None:
-        self.sensors, self.interval, self._lanes = sensors, interval, lanes
+        self.sensors: Mapping[str, EnvironmentSensor] = sensors
+        self.interval: float = interval
+        self._lanes = lanes
         self._functions = [
             trace_measurement(f"h of the sensor {name!r}", one.h, size, 0) for name, one in sensors.items()
         ]
         counts = [function.size for function in self._functions]
-        self.channels = find_channels(sensors, counts, interval)
+        self.channels: tuple[Channel, ...] = find_channels(sensors, counts, interval)
         self._noises = [self._noise(*each, size) for each in zip(sensors.items(), counts, strict=True)]
         m = sum(counts)
         of_each = [one for one, count in zip(sensors.values(), counts, strict=True) for _ in range(count)]
+        self.bias: Array
+        self.quantum: Array
+        self.delays: Array
         self.bias, self.quantum, self.delays = (
             numpy.array([getattr(one, name) for one in of_each]) for name in ("bias", "quantum", "delay")
         )
-        self.periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in of_each])
-        self.limit = numpy.nextafter(0.5 * self.periods, numpy.inf)
+        self.periods: Array = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in of_each])
+        self.limit: Array = numpy.nextafter(0.5 * self.periods, numpy.inf)
         self._turning, self._rounded = numpy.isfinite(self.periods), self.quantum > 0.0
         self._size = m
         self._is_linear = all(one.matrix is not None and not numpy.any(one.offset) for one in self._functions)
@@ -170,7 +175,7 @@ class Readings:
         self._each, self._all_made = numpy.arange(lanes), numpy.ones((lanes, m), dtype=bool)
         self._identities = numpy.zeros((2, lanes), dtype=numpy.uint64)
         self._is_seeded = numpy.zeros(lanes, dtype=bool)
-        self.steps = numpy.zeros(lanes, dtype=numpy.int64)
+        self.steps: Array = numpy.zeros(lanes, dtype=numpy.int64)
         """Since the start of each lane's episode."""
         self._block = numpy.zeros((BLOCK, 2 * m + len(sensors), lanes))
         self._filled = numpy.zeros(lanes, dtype=numpy.int64)

@@ -17,8 +17,8 @@ from . import (
     split_action,
 )
 from .estimates import Estimates
-from .models import find_model
-from .readings import Reading
+from .models import EnvironmentModel, find_model
+from .readings import EnvironmentSensor, Reading, Readings
 
 __all__ = ["EstimatedObservation", "NoisyObservation"]
 
@@ -38,21 +38,24 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def __init__(self, env: VectorEnv[Any, Any, Any], sensors: Any, model: Any = None) -> None:
         super().__init__(env)
-        self.fields = check_observations(env.single_observation_space, env.spec)
-        self.model = find_model(model, env.spec)
+        self.fields: int = check_observations(env.single_observation_space, env.spec)
+        self.model: EnvironmentModel | None = find_model(model, env.spec)
+        self.sensors: dict[str, EnvironmentSensor]
+        self._readings: Readings
+        self.single_observation_space: gymnasium.spaces.Box
         self.sensors, self._readings, self.single_observation_space = readings_of(
             env.single_observation_space, self.model, sensors, env.num_envs
         )
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, env.num_envs
         )
-        self.mode = autoreset_of(env)
-        self.every = numpy.ones(env.num_envs, dtype=bool)
+        self.mode: AutoresetMode = autoreset_of(env)
+        self.every: numpy.ndarray = numpy.ones(env.num_envs, dtype=bool)
         self.reading: Reading | None = None
         """The last readings of all lanes, not rounded to the type of the observation."""
         self.final: Reading | None = None
         """Readings before an autoreset in the same step; None where no lane began anew in the last step."""
-        self.began = self.every
+        self.began: numpy.ndarray = self.every
         """Lanes that began an episode in the last step."""
         self._ended = ~self.every
 
@@ -138,19 +141,21 @@ class EstimatedObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         super().__init__(env)
         self._sensors: NoisyObservation = find_readings(env, NoisyObservation)
         found = self._sensors.model if model is None else find_model(model, env.spec)
-        self.model = check_model(found, self._sensors, env.single_action_space)
+        self.model: EnvironmentModel = check_model(found, self._sensors, env.single_action_space)
         shown = check_shown(show, self.model)
-        self._estimates = Estimates(
+        self._estimates: Estimates = Estimates(
             self.model, self._sensors.sensors, competitor, control, shown, env.num_envs
         )
         dtype: Any = self._sensors.single_observation_space.dtype
-        self.single_observation_space = self._estimates.space(dtype)
-        self.single_action_space = joint_space(env.single_action_space, self._estimates.action_space)
+        self.single_observation_space: gymnasium.spaces.Box = self._estimates.space(dtype)
+        self.single_action_space: gymnasium.Space[Any] = joint_space(
+            env.single_action_space, self._estimates.action_space
+        )
         self.observation_space, self.action_space = (
             gymnasium.vector.utils.batch_space(one, env.num_envs)
             for one in (self.single_observation_space, self.single_action_space)
         )
-        self._joins = isinstance(self.single_action_space, gymnasium.spaces.Box)
+        self._joins: bool = isinstance(self.single_action_space, gymnasium.spaces.Box)
 
     @property
     def estimates(self) -> Estimates:
