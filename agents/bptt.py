@@ -176,7 +176,7 @@ class NetworkPolicy(torch.nn.Module):
         return {name: tensor.detach().numpy().copy() for name, tensor in named.items()}
 
     def fields(self, model: Model) -> list[str]:
-        """Names of what :meth:`arrays` take of an observation."""
+        """Return the names of what :meth:`arrays` take of an observation."""
         return [model.fields[i].name for i in self.strongest_fields(self.fields_kept)]
 
 
@@ -253,7 +253,7 @@ def measure_normalisation(env: TaskVectorEnv, policy: NetworkPolicy) -> None:
 
 
 def _environment(run: TrainingRun) -> TaskVectorEnv:
-    """Episodes that can be differentiated, as code of the processor where that is possible."""
+    """Return the episodes that can be differentiated, as code of the processor where that is possible."""
     make = functools.partial(
         TaskVectorEnv,
         run.environment,
@@ -284,13 +284,15 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
 
 
 def _reward_to_descend(run: TrainingRun) -> str:
-    """Reward whose gradient is followed; that of the difference to the paper's algorithm is the cost's own."""
+    """Return the reward whose gradient is followed; that of the difference to the paper's algorithm is the cost's
+    own.
+    """
     kind = run.hyperparameters.get("env_kwargs", {}).get("reward", "cost")
     return "cost" if kind == "relative" else kind
 
 
 def _reward_with_teacher(run: TrainingRun) -> TrainingObjective:
-    """Reward whose gradient is followed, with the share of it that a teacher gives.
+    """Return the reward whose gradient is followed, with the share of it that a teacher gives.
 
     Raises:
         ValueError: if a teacher cannot give it.

@@ -216,7 +216,7 @@ def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str,
 def _observations(
     cls: type[Task], stored: Any, scenario: Any, keywords: Mapping[str, Any], seeds: Sequence[int]
 ) -> numpy.ndarray:
-    """Fields that an agent takes, of all decisions of some episodes that it flies, ``(n, fields)``."""
+    """Return the fields that an agent takes, of all decisions of some episodes that it flies, ``(n, fields)``."""
     model = make_model(cls, stored.control, scenario, backend="auto", **keywords)
     lanes = start_lanes(model, seeds)
     policy = SteppingPolicy(model, make_competitor(stored, model))

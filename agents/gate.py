@@ -184,7 +184,7 @@ class Gate:
             raise ValueError(f"the fallback is made for control {own!r}, but the task has {model.control!r}")
 
     def begin(self, seeds: Sequence[int]) -> GateMemory:
-        """Memory at the start of the episodes with these seeds."""
+        """Return the memory at the start of the episodes with these seeds."""
         return GateMemory(None, self.fallback.begin(seeds) if isinstance(self.fallback, Policy) else None)
 
     def choose(
@@ -244,7 +244,7 @@ class Gated(Policy):
         expose_spaces(self, self.policy)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory] | None:
-        """Memories of policy and gate; none of what can be traced, which draws nothing."""
+        """Return the memories of policy and gate; none of what can be traced, which draws nothing."""
         if self.traceable:
             return None
         return (self.policy.begin(seeds) if isinstance(self.policy, Policy) else None), self.gate.begin(seeds)
@@ -390,8 +390,8 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         return {}
 
     def _sum_squares(self, memory: GatedState, told: Likelihood) -> tuple[Array, Array]:
-        """Sums of the fallback's normalised innovations squared, and of their degrees; what is not told, or not
-        received, leaves them as they are.
+        """Return the sums of the fallback's normalised innovations squared, and of their degrees; what is not told,
+        or not received, leaves them as they are.
         """
         if self.fallback.adapts_covariance or told.nis is None or told.nis_degrees is None:
             return memory.squares, memory.degrees

@@ -370,5 +370,5 @@ def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
 
 
 def pretrained_path(id: str, name: str) -> Path:
-    """File of an agent that is shipped for a Gymnasium id, whether or not there is one."""
+    """Return the file of an agent that is shipped for a Gymnasium id, whether or not there is one."""
     return PRETRAINED / short_name(id) / f"{name}.safetensors"

@@ -15,7 +15,7 @@ from .training_run import TrainingRun, best_agent, load_run
 
 
 def pretrained_agents(id: str) -> list[str]:
-    """Names of the agents that are shipped for the environment of a Gymnasium id."""
+    """Return the names of the agents that are shipped for the environment of a Gymnasium id."""
     return sorted(path.stem for path in pretrained_path(id, "").parent.glob("*.safetensors"))
 
 

@@ -73,7 +73,7 @@ class ResidualPolicy(Policy):
         expose_spaces(self, agent)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, Any] | None:
-        """Memories of both; none of what can be traced, which draws nothing."""
+        """Return the memories of both; none of what can be traced, which draws nothing."""
         if self.traceable:
             return None
         both = self.policy, self.agent

@@ -153,7 +153,7 @@ def _is_wrapped(model: BaseAlgorithm) -> bool:
 
 
 def statistics_places(path: Path, environment: str | None = None) -> Iterator[Path]:
-    """Files in which the statistics of a model's zip may be, nearest first.
+    """Return the files in which the statistics of a model's zip may be, nearest first.
 
     Args:
         path: of the zip.

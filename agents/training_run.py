@@ -414,7 +414,7 @@ def load_run(folder: Path, trust: bool = False) -> TrainingRun:
 
 
 def best_agent(folder: Path) -> Path:
-    """File of a run's agent with the lowest validation cost, as an evaluation takes it.
+    """Return the file of a run's agent with the lowest validation cost, as an evaluation takes it.
 
     Raises:
         ValueError: if the run has not been validated yet.

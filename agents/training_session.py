@@ -17,7 +17,7 @@ from .validation import Validation
 
 
 def _curve(entry: ValidationEntry) -> dict[str, float]:
-    """Numbers of a validation, as a log shows them over environment steps."""
+    """Return the numbers of a validation, as a log shows them over environment steps."""
     curve = {"validation/cost": entry["cost"]}
     if "paper_cost" in entry and "relative_cost_difference" in entry:
         curve["validation/paper_cost"] = entry["paper_cost"]

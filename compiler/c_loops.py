@@ -142,7 +142,7 @@ class Loops:
         ]
 
     def _entry(self, numbers: Sequence[int]) -> str:
-        """Expression of a number of run ``i``."""
+        """Return the expression of a number of run ``i``."""
         if steady(numbers) is None:
             return f"{self._table(tuple(numbers))}[i]"
         least, text = self._term(numbers, "i")
@@ -200,7 +200,7 @@ class Loops:
         return f"({text} != {literal(0.0, self.scalar)})" if operand.logical else text
 
     def _place(self, operand: Operand, single: Callable[[int, int], str], rows: Mapping[int, Rows]) -> str:
-        """Expression of a member of an array, in a turn of the loop."""
+        """Return the expression of a member of an array, in a turn of the loop."""
         array, places = operand.array, operand.places
         if array != SCRATCH and len(set(places)) == 1:
             return single(array, places[0])
@@ -208,14 +208,14 @@ class Loops:
         return f"{pointer}[{self._index(self._own_places(operand, rows))}]"
 
     def _own_places(self, operand: Operand, rows: Mapping[int, Rows]) -> tuple[int, ...]:
-        """Places of the members behind the pointer to their array."""
+        """Return the places of the members behind the pointer to their array."""
         if operand.array == SCRATCH:
             return operand.places
         of_row = rows[operand.array].places
         return tuple(of_row[row] for row in operand.places)
 
     def _index(self, places: tuple[int, ...]) -> str:
-        """Expression of the place of member ``k``, which is the one in row ``i`` and column ``j``."""
+        """Return the expression of the place of member ``k``, which is the one in row ``i`` and column ``j``."""
         if len(self._runs) > 1 and steady(places) is None:
             name = self._starts.setdefault(_from_least(places), f"r{len(self._starts)}")
             return f"{min(places)} + {name}" if min(places) else name
@@ -235,7 +235,7 @@ class Loops:
         return least, "" if step == 0 else letter if abs(step) == 1 else f"{abs(step)} * {letter}"
 
     def _table(self, values: tuple[Any, ...]) -> str:
-        """Name of a constant array: of numbers, or of distances."""
+        """Return the name of a constant array: of numbers, or of distances."""
         key = (type(values[0]), *(struct.pack("d", value) for value in values))
         if key not in self._found:
             name = self._found[key] = (
@@ -251,7 +251,7 @@ class Loops:
 
 
 def _grid(places: Sequence[int], columns: int) -> list[tuple[int, ...]] | None:
-    """Places of rows and of columns whose sums all places are, row by row; None where there are none."""
+    """Return the places of rows and of columns whose sums all places are, row by row; None where there are none."""
     if columns == 1:
         return None
     rows, row = tuple(places[::columns]), tuple(place - places[0] for place in places[:columns])
@@ -265,7 +265,7 @@ def _from_least(places: Sequence[int]) -> tuple[int, ...]:
 
 
 def _kind(numbers: Sequence[int]) -> str:
-    """Type of C that holds some numbers."""
+    """Return the type of C that holds some numbers."""
     for size, kind in ((8, "char"), (16, "short")):
         if min(numbers) >= 0 and max(numbers) < 2**size:
             return f"unsigned {kind}"
@@ -275,14 +275,14 @@ def _kind(numbers: Sequence[int]) -> str:
 
 
 def _bytes(numbers: Sequence[int]) -> int:
-    """Size of a table, none where its entries are steadily apart."""
+    """Return the size of a table, none where its entries are steadily apart."""
     if steady(numbers) is not None:
         return 0
     return len(numbers) * {"char": 1, "short": 2}.get(_kind(numbers).split()[-1], 4)
 
 
 def _runs(tables: Collection[tuple[int, ...]], turns: int) -> list[int]:
-    """Members with which runs begin, in each of which every table's entries are steadily apart."""
+    """Return the members with which runs begin, in each of which every table's entries are steadily apart."""
     apart = numpy.diff(numpy.array(list(tables)), axis=1)
     bends = (apart[:, 1:] != apart[:, :-1]).any(axis=0).tolist()
     starts = [0]
@@ -294,7 +294,9 @@ def _runs(tables: Collection[tuple[int, ...]], turns: int) -> list[int]:
 
 
 def _steps(places: Sequence[int], runs: Sequence[int], turns: int) -> list[int]:
-    """Distance from member to member in every run; of a run of one, for which any will do, that of the run before."""
+    """Return the distance from member to member in every run; of a run of one, for which any will do, that of the
+    run before.
+    """
     steps: list[int] = []
     for start, end in pairwise([*runs, turns]):
         alone = steps[-1] if steps else 1

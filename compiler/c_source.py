@@ -203,7 +203,9 @@ def write_program(
 
 
 def _packed(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
-    """Blocks put together as long as a function is not too long, and how many of them are before a pause."""
+    """Return the blocks put together as long as a function is not too long, and how many of them are before a
+    pause.
+    """
     packed: list[list[str]] = []
     before = 0
     for i, block in enumerate(blocks):
@@ -221,7 +223,7 @@ def _statements(
     write: Callable[[int, int], str],
     slots: Mapping[int, int],
 ) -> list[str]:
-    """Statements of a part."""
+    """Return the statements of a part."""
     lines: list[str] = []
     fetched: set[int] = set()
     steps = text.steps

@@ -41,7 +41,7 @@ def folder() -> Path | None:
 
 
 def key(*texts: str) -> str:
-    """Name of what is made of some texts."""
+    """Return the name of what is made of some texts."""
     digest = hashlib.sha256()
     for text in texts:
         digest.update(f"{len(text)}:{text}".encode())

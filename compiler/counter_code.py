@@ -78,7 +78,7 @@ class _VectorText:
         self.block = block
 
     def name(self) -> str:
-        """Name that is not taken."""
+        """Return the name that is not taken."""
         self._count += 1
         return f"{self._prefix}{self._count}"
 
@@ -92,7 +92,7 @@ class _VectorText:
         return name
 
     def constant(self, value: int | float) -> str:
-        """Text of a constant."""
+        """Return the text of a constant."""
         if isinstance(value, int):
             return self.block.constant(str(value), "i64")
         return self.block.constant(f"0x{numpy.float64(value).view('u8'):016X}")
@@ -143,7 +143,7 @@ def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str])
 def _loop(
     block: LaneBlock, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
 ) -> list[str]:
-    """Loop over the pairs of a kind, entered from the block ``before``; it leaves to ``done_KIND``."""
+    """Return the loop over the pairs of a kind, entered from the block ``before``; it leaves to ``done_KIND``."""
     text = _VectorText(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [
@@ -176,7 +176,8 @@ def _loop(
 
 @functools.cache
 def llvm_text(block: LaneBlock) -> str:
-    """Text whose ``@program(table, first, last)`` goes on to the next measurement in some lanes and makes its numbers.
+    """Return the text whose ``@program(table, first, last)`` goes on to the next measurement in some lanes and makes
+    its numbers.
 
     The table holds nothing, then address and stride of identities, of measurements and of the rows, then how many of
     these are normal and how many uniform.

@@ -109,7 +109,7 @@ class Machine(Protocol):
     """What the operands' own operators do not say."""
 
     def bits(self, number: Any) -> Any:
-        """Bits of a float64 as a whole number."""
+        """Return the bits of a float64 as a whole number."""
 
     def number(self, bits: Any) -> Any:
         """The float64 of these bits."""
@@ -139,12 +139,12 @@ def pair_of_bits(key: Any, episode: Any, t: Any, pair: Any) -> tuple[Any, Any]:
 
 
 def uniform(machine: Machine, bits: Any) -> Any:
-    """Uniform number of the upper 52 of 64 bits."""
+    """Return the uniform number of the upper 52 of 64 bits."""
     return machine.number((bits >> 12) | ONE) - (1.0 - 2.0**-53)
 
 
 def polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
-    """Sum of ``coefficients[i] x^i``, by Horner's rule."""
+    """Return the sum of ``coefficients[i] x^i``, by Horner's rule."""
     total = x * coefficients[-1] + coefficients[-2]
     for coefficient in coefficients[-3::-1]:
         total = total * x + coefficient
@@ -152,7 +152,7 @@ def polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
 
 
 def logarithm(machine: Machine, u: Any) -> Any:
-    """Natural logarithm of numbers from 2^-1000 to 2^1000."""
+    """Return the natural logarithm of numbers from 2^-1000 to 2^1000."""
     bits = machine.bits(u) + ((RAISED << 52) - ROOT_HALF)
     m = machine.number((bits & FRACTION) + ROOT_HALF)
     e = machine.number((bits >> 52) | POWER_52) - (2.0**52 + RAISED)
@@ -197,7 +197,8 @@ ARRAYS = _Arrays()
 
 
 def numbers(identities: numpy.ndarray, t: numpy.ndarray, normals: int, uniforms: int) -> numpy.ndarray:
-    """Random numbers of episodes at measurements: ``normals`` standard normal ones, then ``uniforms`` uniform ones.
+    """Return the random numbers of episodes at measurements: ``normals`` standard normal ones, then ``uniforms``
+    uniform ones.
 
     Args:
         identities: of the episodes, ``(2, N)`` uint64.

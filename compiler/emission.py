@@ -45,7 +45,9 @@ class _Part(Instructions):
         self.known: set[int] = set()
 
     def value(self, step: int) -> str:
-        """Name of a step's value; what is free, or lies in the scratch array, is fetched where it is first needed."""
+        """Return the name of a step's value; what is free, or lies in the scratch array, is fetched where it is
+        first needed.
+        """
         operation, arguments, logical = self.steps[step]
         name = f"%v{step}"
         if step not in self.known:
@@ -101,7 +103,7 @@ class _Part(Instructions):
         self.write(argument, row, self.as_number(value) if self.steps[step].logical else value)
 
     def scratch(self, place: int) -> str:
-        """Address of a place in the scratch array."""
+        """Return the address of a place in the scratch array."""
         return self.new(f"getelementptr i8, ptr %scratch, i64 {place * self.block.alignment}")
 
     def hand_on(self, step: int) -> None:
@@ -119,7 +121,7 @@ def emit(
     part: int,
     loops: bool = False,
 ) -> str:
-    """Text of a program.
+    """Return the text of a program.
 
     Args:
         program: to emit.
@@ -150,7 +152,7 @@ def emit(
 def _parts(
     program: StraightLineProgram, lane_first: Sequence[bool], block: LaneBlock, size: int
 ) -> tuple[list[list[str]], int]:
-    """Functions of a straight line, and the places of the scratch array that they use."""
+    """Return the functions of a straight line, and the places of the scratch array that they use."""
     parts, _ = cut_parts(program, size)
     slots = scratch_slots(program, parts)
     places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
@@ -189,14 +191,14 @@ def _entry(block: LaneBlock, parts: int, slots: int) -> Iterator[str]:
 
 
 def product_symbol(block: LaneBlock) -> str:
-    """Name of the function that programs call for the product of a matrix."""
+    """Return the name of the function that programs call for the product of a matrix."""
     return f"filtergym_product_{block.lanes}"
 
 
 @functools.cache
 def product_text(block: LaneBlock) -> str:
-    """Text whose ``@program(matrix, vector, result, columns, bands)`` is the product of a matrix of constants with a
-    vector of lane values: bands of rows side by side, each row's terms added one after the other.
+    """Return the text whose ``@program(matrix, vector, result, columns, bands)`` is the product of a matrix of
+    constants with a vector of lane values: bands of rows side by side, each row's terms added one after the other.
 
     It is code of its own, and always optimised: programs spend their time in it.
 
@@ -249,7 +251,7 @@ def _product_lines(block: LaneBlock) -> Iterator[str]:
 
 
 def _declarations(program: StraightLineProgram, library: Library, block: LaneBlock) -> Iterator[str]:
-    """Intrinsics, and functions of a block made of the library's."""
+    """Return the intrinsics, and functions of a block made of the library's."""
     used = program.steps.operations
     if "product" in used:
         yield f"declare void @{product_symbol(block)}(ptr, ptr, ptr, i64, i64)"

@@ -38,7 +38,7 @@ class Leaf(NamedTuple):
 
 
 def leaves(part: Any) -> list[Any]:
-    """Arrays of nested tuples and dictionaries, in order; None holds none."""
+    """Return the arrays of nested tuples and dictionaries, in order; None holds none."""
     if part is None:
         return []
     if isinstance(part, dict):
@@ -49,7 +49,7 @@ def leaves(part: Any) -> list[Any]:
 
 
 def map_arrays(function: Callable[[Any], Any], part: Any) -> Any:
-    """Nested tuples and dictionaries with a function applied to every array."""
+    """Return the nested tuples and dictionaries with a function applied to every array."""
     if part is None:
         return None
     if isinstance(part, dict):
@@ -254,17 +254,17 @@ def run_over(
 
 @functools.cache
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Threads of this process; a forked one has its own."""
+    """Return the threads of this process; a forked one has its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix="lanes")
 
 
 def round_up_lanes(count: int) -> int:
-    """Lanes that so many take: the next multiple of ``LANES``."""
+    """Return the lanes that so many take: the next multiple of ``LANES``."""
     return -(-count // LANES) * LANES
 
 
 def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
-    """Memory for ``(*shape, width)`` float64 numbers whose rows begin on cache lines."""
+    """Return the memory for ``(*shape, width)`` float64 numbers whose rows begin on cache lines."""
     # An odd number of cache lines: rows a power of two apart would share the same few places of the cache.
     stride = width + (LANES if width // LANES % 2 == 0 else 0)
     memory = numpy.empty(math.prod(shape) * stride + LANES)
@@ -273,12 +273,12 @@ def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
 
 
 def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
-    """Memory for the arrays that a program reads or writes."""
+    """Return the memory for the arrays that a program reads or writes."""
     return [empty_lanes(leaf.shape, width) for leaf in arrays]
 
 
 def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
-    """Copies of arrays in their own types, in the places of a template of their numbers."""
+    """Return the copies of arrays in their own types, in the places of a template of their numbers."""
 
     def copied(i: int) -> numpy.ndarray:
         return memory[i].astype(DTYPES[kinds[i]], order="C")
@@ -360,7 +360,7 @@ def _structure(part: Any) -> Any:
 
 
 def _ready(array: Any, width: int) -> numpy.ndarray:
-    """Array as the code reads it: float64, rows one after the other, a multiple of eight lanes."""
+    """Return the array as the code reads it: float64, rows one after the other, a multiple of eight lanes."""
     if array.__class__ is not numpy.ndarray or array.dtype != numpy.float64:
         array = numpy.asarray(array, dtype=numpy.float64)
     if array.shape[-1] != width:
@@ -376,17 +376,17 @@ def _ready(array: Any, width: int) -> numpy.ndarray:
 
 
 def address_of(array: numpy.ndarray) -> int:
-    """Address of an array's first number."""
+    """Return the address of an array's first number."""
     return int(array.__array_interface__["data"][0])
 
 
 def _stride(array: numpy.ndarray) -> int:
-    """Numbers from one row to the next."""
+    """Return the numbers from one row to the next."""
     # An axis of one row may have any stride.
     apart = [stride for length, stride in zip(array.shape[:-1], array.strides, strict=False) if length > 1]
     return apart[-1] // array.itemsize if apart else 0
 
 
 def _lane_stride(array: numpy.ndarray) -> int:
-    """Numbers from one lane to the next of what is written lane by lane."""
+    """Return the numbers from one lane to the next of what is written lane by lane."""
     return array.strides[0] // array.itemsize

@@ -74,7 +74,7 @@ RULES: dict[str, Callable[..., tuple[Any, ...]]] = {
 def pullback(
     graph: Graph, outputs: Sequence[Traced], adjoints: Sequence[Traced], inputs: Sequence[Traced]
 ) -> list[Traced]:
-    """Gradients of ``sum(adjoint * output)`` with respect to some arrays; the graph must be open.
+    """Return the gradients of ``sum(adjoint * output)`` with respect to some arrays; the graph must be open.
 
     Args:
         graph: that the arrays belong to.

@@ -38,7 +38,7 @@ class Instructions:
         self.constants: str = self._entry("ptr", 0)
 
     def new(self, expression: str, name: str | None = None, lines: list[str] | None = None) -> str:
-        """Name of a new value."""
+        """Return the name of a new value."""
         if name is None:
             self._names += 1
             name = f"%t{self._names}"
@@ -48,7 +48,7 @@ class Instructions:
     # --- arguments
 
     def argument(self, argument: int) -> tuple[str, str]:
-        """Address and stride of an argument."""
+        """Return the address and stride of an argument."""
         if argument not in self._arguments:
             self._arguments[argument] = (
                 self._entry("ptr", 1 + 2 * argument),
@@ -61,7 +61,7 @@ class Instructions:
         return self.new(f"load {kind}, ptr {address}, !invariant.load !0", lines=self.head)
 
     def place(self, argument: int, row: int | str) -> str:
-        """Address of the block's numbers in a row of an argument."""
+        """Return the address of the block's numbers in a row of an argument."""
         address, stride = self.argument(argument)
         if argument not in self._first_rows:
             self._first_rows[argument] = self.new(
@@ -71,7 +71,7 @@ class Instructions:
         return self.new(f"getelementptr double, ptr {self._first_rows[argument]}, i64 {start}")
 
     def read(self, argument: int, row: int | str, name: str | None = None) -> str:
-        """Numbers in a row of an argument."""
+        """Return the numbers in a row of an argument."""
         if not self.lane_first[argument]:
             return self.new(f"load {self.numbers}, ptr {self.place(argument, row)}, align 8", name)
         value = "poison"
@@ -91,7 +91,7 @@ class Instructions:
             self.lines.append(f"store double {number}, ptr {address}, align 8")
 
     def _lane_places(self, argument: int, row: int | str) -> Iterator[str]:
-        """Addresses of the block's numbers in an argument that is written lane by lane."""
+        """Return the addresses of the block's numbers in an argument that is written lane by lane."""
         start, stride = self.argument(argument)
         first = self.new(f"mul i64 %lane, {stride}")
         first = self.new(f"add i64 {first}, {row}")
@@ -101,7 +101,7 @@ class Instructions:
             yield self.new(f"getelementptr double, ptr {start}, i64 {offset}")
 
     def constant(self, address: str, name: str | None = None) -> str:
-        """Constant, in every lane."""
+        """Return the constant, in every lane."""
         value = self.new(f"load double, ptr {address}, !invariant.load !0")
         one = self.new(f"insertelement {self.numbers} poison, double {value}, i32 0")
         return self.new(self.block.repeat(one, self.numbers), name)
@@ -124,7 +124,7 @@ class Instructions:
         return self.new(f"select {self.truths} {condition}, {kind} {one}, {kind} {other}", name)
 
     def compare(self, how: str, one: str, other: str, name: str | None = None) -> str:
-        """Truth of a comparison in each lane."""
+        """Return the truth of a comparison in each lane."""
         return self.new(f"fcmp {how} {self.numbers} {one}, {other}", name)
 
     def call(self, function: str, *values: str, name: str | None = None) -> str:

@@ -13,7 +13,7 @@ _COMPUTE: dict[str, Callable[..., Any]] = {**OPERATIONS, **FUNCTIONS, "where": n
 
 
 def first_steps(program: StraightLineProgram, results: int) -> int:
-    """Number of steps after which the first results are known."""
+    """Return the number of steps after which the first results are known."""
     return 1 + max((result.node for result in program.results[:results]), default=-1)
 
 
@@ -66,7 +66,7 @@ def interpret(
 
 
 def in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
-    """Numbers of a precision, in place of those beyond its range the nearest normal ones."""
+    """Return the numbers of a precision, in place of those beyond its range the nearest normal ones."""
     limits = numpy.finfo(dtype)
     size = numpy.clip(numpy.abs(constants), float(limits.tiny), float(limits.max))
     changed = numpy.isfinite(constants) & (constants != 0.0) & (limits.dtype != numpy.float64)
@@ -76,7 +76,9 @@ def in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
 
 
 def _places(index: Any, length: int) -> numpy.ndarray:
-    """Places in a table: negative ones from its end, those outside at the nearest one, what is no number at zero."""
+    """Return the places in a table: negative ones from its end, those outside at the nearest one, what is no number
+    at zero.
+    """
     index = numpy.asarray(index, dtype=float)
     index = numpy.where(index < 0.0, index + length, index)
     inside = numpy.where(index > 0.0, numpy.minimum(index, length - 1.0), 0.0)

@@ -53,7 +53,7 @@ def _open(*names: str | None) -> ctypes.CDLL | None:
 
 @functools.cache
 def portable() -> Library:
-    """Scalar functions of the C library."""
+    """Return the scalar functions of the C library."""
     library = _open("ucrtbase") if sys.platform == "win32" else _open("libm.so.6", None)
     functions = {}
     for name in (*FUNCTIONS, *ROUNDING):
@@ -65,7 +65,7 @@ def portable() -> Library:
 
 @functools.cache
 def fastest(features: str) -> Library:
-    """Library for a processor.
+    """Return the library for a processor.
 
     Args:
         features: as LLVM lists them, ``+avx2,-avx512f,...``.

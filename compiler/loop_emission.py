@@ -17,7 +17,7 @@ class DistanceTables:
         self._found: dict[tuple[int, ...], int] = {}
 
     def find(self, distances: tuple[int, ...]) -> tuple[str, str]:
-        """Name of a table, and the type of its entries."""
+        """Return the name of a table, and the type of its entries."""
         number = self._found.setdefault(distances, len(self._found))
         return f"@places{number}", _kind(distances)
 
@@ -97,7 +97,7 @@ class LoopText(Instructions):
                 self.write(array, self._row(places), number)
 
     def _value(self, operand: Operand) -> str:
-        """Name of a member's number in this turn."""
+        """Return the name of a member's number in this turn."""
         array, places, logical = operand
         if array == TURN:
             return f"%v{places[0]}"
@@ -115,7 +115,7 @@ class LoopText(Instructions):
         return self._address(self.numbers, "%scratch", places)
 
     def _address(self, kind: str, array: str, places: tuple[int, ...]) -> str:
-        """Address of a member in an array."""
+        """Return the address of a member in an array."""
         first, way = self._way(places)
         if way is not None:
             if (array, way) not in self._bases:
@@ -124,7 +124,7 @@ class LoopText(Instructions):
         return self.new(f"getelementptr {kind}, ptr {array}, i64 {first}")
 
     def _row(self, places: tuple[int, ...]) -> int | str:
-        """Row of a member."""
+        """Return the row of a member."""
         first, way = self._way(places)
         return first if way is None else way if first == 0 else self.new(f"add i64 {way}, {first}")
 

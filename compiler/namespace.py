@@ -51,7 +51,7 @@ def tracing(graph: Graph) -> Iterator[Graph]:
 
 
 def _settled(array: Any, use: str) -> Any:
-    """Plain value that the open graph has for an expression, see :meth:`.Graph.settle`."""
+    """Return the plain value that the open graph has for an expression, see :meth:`.Graph.settle`."""
     graph = _OPEN.get(None)
     return None if graph is None or array.nodes.size != 1 else graph.settle(array.nodes.item(), use)
 
@@ -117,7 +117,7 @@ class Traced:
         self.dtype: numpy.dtype = numpy.dtype(dtype)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
-        """Array of objects, on which NumPy's own arithmetic makes expressions, too."""
+        """Return the array of objects, on which NumPy's own arithmetic makes expressions, too."""
         from . import numpy_functions  # noqa: F401  (gives the objects the methods that NumPy calls)
 
         objects = numpy.empty(self.shape, dtype=object)
@@ -195,11 +195,11 @@ class Traced:
         return sum(self, axis=axis)
 
     def min(self, axis: int | None = None) -> "Traced":
-        """Smallest entry along an axis, or of all."""
+        """Return the smallest entry along an axis, or of all."""
         return min(self, axis=axis)
 
     def max(self, axis: int | None = None) -> "Traced":
-        """Largest entry along an axis, or of all."""
+        """Return the largest entry along an axis, or of all."""
         return max(self, axis=axis)
 
     def any(self, axis: int | None = None) -> "Traced":
@@ -221,7 +221,7 @@ class Traced:
         return self.reshape(())
 
     def dot(self, other: Any) -> "Traced":
-        """Product with a vector or a matrix."""
+        """Return the product with a vector or a matrix."""
         return matmul(self, other)
 
     def ravel(self) -> "Traced":
@@ -246,7 +246,7 @@ class Traced:
 
 
 def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None) -> Traced:
-    """Array of constants, or the traced array itself."""
+    """Return the array of constants, or the traced array itself."""
     if isinstance(values, Traced):
         return values if dtype is None else astype(values, dtype)
     if isinstance(values, list | tuple) and builtins.any(isinstance(value, Traced) for value in values):
@@ -284,7 +284,7 @@ def _numbers(array: Traced) -> Traced:
 
 
 def _join(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
-    """Arrays as traced ones of one kind, numbers or truth values, and NumPy's common type of them."""
+    """Return the arrays as traced ones of one kind, numbers or truth values, and NumPy's common type of them."""
     if builtins.all(isinstance(array, Traced) and array.dtype == float64 for array in arrays):
         return list(arrays), float64
     found = [asarray(array) for array in arrays]
@@ -393,7 +393,7 @@ def clip(x: Any, min: Any = None, max: Any = None) -> Traced:
 
 
 def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
-    """Array of another type; from numbers to whole numbers the fraction is cut off."""
+    """Return the array of another type; from numbers to whole numbers the fraction is cut off."""
     x, dtype = asarray(x), numpy.dtype(dtype)
     if dtype.kind not in "fiub":
         raise NotTraceable(f"arrays of {dtype} cannot be traced")
@@ -407,7 +407,7 @@ def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
 
 
 def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
-    """Function of one array that moves its entries, as NumPy's."""
+    """Return the function of one array that moves its entries, as NumPy's."""
 
     @functools.wraps(move)
     def function(x: Any, *arguments: Any, **keywords: Any) -> Traced:
@@ -418,7 +418,7 @@ def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
 
 
 def _gatherer(gather: Callable[..., Any]) -> Callable[..., Traced]:
-    """Function of several arrays that puts them together, as NumPy's."""
+    """Return the function of several arrays that puts them together, as NumPy's."""
 
     @functools.wraps(gather)
     def function(arrays: Any, *, axis: int | None = 0) -> Traced:
@@ -439,7 +439,7 @@ concat, stack = _gatherer(numpy.concat), _gatherer(numpy.stack)
 
 
 def _maker(make: Callable[..., Any]) -> Callable[..., Traced]:
-    """Function that makes an array of constants, as NumPy's."""
+    """Return the function that makes an array of constants, as NumPy's."""
 
     @functools.wraps(make)
     def function(*arguments: Any, dtype: Any = None, device: Any = None) -> Traced:
@@ -452,12 +452,12 @@ zeros, ones, eye, arange = (_maker(make) for make in (numpy.zeros, numpy.ones, n
 
 
 def full(shape: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
-    """Array of one value, which may depend on numbers."""
+    """Return the array of one value, which may depend on numbers."""
     return broadcast_to(asarray(value, dtype), shape)
 
 
 def full_like(x: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
-    """Array of one value, shaped like another."""
+    """Return the array of one value, shaped like another."""
     x = asarray(x)
     return full(x.shape, value, dtype=dtype or x.dtype)
 
@@ -472,13 +472,14 @@ def tril(x: Any, /, *, k: int = 0) -> Traced:
 
 
 def triu(x: Any, /, *, k: int = 0) -> Traced:
-    """Upper triangle, zeros below it."""
+    """Return the upper triangle, zeros below it."""
     x = asarray(x)
     return where(numpy.triu(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
 
 
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
-    """Entries by their place; places that depend on numbers choose from a table of constants, or one by one.
+    """Return the entries by their place; places that depend on numbers choose from a table of constants, or one by
+    one.
 
     A large table of constants had better stay an array of NumPy: its numbers do not become expressions then.
     """
@@ -503,7 +504,7 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
 
 
 def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) -> numpy.ndarray:
-    """Entries of each row ``(R, choices)`` at some places, ``(R, places)``."""
+    """Return the entries of each row ``(R, choices)`` at some places, ``(R, places)``."""
     chosen = numpy.empty((len(rows), len(places)), dtype=numpy.int64)
     open_rows, open_places = [], []
     graph.begin_group()
@@ -571,7 +572,8 @@ def _is_loop(matrix: Any) -> builtins.bool:
 
 
 def matmul(a: Any, b: Any, /) -> Traced:
-    """Product of matrices, the terms added one after the other; what is multiplied by a constant zero is left out.
+    """Return the product of matrices, the terms added one after the other; what is multiplied by a constant zero is
+    left out.
 
     Where the graph allows loops, the product with a large matrix of constants is one.
     """

@@ -135,7 +135,7 @@ PRODUCT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, ctypes.
 
 
 def address_of_code(code: Any) -> int:
-    """Address of a native function."""
+    """Return the address of a native function."""
     return ctypes.cast(code, ctypes.c_void_p).value or 0
 
 
@@ -249,13 +249,13 @@ def native_text(text: str, signature: Any = NATIVE, level: int = 1) -> Any:
 
 
 def _key(*texts: str) -> str:
-    """Name of the code that is made of some texts for this processor."""
+    """Return the name of the code that is made of some texts for this processor."""
     return cache.key(*texts, *processor(), repr(llvm().llvm_version_info))
 
 
 def _text_of(program: StraightLineProgram) -> str:
-    """Text that tells programs apart that have other steps or results: it takes less time than that which is emitted,
-    and other numbers leave it as it is.
+    """Return the text that tells programs apart that have other steps or results: it takes less time than that
+    which is emitted, and other numbers leave it as it is.
     """
     steps, results = program.steps, numpy.array(program.results, dtype=numpy.int64)
     columns = (steps.kinds, steps.begins, steps.arguments, steps.logical, results)
@@ -264,7 +264,7 @@ def _text_of(program: StraightLineProgram) -> str:
 
 @functools.cache
 def _own_text() -> str:
-    """Text of this compiler, which decides what becomes of a program."""
+    """Return the text of this compiler, which decides what becomes of a program."""
     return "".join(path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py")))
 
 

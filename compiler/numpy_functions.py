@@ -17,7 +17,7 @@ from .namespace import NotTraceable, Traced
 
 
 def log_add_exp(one: Any, other: Any) -> Traced:
-    """Logarithm of the sum of two exponentials, which do not overflow."""
+    """Return the logarithm of the sum of two exponentials, which do not overflow."""
     larger = namespace.maximum(one, other)
     apart = namespace.abs(namespace.subtract(one, other))
     # Of two equal infinities the difference is no number.
@@ -26,7 +26,7 @@ def log_add_exp(one: Any, other: Any) -> Traced:
 
 
 def arg_max(x: Any, axis: int) -> Traced:
-    """Place of the largest entry along an axis, of several the first."""
+    """Return the place of the largest entry along an axis, of several the first."""
     rows = namespace.moveaxis(x, axis, 0)
     place: Any = namespace.zeros_like(rows[0], dtype=namespace.float64)
     largest: Any = rows[0]
@@ -55,7 +55,7 @@ def copy_array(x: Any, order: str = "K") -> Traced:
 
 
 def full_like(x: Any, value: Any, dtype: Any = None) -> Traced:
-    """Array of one value, shaped like another."""
+    """Return the array of one value, shaped like another."""
     return namespace.full_like(x, value, dtype=dtype)
 
 
@@ -77,7 +77,7 @@ def split(x: Any, sections: int, axis: int = 0) -> list[Traced]:
 def interpolate(
     x: Any, places: Any, values: Any, left: Any = None, right: Any = None, period: None = None
 ) -> Traced:
-    """Linear interpolation between places that increase, and the end values beyond."""
+    """Return the linear interpolation between places that increase, and the end values beyond."""
     if period is not None:
         raise _refusal(numpy.interp, {"period": period})
     places = numpy.asarray(places, dtype=float)
@@ -92,14 +92,14 @@ def interpolate(
 
 
 def norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Traced:
-    """Euclidean length, of all numbers or along an axis."""
+    """Return the Euclidean length, of all numbers or along an axis."""
     if ord not in (None, 2) or (ord == 2 and x.ndim > 1 and not isinstance(axis, int)):
         raise _refusal(numpy.linalg.norm, {"ord": ord})
     return namespace.sqrt(namespace.sum(namespace.square(x), axis=axis, keepdims=keepdims))
 
 
 def dot(one: Any, other: Any) -> Traced:
-    """Product of vectors, matrices or numbers."""
+    """Return the product of vectors, matrices or numbers."""
     one, other = namespace.asarray(one), namespace.asarray(other)
     return namespace.matmul(one, other) if one.ndim and other.ndim else namespace.multiply(one, other)
 
@@ -113,12 +113,12 @@ def select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) 
 
 
 def cube_root(x: Any) -> Traced:
-    """Cube root, of negative numbers, too."""
+    """Return the cube root, of negative numbers, too."""
     return namespace.multiply(namespace.sign(x), namespace.pow(namespace.abs(x), 1.0 / 3.0))
 
 
 def remainder_of_dividend(one: Any, other: Any) -> Traced:
-    """Remainder with the sign of the dividend."""
+    """Return the remainder with the sign of the dividend."""
     size = namespace.remainder(namespace.abs(one), namespace.abs(other))
     return namespace.multiply(namespace.where(namespace.less(one, 0.0), -1.0, 1.0), size)
 

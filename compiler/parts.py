@@ -14,7 +14,7 @@ Statement = int | ProgramResult
 
 
 def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[list[list[Statement]], int]:
-    """Statements of each part: every step but those that are free, and every result right after its step.
+    """Return the statements of each part: every step but those that are free, and every result right after its step.
 
     Args:
         program: to cut.

@@ -79,7 +79,7 @@ BEFORE = {"input": 2, "constant": 1, "take": 2, "product": 2, "entry": 1}
 
 
 def unband(table: numpy.ndarray, rows: int, columns: int) -> numpy.ndarray:
-    """Matrix ``(rows, columns)`` of the table of a product."""
+    """Return the matrix ``(rows, columns)`` of the table of a product."""
     return table.reshape(-1, columns, BAND).swapaxes(1, 2).reshape(-1, columns)[:rows]
 
 
@@ -144,8 +144,8 @@ class Graph:
         return found
 
     def settle(self, node: int, use: str) -> Any:
-        """Plain value of an expression that decides a ``branch``, becomes a ``number`` or is put into ``words``; None:
-        there is none.
+        """Return the plain value of an expression that decides a ``branch``, becomes a ``number`` or is put into
+        ``words``; None: there is none.
         """
         return None
 
@@ -156,7 +156,7 @@ class Graph:
             self.callers[self.group] = _callers()
 
     def input(self, argument: int, row: int) -> int:
-        """Number in a row of an argument."""
+        """Return the number in a row of an argument."""
         return self._intern(("input", argument, row), "input", (argument, row), None, False)
 
     def constant(self, value: Any) -> int:
@@ -166,7 +166,7 @@ class Graph:
         return self.constants(numpy.array([value], dtype=numpy.float64))[0]
 
     def constants(self, values: numpy.ndarray) -> list[int]:
-        """Numbers that are known, float64 ``(n,)``."""
+        """Return the numbers that are known, float64 ``(n,)``."""
         found, made = self._found, []
         # By its bits: -0.0 is not 0.0, and NaN is itself.
         for bits, value in zip(values.view(numpy.int64).tolist(), values.tolist(), strict=True):
@@ -177,7 +177,9 @@ class Graph:
         return made
 
     def take(self, table: numpy.ndarray, index: int) -> int:
-        """Entry of a table; an index outside is that of the nearest end, a negative one counts from the last."""
+        """Return the entry of a table; an index outside is that of the nearest end, a negative one counts from the
+        last.
+        """
         known = self.values[index]
         if known is not None:
             return self.constant(table[int(known)])
@@ -187,7 +189,8 @@ class Graph:
         return self._intern(("take", place, index), "take", (place, index), None, False)
 
     def product(self, matrix: numpy.ndarray, vector: Sequence[int]) -> list[int]:
-        """Entries of the product of a matrix ``(rows, columns)`` with a vector, summed from the first column on.
+        """Return the entries of the product of a matrix ``(rows, columns)`` with a vector, summed from the first
+        column on.
 
         The table holds the matrix as the loop reads it: bands of ``BAND`` rows, the last one filled up with zeros, and
         in each the columns one after the other.
@@ -218,7 +221,7 @@ class Graph:
         return int(self._found[key])
 
     def node(self, name: str, *arguments: int) -> int:
-        """Expression of others."""
+        """Return the expression of others."""
         known = self.values
         values = [known[argument] for argument in arguments]
         if None not in values:
@@ -233,7 +236,8 @@ class Graph:
         return self._intern(key, name, arguments, None, logical)
 
     def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Expressions of others, member by member: what :meth:`node` makes of each, in a fraction of the time.
+        """Return the expressions of others, member by member: what :meth:`node` makes of each, in a fraction of the
+        time.
 
         Args:
             name: of the operation.
@@ -271,7 +275,9 @@ class Graph:
         known: Sequence[numpy.ndarray],
         numbers: Sequence[Any],
     ) -> Any:
-        """Members for which :meth:`_simpler` may know something that :meth:`nodes` does not do by itself."""
+        """Return the members for which :meth:`_simpler` may know something that :meth:`nodes` does not do by
+        itself.
+        """
         if name in ("maximum", "minimum"):
             return numpy.logical_or.reduce(
                 [there & (number != number) for there, number in zip(known, numbers, strict=True)]
@@ -299,7 +305,7 @@ class Graph:
         self._counted = count
 
     def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Expressions of others that have no simpler form."""
+        """Return the expressions of others that have no simpler form."""
         ordered = (numpy.minimum(*columns), numpy.maximum(*columns)) if name in COMMUTATIVE else columns
         keys = list(zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False))
         count = len(self.operations)
@@ -384,7 +390,7 @@ class Graph:
         return order
 
     def parts(self, node: int) -> tuple[int, ...]:
-        """Expressions that one is directly made of."""
+        """Return the expressions that one is directly made of."""
         name = self.operations[node]
         return () if name == "input" else self.arguments[node][OTHERS.get(name, 0) :]
 
@@ -403,7 +409,7 @@ def _callers() -> str:
 
 @functools.cache
 def _stem_outside(path: str) -> str | None:
-    """Name of a file without its ending, None of one of this package."""
+    """Return the name of a file without its ending, None of one of this package."""
     return None if Path(path).parent == Path(__file__).parent else Path(path).stem
 
 
@@ -526,7 +532,7 @@ class StraightLineProgram(NamedTuple):
 
 @without_collection()
 def program(graph: Graph, wanted: Sequence[ProgramResult]) -> StraightLineProgram:
-    """Program for some expressions of a graph."""
+    """Return the program for some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
     operations = list(map(graph.operations.__getitem__, order))
     given = list(map(graph.arguments.__getitem__, order))

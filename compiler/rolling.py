@@ -160,7 +160,7 @@ class _Roller:
     # --- what becomes a statement
 
     def _alike(self) -> Iterator[numpy.ndarray]:
-        """Steps of one array operation with one form, in the order of that operation."""
+        """Return the steps of one array operation with one form, in the order of that operation."""
         parts = self.parts
         computed = numpy.flatnonzero(self.source == COMPUTED)
         if not len(computed):
@@ -287,7 +287,7 @@ class _Roller:
                 yield _Read(None, number[i] if of_all[i] else None, statements)
 
     def _needs(self, draft: _Draft) -> dict[int, bool]:
-        """Statements that one takes members of, and whether the same turn of a loop will do."""
+        """Return the statements that one takes members of, and whether the same turn of a loop will do."""
         needs: dict[int, bool] = {}
         for _, turn, statements in draft.reads:
             for number in statements:
@@ -336,7 +336,7 @@ class _Roller:
     # --- where
 
     def finish(self) -> Rolled:
-        """Loops with the places of all that crosses them."""
+        """Return the loops with the places of all that crosses them."""
         loops = self.schedule()
         drafts = self.drafts
         turns: dict[tuple[int, int], int] = {}
@@ -406,7 +406,7 @@ class _Roller:
 
 
 def _joined(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
-    """Columns one after the other, where each begins, and how long it is."""
+    """Return the columns one after the other, where each begins, and how long it is."""
     lengths = numpy.array([len(column) for column in columns], dtype=numpy.int64)
     steps = numpy.concatenate([*columns, numpy.zeros(0, dtype=numpy.int64)])
     return steps, numpy.cumsum(lengths) - lengths, lengths
@@ -439,7 +439,7 @@ def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled
 
 
 def steady(places: Sequence[int]) -> int | None:
-    """Distance from each place to the next, where it is always the same."""
+    """Return the distance from each place to the next, where it is always the same."""
     count, first = len(places), places[0]
     step = places[1] - first if count > 1 else 0
     regular = range(first, first + step * count, step) if step else (first,) * count

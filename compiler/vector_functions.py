@@ -103,7 +103,7 @@ class VectorFunction:
         return tuple(found[result.node] for result in self._value.results)
 
     def value(self, x: Any, xp: Any) -> Any:
-        """Value at vectors.
+        """Return the value at vectors.
 
         Args:
             x: ``(n + g, N)``.
@@ -115,7 +115,7 @@ class VectorFunction:
         return xp.stack(_compute(self._value, x, xp))
 
     def jacobian(self, x: Any, xp: Any) -> Any:
-        """Jacobian at vectors, ``(m, n, N)``: rows of the value, columns of the first n of x.
+        """Return the Jacobian at vectors, ``(m, n, N)``: rows of the value, columns of the first n of x.
 
         Arguments are those of :meth:`value`.
         """
@@ -128,7 +128,7 @@ def _program(graph: Graph, nodes: Sequence[int]) -> StraightLineProgram:
 
 
 def _compute(program: StraightLineProgram, x: Any, xp: Any) -> list[Any]:
-    """Results of a program on lanes ``(n, N)``, each ``(N,)``."""
+    """Return the results of a program on lanes ``(n, N)``, each ``(N,)``."""
     values: list[Any] = []
 
     def array(place: int) -> Any:
