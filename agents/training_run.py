@@ -480,7 +480,7 @@ def resume_run(folder: Path, requested: TrainingRun, same: bool = False) -> Trai
     return run
 
 
-def holds_run(folder: Path) -> bool:
+def has_run(folder: Path) -> bool:
     """Return whether a folder contains a training run with at least one checkpoint."""
     return (folder / "run.json").exists() or find_folder(folder / "checkpoint").exists()
 
@@ -497,7 +497,7 @@ def open_run(folder: Path, requested: TrainingRun, resume: bool, same: bool = Fa
     Raises:
         ValueError: if the folder cannot be written to, or contains a run that is not to be resumed or a different one.
     """
-    if not resume and holds_run(folder):
+    if not resume and has_run(folder):
         raise ValueError(
             f"{folder} contains a training run: add --resume to continue it, or choose another folder"
         )

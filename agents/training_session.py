@@ -160,7 +160,7 @@ class Bookkeeping:
         self.folder: Path = session.folder
         self.interval: int = session.steps_between_validations(run)
         self.report: Callable[[str], None] = session.report
-        self.on_validation: Callable[[ValidationEntry], bool] = session.validated
+        self.on_validation: Callable[[ValidationEntry], bool] = session.on_validation
         self.policy, self.save_checkpoint, self.save_agent = trainee
         self.validation: Validation = Validation(run)
         self.due: int = run.steps_done + self.interval
