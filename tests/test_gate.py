@@ -411,10 +411,10 @@ def test_what_was_around_an_agent_is_around_it_again(monkeypatch, tmp_path):
         (
             "ppo",
             {"residual_to": "kalman-imm"},
-            "of kind estimator and has no actions that could be corrected",
+            "of kind estimator and has no actions to correct",
         ),
         ("ppo", {"residual_to": "adaptive", "control": "gains"}, "made for control 'gain', but the environ"),
-        ("ppo", {"residual_to": "imm-tuned"}, "acts under parameters of its own"),
+        ("ppo", {"residual_to": "imm-tuned"}, "has task parameters of its own"),
         ("ppo", {"gated": True, "control": "mode"}, "has no constant action that is the paper's"),
     ],
 )
@@ -431,7 +431,7 @@ def test_a_policy_that_chooses_a_hypothesis_has_no_residual():
     from filtergym.agents.training_run import RunOptions, new_run
 
     problem = problem_of("filtergym/UavAutopilot-v0")
-    with pytest.raises(ValueError, match="a residual action is added: control 'mode' has Discrete"):
+    with pytest.raises(ValueError, match="a residual action needs a continuous control: 'mode' has Discrete"):
         new_run(problem, RunOptions("ppo", residual_to="over-smoothed"))
 
 
