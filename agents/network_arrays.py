@@ -1,4 +1,4 @@
-"""The plain arrays of a trained model's network, as a learned policy takes them."""
+"""The plain arrays of a trained model's network, in the form of a learned policy."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ def _lstm(module: torch.nn.LSTM) -> dict[str, numpy.ndarray]:
     parameters = {name: values.detach().numpy() for name, values in module.named_parameters()}
     if parameters.keys() != names.keys():
         raise ValueError(
-            f"cannot export {module}: a learned policy holds one layer, with biases and no projection"
+            f"cannot export {module}: a learned policy has one layer, with biases and without projection"
         )
     return {names[name]: values for name, values in parameters.items()}
 
@@ -40,7 +40,7 @@ def network_arrays(agent: Any, algorithm: str) -> tuple[dict[str, numpy.ndarray]
     """Return the arrays, float32, output and activation of a trained model's deterministic action.
 
     Raises:
-        ValueError: for an algorithm or network that a learned policy cannot hold.
+        ValueError: for an algorithm or network that a learned policy cannot represent.
     """
     policy: Any = agent.model.policy
     discrete = not hasattr(agent.action_space, "low")

@@ -198,7 +198,7 @@ def test_a_network_that_arrays_cannot_hold_is_validated_as_a_model(tmp_path):
     model = str(tmp_path / "best" / "model.zip")
     costs = evaluate(ID, [model], episodes=16, split="validation", trust=True)["cost"].values[0]
     assert entry["cost"] == validation.Bootstrap(16).means(costs.mean(axis=1))[0]
-    with pytest.raises(ValueError, match=r"cannot export LSTM\(.*num_layers=2.*holds one layer"):
+    with pytest.raises(ValueError, match=r"cannot export LSTM\(.*num_layers=2.*has one layer"):
         export_run(tmp_path, tmp_path / "agent.safetensors", trust=True)
 
 
