@@ -1,6 +1,7 @@
 """Loops of a program as text of LLVM: a function for each, whose turns compute the members of its statements.
 
-A member's number lies where the turn says: a multiple of its number away from the first, or as far as a table says.
+The place of a member's number depends on the turn: its distance from the first is a multiple of the turn's number, or
+an entry of a table.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Statement, steady
 
 
 class DistanceTables:
-    """Distances of members that are not always the same, as constants of the text."""
+    """Tables of irregular distances between members, as constants of the text."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[int, ...], int] = {}
@@ -40,10 +41,10 @@ class LoopText(Instructions):
     """Text of a loop.
 
     Args:
-        loop: to write.
-        lane_first: of every argument whether it is written lane by lane.
+        loop: the loop.
+        lane_first: for every argument whether its layout is lane by lane.
         block: lanes that are computed at a time.
-        tables: of all loops.
+        tables: tables of all loops.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class LoopText(Instructions):
         return first if way is None else way if first == 0 else self.new(f"add i64 {way}, {first}")
 
     def _way(self, places: tuple[int, ...]) -> tuple[int, str | None]:
-        """A place, and how far from it the turn's one is; None: not at all."""
+        """Return the first place, and the name of the turn's distance from it; None: zero."""
         step = steady(places)
         if step == 0:
             return places[0], None
