@@ -293,7 +293,7 @@ def test_an_index_outside_reads_the_nearest_end_and_nan_within():
         (lambda x: np.array([x[0, 0]], dtype=float), "numpy.array of one without dtype"),
         (lambda x: np.zeros((3, 1)).__setitem__(0, x[0]), "in place of an array whose entries are set"),
         (lambda x: x.__setitem__(0, x[1]), "an entry of the given array is set: return a list"),
-        (lambda x: np.maximum(np.array([x[0, 0]]), 0.0), "of numpy.stack in place of numpy.array"),
+        (lambda x: np.maximum(np.array([x[0, 0]]), 0.0), "use numpy.stack in place of numpy.array"),
         (lambda x: [1, 2, 3][x[0, 0]], "a branch or a loop depends"),
         (lambda x: np.frexp(x)[0], "numpy.frexp cannot be traced"),
         (lambda x: np.linalg.inv(x), "numpy.linalg.inv cannot be traced: write out the formula"),
