@@ -38,12 +38,12 @@ from ..evaluation.competitors.kinds import Policy
 from ..evaluation.running.seeds import episode_seeds
 from ..filters.array_namespace import host_array
 from .eager_optimiser import exclude_from_compilation, step_eagerly
-from .gate import Gate, as_trained
+from .gate import Gate, wrap_as_trained
 from .learned_estimator import EstimatorMaker
 from .learned_policy import LearnedPolicy, write_arrays
 from .settings import ESTIMATORS
 from .training_run import TrainingRun, schedule
-from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
+from .training_session import Bookkeeping, Session, Trainee, curve_writer, interruption, make_logger
 from .unrolled import Teacher, Unrolled
 
 NETWORKS = ("linear", "feedforward", "recurrent")
@@ -305,10 +305,9 @@ def _reward_with_teacher(run: TrainingRun) -> TrainingObjective:
     return TrainingObjective(kind, share)
 
 
-def _agent_of(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
-    """Return the current network of a training as an agent."""
+def _make_agent(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
     network = LearnedPolicy(model, policy.arrays(), "tanh", ACTIVATION, policy.fields(model))
-    return as_trained(model, network, gated=gated)
+    return wrap_as_trained(model, network, gated=gated)
 
 
 class Descent:
@@ -384,7 +383,7 @@ class Descent:
     def trainee(self) -> Trainee:
         """Return the agent with its functions for saving."""
         run, policy = self.run, self.policy
-        agent = functools.partial(_agent_of, policy, run.gated)
+        agent = functools.partial(_make_agent, policy, run.gated)
 
         def save_agent(place: Path) -> None:
             path = place / "agent.safetensors"
@@ -445,14 +444,14 @@ def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
     else:
         measure_normalisation(descent.env, descent.policy)
     fly = descent.flight()
-    logger = logger_in(session.folder / "log", descent.steps_done)
+    logger = make_logger(session.folder / "log", descent.steps_done)
 
     def descend() -> None:
         logger.record_mean("train/gradient_norm", descent.update())
 
     per_iteration = run.envs * descent.env.last_decision
     with interruption() as stop:
-        books = Bookkeeping(run, session, descent.trainee(), stop, curves_beside(logger), began)
+        books = Bookkeeping(run, session, descent.trainee(), stop, curve_writer(logger), began)
         stopping = False
         while descent.steps_done < run.steps and not stopping:
             descent.follow_schedule()

@@ -88,7 +88,7 @@ class TrustMemory(NamedTuple):
     alarm: Any
     envelope: Any
     """None without an envelope."""
-    heeded: Array
+    active: Array
     """Remaining decisions for which the alarm is active, ``(N,)``."""
     outside: Array
     """Remaining decisions for which the agent is not trusted after an observation outside its training, ``(N,)``."""
@@ -136,13 +136,13 @@ class Trust:
             Booleans ``(N,)``, and memory.
         """
         none = 0.0 * observation[:, 0]
-        alarm, envelope, heeded, outside = (None, None, none, none) if memory is None else memory
+        alarm, envelope, active, outside = (None, None, none, none) if memory is None else memory
         spoken, alarm = self.alarm.hear(observation, alarm, start)
-        heeded = self._count_down(spoken, heeded, start)
+        active = self._count_down(spoken, active, start)
         if self.envelope is not None:
             left, envelope = self.envelope.hear(observation, envelope, start)
             outside = self._count_down(left, outside, start)
-        return (heeded > 0.0) & (outside <= 0.0), TrustMemory(alarm, envelope, heeded, outside)
+        return (active > 0.0) & (outside <= 0.0), TrustMemory(alarm, envelope, active, outside)
 
     def _count_down(self, spoken: Array, before: Array, start: Array) -> Array:
         left = numpy.maximum(numpy.where(start, 0.0, before) - 1.0, 0.0)
@@ -260,7 +260,7 @@ class Gated(Policy):
 # --- two filters
 
 
-class ListeningMemory(NamedTuple):
+class MonitoredMemory(NamedTuple):
     """Memory of a policy and of its alarms."""
 
     policy: Any
@@ -269,7 +269,7 @@ class ListeningMemory(NamedTuple):
     """Whether the policy is trusted, booleans ``(N,)``."""
 
 
-class ListeningPolicy(Policy):
+class MonitoredPolicy(Policy):
     """A policy whose memory includes whether it is trusted; its actions do not change.
 
     Args:
@@ -285,13 +285,13 @@ class ListeningPolicy(Policy):
         self.trust = trust
 
     def act(
-        self, observation: numpy.ndarray, state: ListeningMemory | None, start: numpy.ndarray
-    ) -> tuple[numpy.ndarray, ListeningMemory]:
+        self, observation: numpy.ndarray, state: MonitoredMemory | None, start: numpy.ndarray
+    ) -> tuple[numpy.ndarray, MonitoredMemory]:
         """Run the policy, then the alarms."""
         memory, trust = (None, None) if state is None else state[:2]
         action, memory = self.policy.predict(observation, memory, start, deterministic=True)
         trusted, trust = self.trust.listen(observation, trust, start)
-        return action, ListeningMemory(memory, trust, trusted)
+        return action, MonitoredMemory(memory, trust, trusted)
 
 
 class GatedState(NamedTuple):
@@ -325,7 +325,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
     is not scaled: its innovations are those before its action.
 
     Args:
-        agent: a filter whose policy is a :class:`ListeningPolicy`.
+        agent: a filter whose policy is a :class:`MonitoredPolicy`.
         fallback: a filter.
     """
 
@@ -501,7 +501,7 @@ class GatedMaker:
             policy = replace(policy)
         trust = Trust(shown, self.alarm, self.window, self.envelope)
         interval = 1 if self._decides_always else task.decision_interval
-        agent = LearnedEstimator(model, ListeningPolicy(policy, trust, shown), interval)
+        agent = LearnedEstimator(model, MonitoredPolicy(policy, trust, shown), interval)
         return GatedEstimator(agent, self._make_fallback(task))
 
     def _make_fallback(self, task: Task) -> Filter[Any, Any, Any]:
@@ -565,7 +565,7 @@ class PolicyMaker:
         return self.wrap(model, make_competitor(self.maker, model))
 
 
-def as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool = False) -> Any:
+def wrap_as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool = False) -> Any:
     """Return an agent as it acts in its training run.
 
     Args:

@@ -25,7 +25,7 @@ from ..envs.engine.catalogue import short_name, task_class
 from ..evaluation.competitors.kinds import Policy
 from ..evaluation.storage.files import whole_file
 from ..evaluation.storage.stored import fits
-from .gate import as_trained
+from .gate import wrap_as_trained
 from .learned_estimator import EstimatorMaker
 from .training_run import TrainingRun
 
@@ -355,7 +355,7 @@ class StoredPolicy:
                 f"{self.path} returns {self.header['output']} of {self.header['answers']} numbers, which is no "
                 f"action of control {model.control!r}: {space}"
             )
-        return as_trained(model, network, *self.around)
+        return wrap_as_trained(model, network, *self.around)
 
 
 def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:

@@ -9,7 +9,7 @@ from ..envs.contract.companions import action_reach
 from ..envs.contract.task import Task
 from ..envs.data.foreign_files import is_folder
 from ..evaluation.competitors.kinds import Competitor, CompetitorFiles
-from .gate import PolicyMaker, as_trained
+from .gate import PolicyMaker, wrap_as_trained
 from .learned_policy import load_policy, pretrained_path
 from .training_run import TrainingRun, best_agent, load_run
 
@@ -44,7 +44,9 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
     model = load_zipped_model(cls, path, None, trust)
     # A run.json beside the model describes the policy that it corrects, and its gate.
     return (
-        _as_recorded(model, load_run(path.parent, trust)) if (path.parent / "run.json").is_file() else model
+        _wrap_as_in_run(model, load_run(path.parent, trust))
+        if (path.parent / "run.json").is_file()
+        else model
     )
 
 
@@ -75,17 +77,17 @@ def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
     own = run.environment.rpartition(":")[2]
     if own != cls.id:
         raise ValueError(f"{folder} contains a run of {own}, not of {cls.id}")
-    return _as_recorded(load_zipped_model(cls, agent, run.control, trust), run)
+    return _wrap_as_in_run(load_zipped_model(cls, agent, run.control, trust), run)
 
 
-def _as_recorded(model: Any, run: TrainingRun) -> Any:
+def _wrap_as_in_run(model: Any, run: TrainingRun) -> Any:
     """Return a model with the policy that it corrects, its gate, and the reach of its actions."""
     reach = action_reach(run.problem.task, run.control)
     model.task_keywords = {name: run.task_keywords[name] for name in reach if name in run.task_keywords}
     if not (run.residual_to or run.gated):
         return model
     return PolicyMaker(
-        model, lambda task, agent: as_trained(task, agent, run.residual_to, run.gated), run.control
+        model, lambda task, agent: wrap_as_trained(task, agent, run.residual_to, run.gated), run.control
     )
 
 

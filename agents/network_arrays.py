@@ -23,7 +23,6 @@ def _layers(*modules: torch.nn.Module) -> tuple[dict[str, numpy.ndarray], str]:
 
 
 def _lstm(module: torch.nn.LSTM) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a long short-term memory of one layer."""
     names = {
         "weight_ih_l0": "lstm_input_weight", "bias_ih_l0": "lstm_input_bias",
         "weight_hh_l0": "lstm_memory_weight", "bias_hh_l0": "lstm_memory_bias",

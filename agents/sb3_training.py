@@ -29,14 +29,14 @@ from ..envs.contract.model import Model
 from ..evaluation.running.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
 from .eager_optimiser import exclude_from_compilation, step_eagerly
-from .gate import Gate, PolicyMaker, as_trained
+from .gate import Gate, PolicyMaker, wrap_as_trained
 from .learned_policy import LearnedPolicy, write_arrays
 from .network_arrays import network_arrays
 from .residual import policy_to_correct
 from .sb3_algorithms import ALGORITHMS, SPACES
 from .sb3_policy import Sb3Policy
 from .training_run import TrainingRun, check_trust, save_run, schedule
-from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
+from .training_session import Bookkeeping, Session, Trainee, curve_writer, interruption, make_logger
 
 
 class _Trainer(BaseCallback):
@@ -74,7 +74,6 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
 
 
 def _step_eagerly(model: BaseAlgorithm) -> None:
-    """Make every optimiser of a model step without torch's compiler."""
     found = [getattr(module, "optimizer", None) for module in model.policy.modules()]
     for optimiser in (*found, getattr(model, "ent_coef_optimizer", None)):
         if optimiser is not None:
@@ -220,20 +219,20 @@ def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
         model, env, normalisation = load_checkpoint(run, session.folder / "checkpoint", session.trust)
     else:
         model, env, normalisation = begin_model(run)
-    logger = logger_in(session.folder / "log", model.num_timesteps)
+    logger = make_logger(session.folder / "log", model.num_timesteps)
     model.set_logger(logger)
     policy = Sb3Policy(model, normalisation, run.control)
     trainee = Trainee(
         PolicyMaker(
             functools.partial(as_saved_agent, policy, run.algorithm),
-            lambda task, agent: as_trained(task, agent, run.residual_to, run.gated),
+            lambda task, agent: wrap_as_trained(task, agent, run.residual_to, run.gated),
             run.control,
         ),
         lambda place: save_checkpoint(model, env, normalisation, place),
         lambda place: save_agent(policy, run, place),
     )
     with contextlib.closing(logger), interruption() as stop:
-        books = Bookkeeping(run, session, trainee, stop, curves_beside(logger), began)
+        books = Bookkeeping(run, session, trainee, stop, curve_writer(logger), began)
         trainer = _Trainer(books, session.progress)
         remaining = run.steps - model.num_timesteps
         if remaining > 0:

@@ -24,18 +24,18 @@ ESTIMATORS = ("kalman-net", "student")
 """Algorithms that train a learned estimator: a network that acts in a filter of its own (:class:`.TrainedBanks`)."""
 THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
-OF_THE_RUN = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+RUN_ARGUMENTS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 """Arguments of an algorithm that a run sets itself."""
 
 
-def with_numbers(value: Any) -> Any:
+def convert_numbers(value: Any) -> Any:
     """Return a parsed YAML value with numbers in scientific notation converted."""
     if isinstance(value, str) and SCIENTIFIC.fullmatch(value):
         return float(value)
     if isinstance(value, list):
-        return [with_numbers(item) for item in value]
+        return [convert_numbers(item) for item in value]
     if isinstance(value, dict):
-        return {name: with_numbers(item) for name, item in value.items()}
+        return {name: convert_numbers(item) for name, item in value.items()}
     return value
 
 
@@ -70,7 +70,7 @@ def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]
                 f"--set needs env.NAME=VALUE or algo.NAME=VALUE, such as --set algo.learning_rate=0.001, got {word!r}"
             )
         try:
-            value = with_numbers(yaml.safe_load(text))
+            value = convert_numbers(yaml.safe_load(text))
         except yaml.YAMLError as error:
             raise ValueError(f"--set {path}: cannot read the value {text!r} as YAML") from error
         for name in reversed(names):
@@ -86,7 +86,7 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
         ValueError: if it cannot be read, or is not a mapping; ``needs`` describes the expected form.
     """
     try:
-        table = with_numbers(read_yaml(path))
+        table = convert_numbers(read_yaml(path))
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ValueError(f"cannot read settings from {path}: {reason}") from error
@@ -162,7 +162,7 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
         from .sb3_algorithms import ALGORITHMS
 
         cls = ALGORITHMS[algorithm]
-        known |= {"normalize", *inspect.signature(cls).parameters} - OF_THE_RUN
+        known |= {"normalize", *inspect.signature(cls).parameters} - RUN_ARGUMENTS
         policy = cls.policy_aliases.get(str(values.get("policy")))
         own = values.get("policy_kwargs") or {}
         if not isinstance(own, Mapping):

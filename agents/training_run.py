@@ -81,7 +81,7 @@ class ValidationEntry(TypedDict):
     """Value and 95 % interval."""
 
 
-class Passed(TypedDict):
+class FirstWin(TypedDict):
     """Steps and time until an agent was first better than the paper's algorithm."""
 
     steps: int
@@ -120,7 +120,7 @@ class TrainingRun:
     """Name of the policy that the agent corrects; empty: none."""
     gated: bool = False
     """Whether the agent acts behind a gate, see :mod:`.gate`."""
-    beat_paper: Passed | None = None
+    beat_paper: FirstWin | None = None
     """The first validation whose relative cost difference to the paper's algorithm has an interval below zero."""
 
     @functools.cached_property
@@ -212,13 +212,13 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
     _check_environment(problem, options, control, flown, of_environment)
     if of_environment or "env_kwargs" in values:
         values["env_kwargs"] = of_environment
-    default_envs, default_steps = (_without_point(values.pop(name)) for name in ("n_envs", "n_timesteps"))
+    default_envs, default_steps = (_as_integer(values.pop(name)) for name in ("n_envs", "n_timesteps"))
     envs = check_integer("envs", default_envs if options.envs is None else options.envs, 1)
     steps = check_integer("steps", default_steps if options.steps is None else options.steps, 1)
     return TrainingRun(
         problem.name,
         control or controls[0],
-        in_words(flown),
+        scenario_text(flown),
         algorithm,
         check_integer("seed", options.seed, 0),
         envs,
@@ -265,7 +265,7 @@ def _check_environment(
             raise nearest(name, keywords[name], words)
 
 
-def _without_point(value: Any) -> Any:
+def _as_integer(value: Any) -> Any:
     """Return a whole number as an integer: files contain 1e6."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
@@ -324,7 +324,7 @@ def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
     return weights
 
 
-def in_words(weights: Mapping[str, float]) -> str:
+def scenario_text(weights: Mapping[str, float]) -> str:
     """Return a scenario or a mixture in the form of the option ``--scenario`` and of ``gymnasium.make``."""
     if len(weights) == 1:
         return next(iter(weights))
@@ -511,16 +511,14 @@ def open_run(folder: Path, requested: TrainingRun, resume: bool, same: bool = Fa
             f"--scenario {run.scenario} --steps {run.steps} --envs {run.envs} --seed {run.seed}",
             *([f"--residual-to {run.residual_to}"] if run.residual_to else []),
             *(["--gated"] if run.gated else []),
-            *_settings_in_words(run),
+            *_settings_as_options(run),
         ]
     )
     run.versions = library_versions(LIBRARIES)
     return run
 
 
-def _settings_in_words(run: TrainingRun) -> Iterator[str]:
-    """Return the differences to the shipped hyperparameters as options."""
-
+def _settings_as_options(run: TrainingRun) -> Iterator[str]:
     def differing(path: str, own: Any, shipped: Any) -> Iterator[str]:
         if isinstance(own, dict):
             for name, value in own.items():

@@ -25,7 +25,7 @@ def _curve(entry: ValidationEntry) -> dict[str, float]:
     return curve
 
 
-def logger_in(folder: Path, steps_done: int) -> Any:
+def make_logger(folder: Path, steps_done: int) -> Any:
     """Return a logger of Stable-Baselines3 that writes CSV and, where it is installed, TensorBoard.
 
     Args:
@@ -39,7 +39,7 @@ def logger_in(folder: Path, steps_done: int) -> Any:
     return Logger(str(folder), [make_output_format(name, str(folder), suffix) for name in formats])
 
 
-def curves_beside(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
+def curve_writer(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
     """Return a function that writes numbers at once to a logger's files, without the values pending in the logger."""
     from stable_baselines3.common.logger import Logger
 

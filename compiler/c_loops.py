@@ -11,7 +11,7 @@ import numpy
 
 from .c_text import WIDTH, Scalar, array_text, comment, expression, literal
 from .program import StraightLineProgram
-from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, steady
+from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, common_difference
 
 MOST = 4
 """Most functions named in the comment before a loop."""
@@ -145,7 +145,7 @@ class Loops:
 
     def _entry(self, numbers: Sequence[int]) -> str:
         """Return the expression of a number of run ``i``."""
-        if steady(numbers) is None:
+        if common_difference(numbers) is None:
             return f"{self._table(tuple(numbers))}[i]"
         least, text = self._term(numbers, "i")
         return " + ".join([str(least)] * (least != 0 or not text) + [text] * (text != ""))
@@ -162,8 +162,8 @@ class Loops:
                 for operand in operands:
                     if operand.array not in (TURN, CONSTANTS):
                         places = self._own_places(operand, rows)
-                        if steady(places) is None:
-                            irregular.add(_from_least(places))
+                        if common_difference(places) is None:
+                            irregular.add(_distances(places))
         if not irregular:
             return
 
@@ -218,10 +218,10 @@ class Loops:
 
     def _index(self, places: tuple[int, ...]) -> str:
         """Return the expression of the offset of member ``k``, in row ``i`` and column ``j``."""
-        if len(self._runs) > 1 and steady(places) is None:
-            name = self._starts.setdefault(_from_least(places), f"r{len(self._starts)}")
+        if len(self._runs) > 1 and common_difference(places) is None:
+            name = self._starts.setdefault(_distances(places), f"r{len(self._starts)}")
             return f"{min(places)} + {name}" if min(places) else name
-        grid = _grid(places, self._columns) if steady(places) is None else None
+        grid = _grid(places, self._columns) if common_difference(places) is None else None
         parts = zip(grid, "ij", strict=True) if grid else [(places, "k")]
         terms = [self._term(part, letter) for part, letter in parts]
         first = sum(least for least, _ in terms)
@@ -229,9 +229,9 @@ class Loops:
 
     def _term(self, places: Sequence[int], letter: str) -> tuple[int, str]:
         """Return the least of some places, and an expression of the distance of the others from it."""
-        step, least = steady(places), min(places)
+        step, least = common_difference(places), min(places)
         if step is None:
-            return least, f"{self._table(_from_least(places))}[{letter}]"
+            return least, f"{self._table(_distances(places))}[{letter}]"
         if step < 0:
             letter = f"({len(places) - 1} - {letter})"
         return least, "" if step == 0 else letter if abs(step) == 1 else f"{abs(step)} * {letter}"
@@ -261,7 +261,7 @@ def _grid(places: Sequence[int], columns: int) -> list[tuple[int, ...]] | None:
     return [rows, row] if alike else None
 
 
-def _from_least(places: Sequence[int]) -> tuple[int, ...]:
+def _distances(places: Sequence[int]) -> tuple[int, ...]:
     least = min(places)
     return tuple([place - least for place in places])
 
@@ -278,7 +278,7 @@ def _kind(numbers: Sequence[int]) -> str:
 
 def _bytes(numbers: Sequence[int]) -> int:
     """Return the size of a table in bytes, zero where its entries have constant distances."""
-    if steady(numbers) is not None:
+    if common_difference(numbers) is not None:
         return 0
     return len(numbers) * {"char": 1, "short": 2}.get(_kind(numbers).split()[-1], 4)
 

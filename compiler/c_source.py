@@ -99,7 +99,6 @@ class _ProgramText:
         return literal(value, self.scalar)
 
     def value(self, step: int) -> str:
-        """Return an expression of a step's value."""
         operation, arguments, logical = self.steps[step]
         if operation == "input":
             return self.read(*arguments)
@@ -120,7 +119,6 @@ class _ProgramText:
         return f"const {kind} v{step} = {expression};"
 
     def expression(self, index: int) -> str:
-        """Return the expression that computes a step."""
         operation, arguments, _ = self.steps[index]
         parts = self.steps[index].parts
         known = [self.steps[part].operation == "constant" for part in parts]
@@ -168,7 +166,7 @@ def write_program(
     rolled = None if arrays is None else roll_where_shorter(program, results if between else 0)
     if arrays is not None and rolled is not None:
         loops = Loops(program, name, read, write, arrays, scalar, tables, qualifier)
-        blocks, before = _packed([loops.loop(loop) for loop in rolled.loops], rolled.before)
+        blocks, before = _merge_blocks([loops.loop(loop) for loop in rolled.loops], rolled.before)
         defined += loops.defined
         count, together = rolled.scratch, len(blocks) == 1
     else:
@@ -202,7 +200,7 @@ def write_program(
     return ProgramSource("\n".join(defined), body, count_operations, count, replaced)
 
 
-def _packed(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
+def _merge_blocks(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
     """Return the blocks merged up to the length of a function, and the number of them before a pause."""
     packed: list[list[str]] = []
     before = 0
@@ -221,7 +219,6 @@ def _statements(
     write: Callable[[int, int], str],
     slots: Mapping[int, int],
 ) -> list[str]:
-    """Return the statements of a part."""
     lines: list[str] = []
     fetched: set[int] = set()
     steps = text.steps

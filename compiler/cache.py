@@ -64,13 +64,13 @@ def load(name: str) -> bytes | None:
     return code if hashlib.sha256(code).digest() == checksum else None
 
 
-def holds(name: str) -> bool:
+def contains(name: str) -> bool:
     """Return whether an entry exists, valid or not."""
     place = folder()
     return place is not None and (place / f"{name}{SUFFIX}").exists()
 
 
-def keep(name: str, code: bytes) -> None:
+def store(name: str, code: bytes) -> None:
     """Write an entry, if possible."""
     place = folder()
     if place is None:

@@ -78,12 +78,10 @@ class _VectorText:
         self.block = block
 
     def name(self) -> str:
-        """Return an unused name."""
         self._count += 1
         return f"{self._prefix}{self._count}"
 
     def word(self, name: str) -> Value:
-        """Return the whole number with this name in the text."""
         return Value(self, name, True)
 
     def new(self, expression: str) -> str:
@@ -92,7 +90,6 @@ class _VectorText:
         return name
 
     def constant(self, value: int | float) -> str:
-        """Return the text of a constant."""
         if isinstance(value, int):
             return self.block.constant(str(value), "i64")
         return self.block.constant(f"0x{numpy.float64(value).view('u8'):016X}")

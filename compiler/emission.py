@@ -68,7 +68,6 @@ class _Part(Instructions):
         return name
 
     def step(self, index: int) -> None:
-        """Write the code of a step."""
         step = self.steps[index]
         self.known.add(index)
         if step.operation == "product":
@@ -96,16 +95,13 @@ class _Part(Instructions):
         )
 
     def store(self, argument: int, row: int, step: int) -> None:
-        """Write the code that stores a result."""
         value = self.value(step)
         self.write(argument, row, self.as_number(value) if self.steps[step].logical else value)
 
     def scratch(self, place: int) -> str:
-        """Return the address of a place in the scratch array."""
         return self.new(f"getelementptr i8, ptr %scratch, i64 {place * self.block.alignment}")
 
-    def hand_on(self, step: int) -> None:
-        """Write the code that stores a value in the scratch array."""
+    def store_scratch(self, step: int) -> None:
         kind = self.truths if self.steps[step].logical else self.numbers
         address = self.scratch(self.places.slots[step])
         self.lines.append(f"store {kind} {self.value(step)}, ptr {address}")
@@ -164,7 +160,7 @@ def _parts(
                 continue
             own.step(statement)
             if statement in slots:
-                own.hand_on(statement)
+                own.store_scratch(statement)
         functions.append([f"define internal void @part{number}({HEADER}) {{", *own.lines, "ret void", "}"])
     return functions, places.vector + max(vectors, default=0)
 
@@ -261,10 +257,10 @@ def _declarations(program: StraightLineProgram, library: Library, block: LaneBlo
     for name in sorted(used & FUNCTIONS.keys() - OPERATIONS.keys()):
         if name not in library.functions:
             raise KeyError(f"{library.name} has no function {name}")
-        yield from _of_block(block, name, *library.functions[name][:2])
+        yield from _block_function(block, name, *library.functions[name][:2])
 
 
-def _of_block(block: LaneBlock, name: str, symbol: str, lanes: int) -> Iterator[str]:
+def _block_function(block: LaneBlock, name: str, symbol: str, lanes: int) -> Iterator[str]:
     """Yield the function of a block made from one of the library, which takes ``lanes`` lanes."""
     width, numbers = block.lanes, block.numbers
     kind = "double" if lanes == 1 else f"<{lanes} x double>"

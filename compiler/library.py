@@ -52,7 +52,7 @@ def _open(*names: str | None) -> ctypes.CDLL | None:
 
 
 @functools.cache
-def portable() -> Library:
+def portable_library() -> Library:
     """Return the scalar functions of the C library."""
     library = _open("ucrtbase") if sys.platform == "win32" else _open("libm.so.6", None)
     functions = {}
@@ -64,7 +64,7 @@ def portable() -> Library:
 
 
 @functools.cache
-def fastest(features: str) -> Library:
+def fastest_library(features: str) -> Library:
     """Return the fastest library for a processor.
 
     Args:
@@ -76,9 +76,9 @@ def fastest(features: str) -> Library:
         there.append("+neon")
     variant = next((VARIANTS[name] for name in VARIANTS if f"+{name}" in there), None)
     if vectors is None or variant is None:
-        return portable()
+        return portable_library()
     letter, lanes = variant
-    functions = dict(portable().functions)
+    functions = dict(portable_library().functions)
     for name in FUNCTIONS:
         symbol = f"_ZGV{letter}N{lanes}{'vv' if name in BINARY else 'v'}_{name}"
         address = _address(vectors, symbol)

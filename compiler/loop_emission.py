@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from .block import LaneBlock
 from .instructions import HEADER, Instructions
-from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Statement, steady
+from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Statement, common_difference
 
 
 class DistanceTables:
@@ -98,7 +98,6 @@ class LoopText(Instructions):
                 self.write(array, self._row(places), number)
 
     def _value(self, operand: Operand) -> str:
-        """Return the name of a member's number in this turn."""
         array, places, logical = operand
         if array == TURN:
             return f"%v{places[0]}"
@@ -116,7 +115,6 @@ class LoopText(Instructions):
         return self._address(self.numbers, "%scratch", places)
 
     def _address(self, kind: str, array: str, places: tuple[int, ...]) -> str:
-        """Return the address of a member in an array."""
         first, way = self._way(places)
         if way is not None:
             if (array, way) not in self._bases:
@@ -125,13 +123,12 @@ class LoopText(Instructions):
         return self.new(f"getelementptr {kind}, ptr {array}, i64 {first}")
 
     def _row(self, places: tuple[int, ...]) -> int | str:
-        """Return the row of a member."""
         first, way = self._way(places)
         return first if way is None else way if first == 0 else self.new(f"add i64 {way}, {first}")
 
     def _way(self, places: tuple[int, ...]) -> tuple[int, str | None]:
         """Return the first place, and the name of the turn's distance from it; None: zero."""
-        step = steady(places)
+        step = common_difference(places)
         if step == 0:
             return places[0], None
         if step is not None:

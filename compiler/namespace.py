@@ -50,14 +50,14 @@ def tracing(graph: Graph) -> Iterator[Graph]:
             _OPEN.reset(token)
 
 
-def _settled(array: Any, use: str) -> Any:
+def _plain_value(array: Any, use: str) -> Any:
     """Return the plain value that the open graph has for an expression, see :meth:`.Graph.settle`."""
     graph = _OPEN.get(None)
     return None if graph is None or array.nodes.size != 1 else graph.settle(array.nodes.item(), use)
 
 
 def _decide(self: Any) -> builtins.bool:
-    known = _settled(self, "branch")
+    known = _plain_value(self, "branch")
     return _refuse(self) if known is None else builtins.bool(known)
 
 
@@ -69,7 +69,7 @@ def _refuse(self: Any, *_: Any) -> Any:
 
 
 def _number(self: Any) -> float:
-    known = _settled(self, "number")
+    known = _plain_value(self, "number")
     return _refuse_number(self) if known is None else float(known)
 
 
@@ -85,7 +85,7 @@ def _round(self: Any, digits: Any = None) -> Any:
 
 
 def _format(self: Any, form: str) -> str:
-    known = _settled(self, "words")
+    known = _plain_value(self, "words")
     return str(self) if known is None else format(known, form)
 
 

@@ -17,7 +17,7 @@ import numpy
 from . import cache, emission
 from .block import LANES, block_for, block_of
 from .emission import emit, product_symbol, product_text
-from .library import Library, fastest
+from .library import Library, fastest_library
 from .program import LOCK, StraightLineProgram
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
@@ -49,7 +49,7 @@ def processor() -> tuple[str, str]:
     """Return name and features of the target processor in LLVM's form.
 
     It is this one, or the value of ``FILTERGYM_COMPILER_PROCESSOR``, such as ``haswell,+avx2`` or ``x86-64``. A name
-    implies its features for LLVM; the features after it select the vector functions (:func:`~.library.fastest`).
+    implies its features for LLVM; further features select the vector functions (:func:`~.library.fastest_library`).
 
     Raises:
         ValueError: for a feature without ``+`` or ``-``.
@@ -200,7 +200,7 @@ def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Li
     """
     with LOCK:
         binding, (_, features) = llvm(), processor()
-        library = library or fastest(features)
+        library = library or fastest_library(features)
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
         has_products = "product" in program.steps.operations
         quick = quick_setting(features, has_products)
@@ -226,7 +226,7 @@ def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Li
             make, optimise = functools.partial(code, quick, key), None
             if better is not None:
                 optimise = functools.partial(code, better, better_key)
-                if cache.holds(better_key):
+                if cache.contains(better_key):
                     make, optimise = optimise, None
             _CODES[key] = Code(make, optimise, HOT // IN_LOOPS if in_loops else HOT)
         return _CODES[key]
@@ -251,7 +251,6 @@ def native_text(text: str, signature: Any = NATIVE, level: int = 1) -> Any:
 
 
 def _key(*texts: str) -> str:
-    """Return the key of the code made from some texts for this processor."""
     return cache.key(*texts, *processor(), repr(llvm().llvm_version_info))
 
 
@@ -275,7 +274,7 @@ def _load(key: str, write: Callable[[], str], signature: Any, level: int = 1) ->
     if code is None:
         module = binding.parse_assembly(write())
         code = _target(level).emit_object(module)
-        cache.keep(key, code)
+        cache.store(key, code)
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _target())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()

@@ -121,7 +121,7 @@ class _Roller:
         self._read_steps()
         # Statement of a step, and its index among the members.
         self.statement, self.member = numpy.full((2, len(self.steps)), -1)
-        self._compute(list(self._alike()))
+        self._compute(list(self._group_steps()))
         early = program.results[:results]
         for late, some in ((False, early), (True, program.results[results:])):
             rows: dict[int, dict[int, int]] = {}
@@ -129,7 +129,7 @@ class _Roller:
                 rows.setdefault(result.argument, {})[result.row] = result.node
             for argument, nodes in rows.items():
                 self._write(argument, nodes, late)
-        self._copy_what_is_mixed()
+        self._copy_mixed_operands()
         reads = self._find_sources()
         for draft in self.drafts:
             draft.reads = [next(reads) for _ in draft.columns]
@@ -159,7 +159,7 @@ class _Roller:
 
     # --- statements
 
-    def _alike(self) -> Iterator[numpy.ndarray]:
+    def _group_steps(self) -> Iterator[numpy.ndarray]:
         """Yield the steps of one array operation with one form, in the order of that operation."""
         parts = self.parts
         computed = numpy.flatnonzero(self.source == COMPUTED)
@@ -242,7 +242,7 @@ class _Roller:
 
     def _sources(self, columns: Sequence[numpy.ndarray]) -> list[int | None]:
         """Return for each operand the argument or the constants that contain all of it; None: the scratch array."""
-        steps, starts, lengths = _joined(columns)
+        steps, starts, lengths = _join_columns(columns)
         sources = self.source[steps]
         own = sources[starts]
         alike = numpy.logical_and.reduceat(sources == numpy.repeat(own, lengths), starts)
@@ -251,7 +251,7 @@ class _Roller:
             for source, same in zip(own.tolist(), alike.tolist(), strict=True)
         ]
 
-    def _copy_what_is_mixed(self) -> None:
+    def _copy_mixed_operands(self) -> None:
         """Copy inputs and constants that share an operand with other values to the scratch array, once."""
         for late in (False, True):
             columns = [column for draft in self.drafts if draft.late == late for column in draft.columns]
@@ -271,7 +271,7 @@ class _Roller:
         """Yield the sources of all operands of all statements."""
         columns = [column for draft in self.drafts for column in draft.columns]
         counts = numpy.array([draft.count for draft in self.drafts])
-        steps, starts, lengths = _joined(columns)
+        steps, starts, lengths = _join_columns(columns)
         first = numpy.repeat(steps[starts], lengths)
         members = numpy.arange(len(steps)) - numpy.repeat(starts, lengths)
         numbers = self.statement[steps]
@@ -406,7 +406,7 @@ class _Roller:
         return {number: base[self.drafts[number].group] + k for number, k in inside.items()}, top
 
 
-def _joined(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
+def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
     """Return the columns one after the other, and the start and length of each."""
     lengths = numpy.array([len(column) for column in columns], dtype=numpy.int64)
     steps = numpy.concatenate([*columns, numpy.zeros(0, dtype=numpy.int64)])
@@ -439,7 +439,7 @@ def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled
     return rolled if SHORTER * statements < operations + len(program.results) else None
 
 
-def steady(places: Sequence[int]) -> int | None:
+def common_difference(places: Sequence[int]) -> int | None:
     """Return the distance from each place to the next if it is constant, else None."""
     count, first = len(places), places[0]
     step = places[1] - first if count > 1 else 0

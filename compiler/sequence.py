@@ -220,14 +220,13 @@ class CallSequence:
         self._lasting = numpy.array([call.address + 8 + 16 * i for call, i, _ in passing], dtype=numpy.int64)
         # Calls count lanes from the first lane of all tiles.
         self._hops = numpy.array([apart - 8 * tile for *_, apart in passing], dtype=numpy.int64)
-        self._given = self._put_together(self._tables, self._entries, self._lasting)
+        self._given = self._driver_argument(self._tables, self._entries, self._lasting)
         self._run = functools.partial(_driver(), address_of(self._given))
         self._shares: dict[tuple[int, int], _Share] = {}
 
-    def _put_together(
+    def _driver_argument(
         self, tables: numpy.ndarray, entries: numpy.ndarray, lasting: numpy.ndarray
     ) -> numpy.ndarray:
-        """Return the argument of the driver."""
         count, steps, tile = self._form
         addresses = address_of(self._codes), address_of(tables), count, address_of(entries)
         return numpy.array(
@@ -311,7 +310,7 @@ class CallSequence:
             if not apart:
                 own = arrays.setdefault(id(known), empty_lanes(known.shape[:-1], known.shape[-1]))
             passing.append((tables[owner], place, own, apart))
-        given = self._put_together(addresses, entries, lasting)
+        given = self._driver_argument(addresses, entries, lasting)
         return _Share(tables, addresses, entries, lasting, passing, given, address_of(given))
 
 

@@ -132,7 +132,7 @@ def test_curves_are_written_at_once_and_what_a_logger_gathers_stays():
 
     logger = Logger(None, [Kept()])
     logger.record("loss", 1.0)
-    training_session.curves_beside(logger)(40, {"cost": 2.0})
+    training_session.curve_writer(logger)(40, {"cost": 2.0})
     assert written == [({"cost": 2.0, "time/total_timesteps": 40}, 40)]
     assert dict(logger.name_to_value) == {"loss": 1.0}
 

@@ -127,7 +127,7 @@ def opened(name, control, scenario, episodes, keywords):
     class Listening(Gated):
         def act(self, observation, state, start):
             action, state = super().act(observation, state, start)
-            seen.append(state[1].trust.heeded > 0.0)
+            seen.append(state[1].trust.active > 0.0)
             return action, state
 
     def make(task):
