@@ -36,7 +36,7 @@ def to_sb3(
     ``terminal_observation`` and ``episode`` (return, length, seconds since this object was made).
 
     Args:
-        vector_env: from ``gymnasium.make_vec(id, num_envs, autoreset_mode="SameStep")``.
+        vector_env: environment from ``gymnasium.make_vec(id, num_envs, autoreset_mode="SameStep")``.
         staggered: shorten the episodes that a reset starts to lengths spread evenly over the horizon, so that
             environments finish one group after another instead of all in one step; later episodes are whole. For
             training only: a score over the shortened ones is not a score of whole episodes.

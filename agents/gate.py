@@ -77,8 +77,8 @@ class FallbackAction(ConstantPolicy):
             self.action = (0.0,) * space.shape[0]
         else:
             raise ValueError(
-                f"control {model.control!r} of {model.task.id} has no constant action that is the paper's: give the "
-                "gate a fallback, or choose another control"
+                f"control {model.control!r} of {model.task.id} has no constant action of the paper's algorithm: "
+                "give the gate a fallback, or choose another control"
             )
 
 
@@ -449,8 +449,7 @@ class GatedMaker:
     ) -> None:
         if not is_gateable(maker):
             raise ValueError(
-                f"{name!r} is of kind {kind_of(maker)} and has no actions that follow from what is measured: an alarm "
-                "has nothing to listen to"
+                f"{name!r} is of kind {kind_of(maker)} and has no actions that depend on measurements for a gate"
             )
         self.problem = problem
         self.name = name
@@ -473,10 +472,10 @@ class GatedMaker:
         # Its actions last for its own decision interval, independent of the agent's.
         keywords.pop("decision_interval", None)
         if kind not in ("policy", "estimator") or self._fallback is RandomPolicy:
-            raise ValueError(f"{self.fallback!r} is of kind {kind} and nothing that a gate can fall back on")
+            raise ValueError(f"{self.fallback!r} is of kind {kind} and cannot be the fallback of a gate")
         if keywords:
             raise ValueError(
-                f"{self.fallback!r} has parameters of the task of its own ({', '.join(keywords)}) and cannot run "
+                f"{self.fallback!r} has task parameters of its own ({', '.join(keywords)}) and cannot run "
                 "beside an agent: choose another fallback"
             )
         excess, errors = excess_cost(self.problem, self.fallback)

@@ -328,7 +328,7 @@ class StoredPolicy:
             trained = keywords.get(name, getattr(defaults, name))
             if getattr(now, name) != trained:
                 raise ValueError(
-                    f"{self.path} was trained with {name}={trained!r}, and its actions mean something else with "
+                    f"{self.path} was trained with {name}={trained!r}, and its actions have another meaning with "
                     f"{name}={getattr(now, name)!r}: leave out {name}"
                 )
 

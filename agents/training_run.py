@@ -103,7 +103,7 @@ class TrainingRun:
     steps: int
     """Requested environment steps."""
     hyperparameters: dict[str, Any]
-    """With keywords of the environment in ``env_kwargs``, as in rl-zoo3's form."""
+    """Hyperparameters, with keywords of the environment in ``env_kwargs``, as in rl-zoo3's form."""
     backend: str = "auto"
     """Backend of the environments: the requested one, and the actual one once they exist."""
     command: str = ""
@@ -388,7 +388,7 @@ def load_run(folder: Path, trust: bool = False) -> TrainingRun:
     """Read ``run.json``.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         trust: import the module that registers the environment, which executes it. An environment of filtergym, or one
             whose module is already imported, such as one that the command line names, needs no trust.
 

@@ -276,7 +276,7 @@ class Teacher:
             raise ValueError(f"a teacher is an estimator or a reference, but {name!r} is of kind {kind}")
         if env.task.closes_loop:
             raise ValueError(
-                f"{name!r} cannot teach in {env.task.id}: what is measured follows its own estimates there"
+                f"{name!r} cannot teach in {env.task.id}: the measurements depend on its own estimates"
             )
         model = put_in_loop(env.model, competitor, kind, name, env.num_envs)
         if not can_step(model, _estimate):

@@ -337,7 +337,9 @@ class CompiledFunction:
         special = self.specialise(*parts)
         count = max(array.shape[-1] for array in given)
         if any(array.shape[-1] not in (1, count) for array in given):
-            raise ValueError(f"arrays have one width, got {sorted({array.shape[-1] for array in given})}")
+            raise ValueError(
+                f"arrays must have one width, got {sorted({array.shape[-1] for array in given})}"
+            )
         width = round_up_lanes(count)
         outputs = special.call([_ready(array, width) for array in given], width, threads)
         answer: list[Any] = []

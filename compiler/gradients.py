@@ -80,7 +80,7 @@ def pullback(
         graph: graph of the arrays.
         outputs: functions of the inputs.
         adjoints: one for each output, of its shape.
-        inputs: of any shapes.
+        inputs: arrays of any shapes.
 
     Returns:
         For each input its gradient, an array of its shape, float64.

@@ -524,12 +524,12 @@ def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) ->
                 open_places.append(p)
     if open_rows:
         choices = Traced(rows[open_rows].T, dtype)
-        index = Traced(numpy.array(places)[open_places], float64)
+        requested = Traced(numpy.array(places)[open_places], float64)
         # As for a table: a negative index counts from the end, one outside is clipped to the range.
-        index = where(less(index, 0.0), add(index, float(rows.shape[-1])), index)
+        requested = where(less(requested, 0.0), add(requested, float(rows.shape[-1])), requested)
         found = choices[0]
         for place, choice in enumerate(list(choices)[1:], 1):
-            found = where(greater_equal(index, float(place)), choice, found)
+            found = where(greater_equal(requested, float(place)), choice, found)
         chosen[open_rows, open_places] = found.nodes
     return chosen
 

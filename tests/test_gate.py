@@ -283,7 +283,7 @@ def naive_factors(nis, degrees):
     [
         ("fixed-low", r"fallback 'fixed-low' costs [\d.]+ % more than the paper's algorithm 'imm'"),
         ("imm-smoother", "'imm-smoother' is of kind smoother and nothing that a gate can fall"),
-        ("imm-tuned", "'imm-tuned' has parameters of the task of its own"),
+        ("imm-tuned", "'imm-tuned' has task parameters of its own"),
     ],
 )
 def test_what_a_gate_cannot_fall_back_on_is_refused(fallback, message):
@@ -317,8 +317,8 @@ def test_who_has_no_gate_is_refused(name, message):
 @pytest.mark.parametrize(
     ("make", "control", "message"),
     [
-        (Gate, "mode", "has no constant action that is the paper's: give the gate a fallback"),
-        (Gate, "weights", "has no constant action that is the paper's"),
+        (Gate, "mode", "has no constant action of the paper's algorithm: give the gate a fallback"),
+        (Gate, "weights", "has no constant action of the paper's algorithm"),
         (lambda model: Gate(model, fallback=Constant), "gains", "fallback is made for control 'gain', but"),
         (lambda model: Gated(model, Constant), "gains", "policy is made for control 'gain', but the task"),
         (lambda model: Gate(model, window=0), "gain", "window must be at least one decision, got 0"),
@@ -415,7 +415,7 @@ def test_what_was_around_an_agent_is_around_it_again(monkeypatch, tmp_path):
         ),
         ("ppo", {"residual_to": "adaptive", "control": "gains"}, "made for control 'gain', but the environ"),
         ("ppo", {"residual_to": "imm-tuned"}, "has task parameters of its own"),
-        ("ppo", {"gated": True, "control": "mode"}, "has no constant action that is the paper's"),
+        ("ppo", {"gated": True, "control": "mode"}, "has no constant action of the paper's algorithm"),
     ],
 )
 def test_training_around_what_cannot_be(algorithm, around, message):
