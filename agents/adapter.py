@@ -1,8 +1,8 @@
-"""A native vector environment as Stable-Baselines3 sees environments.
+"""A native vector environment as a ``VecEnv`` of Stable-Baselines3.
 
 Stable-Baselines3 has its own ``VecEnv``, older than Gymnasium's vector environments: it resets finished
 environments in the same step and passes their last observation in ``info["terminal_observation"]``. The
-adapter works on whole arrays; only environments that finish in a step cost Python work, and all others share
+adapter works on whole arrays; only environments that finish in a step need work in Python, and all others share
 one info.
 """
 
@@ -22,8 +22,8 @@ from .gate import Gate
 from .residual import check_residual
 
 STAGGERED_GROUPS = 16
-"""Of environments that finish together, where episodes are staggered: a step in which some begin anew costs much more
-than another, and with sixteen a rollout shows the parts of an episode alike."""
+"""Groups of environments that finish together, where episodes are staggered. A step with resets takes much longer than
+another; with sixteen groups a rollout still covers all parts of an episode evenly."""
 
 
 def to_sb3(
@@ -36,13 +36,12 @@ def to_sb3(
     ``terminal_observation`` and ``episode`` (return, length, seconds since this object was made).
 
     Args:
-        vector_env: from ``gymnasium.make_vec(id, num_envs, autoreset_mode="SameStep")``.
-        staggered: cut the episodes that a reset starts to lengths spread evenly over the horizon, so that
-            environments finish one after another, many of them in groups, instead of all in one step; later episodes
-            are whole. For
+        vector_env: environment from ``gymnasium.make_vec(id, num_envs, autoreset_mode="SameStep")``.
+        staggered: shorten the episodes that a reset starts to lengths spread evenly over the horizon, so that
+            environments finish one group after another instead of all in one step; later episodes are whole. For
             training only: a score over the shortened ones is not a score of whole episodes.
         residual_to: a policy to whose actions the agent's are added; see :mod:`.residual`.
-        gate: that decides whether the agent acts; see :mod:`.gate`.
+        gate: gate that decides whether the agent acts; see :mod:`.gate`.
 
     Raises:
         ValueError: for a vector environment that cannot be adapted, with the reason.
@@ -63,11 +62,11 @@ def to_sb3(
         )
     if vector_env.options.detailed_info:
         raise ValueError(
-            "to_sb3 keeps no detailed_info for each environment: leave it out, and evaluate instead"
+            "to_sb3 has no detailed_info for each environment: leave it out, and evaluate instead"
         )
     if vector_env.options.context:
         raise ValueError(
-            "to_sb3 keeps no context for each environment: leave it out, or show it to critics with "
+            "to_sb3 has no context for each environment: leave it out, or show it to critics with "
             "observation='asymmetric'"
         )
     if residual_to is not None:
@@ -76,7 +75,7 @@ def to_sb3(
 
 
 class TaskVecEnv(VecEnv):
-    """See :func:`to_sb3`."""
+    """A native vector environment with the interface of Stable-Baselines3, see :func:`to_sb3`."""
 
     def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any, gate: Gate | None) -> None:
         self.env = env
@@ -91,7 +90,7 @@ class TaskVecEnv(VecEnv):
         self.returns: numpy.ndarray = numpy.zeros(env.num_envs)
         """Sum of rewards of the running episodes."""
         self.lengths: numpy.ndarray = numpy.zeros(env.num_envs, dtype=int)
-        """Decisions taken in them."""
+        """Decisions in the running episodes."""
         self._actions: Any = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self.metadata: dict[str, Any] = env.metadata
@@ -100,13 +99,13 @@ class TaskVecEnv(VecEnv):
         """Start new episodes with the seeds given to :meth:`seed` and the options given to :meth:`set_options`.
 
         Raises:
-            ValueError: for options that differ between environments, and others than "scenario" and "parameters".
+            ValueError: for options that differ between environments, or other options than "scenario" and "parameters".
         """
         options: dict[str, Any] = dict(self._options[0])
         known = TaskEnv.reset_options
         if any(own != options for own in self._options) or not options.keys() <= set(known):
             raise ValueError(
-                f"options of a reset, {' and '.join(known)}, are the same for all environments here, got "
+                f"options of a reset, {' and '.join(known)}, must be the same for all environments, got "
                 f"{self._options!r}"
             )
         count = self.num_envs
@@ -127,7 +126,7 @@ class TaskVecEnv(VecEnv):
         self._seeds = list(seeds)
 
     def step_async(self, actions: numpy.ndarray) -> None:
-        """Keep the actions for :meth:`step_wait`."""
+        """Store the actions for :meth:`step_wait`."""
         if self.residual_to is not None or self.gate is not None:
             shown = self._shown["observation"] if self.env.privileged else self._shown
         if self.residual_to is not None:
@@ -145,7 +144,7 @@ class TaskVecEnv(VecEnv):
         self.returns += reward
         self.lengths += 1
         self._shown, self._start = observation, finished
-        # One new dictionary for all that go on: whoever writes into it harms this step's only.
+        # One new dictionary per step for all running episodes: a caller that writes into it affects this step only.
         running: dict[str, Any] = {"TimeLimit.truncated": False}
         infos = [running] * self.num_envs
         if finished.any():
@@ -173,7 +172,7 @@ class TaskVecEnv(VecEnv):
     def snapshot(self) -> dict[str, Any]:
         """Return everything that later steps depend on: lanes, running returns, the memory of a policy.
 
-        The latter are shared with this object, so pickle it before the next step.
+        Returns and memory are shared with this object, so pickle the snapshot before the next step.
         """
         policy = self._policy_memory, self._gate_memory, self._shown, self._start
         lanes = self.env.fleet.snapshot()
@@ -195,11 +194,11 @@ class TaskVecEnv(VecEnv):
         return list(self._get_indices(indices))
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Return an attribute of the vector environment, once for each environment asked for."""
+        """Return an attribute of the vector environment, once for each of the given environments."""
         return [getattr(self.env, attr_name) for _ in self._indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Refuse: the environments are one object and its parameters are fixed."""
+        """Raise NotImplementedError: the environments are one object with fixed parameters."""
         raise NotImplementedError(
             f"cannot set {attr_name!r}: a task is fixed when it is made; make a new vector environment"
         )
@@ -207,7 +206,7 @@ class TaskVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *args: Any, indices: int | Iterable[int] | None = None, **keywords: Any
     ) -> list[Any]:
-        """Refuse: there are no separate environments to call."""
+        """Raise NotImplementedError: there are no separate environments."""
         raise NotImplementedError(
             f"cannot call {method_name!r} on one environment: they are one native object"
         )
@@ -215,5 +214,5 @@ class TaskVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
-        """Say yes to ``Monitor``, whose statistics the adapter reports, and to nothing else."""
+        """Return True for ``Monitor``, whose statistics the adapter reports, and False for other wrappers."""
         return [wrapper_class is Monitor for _ in self._indices(indices)]

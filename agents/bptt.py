@@ -2,16 +2,16 @@
 
 A task is differentiable from the action to the reward of every later measurement. So no value function and no
 exploration are needed: the mean cost of a batch of episodes is differentiated through filter and policy
-(back-propagation through time) and descended by Adam. Where an episode is long, the gradient is cut and
-descended every ``truncation`` decisions (truncated back-propagation): values go on, gradients stop.
+(back-propagation through time) and minimised by Adam. In long episodes the gradient is truncated every ``truncation``
+decisions (truncated back-propagation): the states continue, the gradients do not flow further back.
 
 Compiled episodes are differentiated by the code of :mod:`.unrolled`, with the same gradients as torch's and several
 times as fast; a task that cannot be compiled runs on torch tensors.
 
-The network is a linear rule, has one hidden layer, or a memory (``network``); one that is to be quick reads few fields
-of the observation in the end (``fields_kept``), those of the largest weights.
+The network is a linear rule, has one hidden layer, or a memory (``network``). A fast network reads only a few fields of
+the observation at the end of its training (``fields_kept``), those with the largest weights.
 
-A learned estimator (``kalman-net``) is trained by the same descent: its network steers a filter of its own.
+A learned estimator (``kalman-net``) is trained by the same descent: its network acts on a filter of its own.
 """
 
 import functools
@@ -38,39 +38,39 @@ from ..evaluation.competitors.kinds import Policy
 from ..evaluation.running.seeds import episode_seeds
 from ..filters.array_namespace import host_array
 from .eager_optimiser import exclude_from_compilation, step_eagerly
-from .gate import Gate, as_trained
+from .gate import Gate, wrap_as_trained
 from .learned_estimator import EstimatorMaker
 from .learned_policy import LearnedPolicy, write_arrays
 from .settings import ESTIMATORS
 from .training_run import TrainingRun, schedule
-from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
+from .training_session import Bookkeeping, Session, Trainee, curve_writer, interruption, make_logger
 from .unrolled import Teacher, Unrolled
 
 NETWORKS = ("linear", "feedforward", "recurrent")
-"""A linear rule; one hidden layer; a gated recurrent unit, which remembers."""
+"""A linear rule; one hidden layer; a gated recurrent unit, which has a memory."""
 ACTIVATION = "relu"
-"""Of the hidden layer: sixteen rectifiers take as long as four tanh."""
+"""Activation of the hidden layer: sixteen rectifiers take as long as four tanh."""
 PRUNED = 0.5
-"""Share of a run after which no field is read beside those that are kept."""
+"""Share of a run after which only the kept fields are read."""
 NEAREST = 0.9
-"""How far towards the edge of the box the first actions may be, where its middle is 0: nearer there is no gradient."""
+"""Largest magnitude of the first actions, with the box scaled to -1 to 1: nearer to the edge the gradient vanishes."""
 
 
 class NetworkPolicy(torch.nn.Module):
-    """Observation, normalised -> network -> tanh -> box of the actions.
+    """A network as a policy: normalised observation -> network -> tanh -> box of the actions.
 
     Args:
-        observations: fields of the observation.
-        space: of the actions.
-        hidden_size: of the memory or of the hidden layer; a linear rule has neither.
-        first_action: about what is answered before anything is learned; default: the middle of the box.
+        observations: number of fields of the observation.
+        space: space of the actions.
+        hidden_size: units of the memory or of the hidden layer; unused by a linear rule.
+        first_action: approximate action before training; default: the middle of the box.
         network: one of ``NETWORKS``.
-        fields_kept: how many fields of the observation the agent reads that is saved; None: all.
-        longest_memory: decisions over which the slowest unit of a memory forgets at first, the quickest in one; None:
-            all of them in about two.
+        fields_kept: number of fields of the observation that the saved agent reads; None: all.
+        longest_memory: initial time constant of the slowest unit of a memory, in decisions; that of the fastest is one.
+            None: about two for all units.
 
     Raises:
-        ValueError: if that is no action, no network or no memory, or for fewer than one field.
+        ValueError: for an invalid action, network or memory, or for fewer than one field.
     """
 
     low: torch.Tensor
@@ -78,7 +78,7 @@ class NetworkPolicy(torch.nn.Module):
     mean: torch.Tensor
     scale: torch.Tensor
     used: torch.Tensor
-    """1 of a field that is read in training, 0 of one that is not any more."""
+    """1 for a field that is read, 0 for a field that is no longer read."""
 
     def __init__(
         self,
@@ -128,15 +128,15 @@ class NetworkPolicy(torch.nn.Module):
 
     @property
     def memory_size(self) -> int:
-        """Numbers that are remembered from one decision to the next."""
+        """Size of the memory."""
         return 0 if self.gru is None else self.gru.hidden_size
 
     def new_memory(self, envs: int) -> torch.Tensor:
-        """Return what is remembered at the start of so many episodes, ``(envs, memory_size)``."""
+        """Return the memory at the start of episodes, ``(envs, memory_size)``."""
         return self.mean.new_zeros(envs, self.memory_size)
 
     def forward(self, observation: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Answer observations ``(N, fields)`` and memory ``(N, memory_size)`` with actions and memory."""
+        """Return actions and memory for observations ``(N, fields)`` and memory ``(N, memory_size)``."""
         features = ((observation.to(self.mean.dtype) - self.mean) / self.scale).clamp(-10.0, 10.0) * self.used
         if self.gru is not None:
             features = memory = self.gru(features, memory)
@@ -145,9 +145,9 @@ class NetworkPolicy(torch.nn.Module):
         return self.low + (self.high - self.low) * 0.5 * (1.0 + torch.tanh(self.head(features))), memory
 
     def strongest_fields(self, count: int) -> numpy.ndarray:
-        """Return the places of the fields of the largest weights among those in use, in ascending order.
+        """Return the indices of the fields with the largest weights among those in use, in ascending order.
 
-        Observations are normalised, so that a small weight is a small influence (magnitude pruning).
+        Observations are normalised, so that a small weight means a small influence (magnitude pruning).
         """
         first = self.layers[0].weight if self.gru is None else self.gru.weight_ih
         # A field that is not in use comes after all others, whatever its weight once was.
@@ -155,11 +155,11 @@ class NetworkPolicy(torch.nn.Module):
         return numpy.sort(numpy.argsort(-strength, kind="stable")[:count])
 
     def use_fields(self, count: int) -> None:
-        """Read from now on only so many of the fields in use, those with the largest weights."""
+        """Limit the fields in use to the ``count`` fields with the largest weights."""
         self.used[numpy.setdiff1d(numpy.arange(len(self.used)), self.strongest_fields(count))] = 0.0
 
     def arrays(self) -> dict[str, numpy.ndarray]:
-        """Return the policy as a :class:`~.learned_policy.LearnedPolicy` takes it, of its strongest fields only."""
+        """Return the arrays of a :class:`~.learned_policy.LearnedPolicy`, restricted to the strongest fields."""
         columns = self.strongest_fields(self.fields_kept)
         named = {"observation_mean": self.mean[columns], "observation_scale": self.scale[columns]}
         if self.gru is not None:
@@ -176,7 +176,7 @@ class NetworkPolicy(torch.nn.Module):
         return {name: tensor.detach().numpy().copy() for name, tensor in named.items()}
 
     def fields(self, model: Model) -> list[str]:
-        """Names of what :meth:`arrays` take of an observation."""
+        """Return the names of the fields that the policy of :meth:`arrays` reads."""
         return [model.fields[i].name for i in self.strongest_fields(self.fields_kept)]
 
 
@@ -188,21 +188,21 @@ def descend_episodes(
     gate: Gate | None = None,
     largest: float | None = None,
 ) -> float:
-    """Fly one episode in every environment and descend the gradient of the mean cost.
+    """Simulate one episode in every environment and descend the gradient of the mean cost.
 
     Args:
-        env: with torch backend and autoreset mode "Disabled".
-        policy: whose gradients are added to.
+        env: environments with torch backend and autoreset mode "Disabled".
+        policy: the policy, to whose gradients are added.
         truncation: decisions through which the gradient flows back.
         descend: called every ``truncation`` decisions and at the end, when the policy's gradients are those of
-            the mean cost of a decision since the last time; uses and clears them.
-        gate: that decides whether the policy acts; a decision in which it does not, has no gradient.
-        largest: norm to which the gradient of an episode's costs since the last time with respect to one of its actions
-            is cut. Some episodes lose the track, and then the gradient grows with every decision that it flows back:
-            uncut, few episodes say where all go.
+            the mean cost of a decision since the last call; uses and clears them.
+        gate: gate that decides whether the policy acts; other decisions have no gradient.
+        largest: norm to which the gradient of an episode's costs since the last call with respect to one of its actions
+            is clipped. In episodes that lose the track the gradient grows with every decision that it flows back:
+            without clipping, few episodes dominate the sum.
 
     Returns:
-        Mean cost of a measurement, in the unit of the reward and compressed as there.
+        Mean cost of a measurement, in the unit of the reward and compressed in the same way.
     """
     observation, _ = env.reset()
     hidden = policy.new_memory(env.num_envs)
@@ -237,7 +237,7 @@ def descend_episodes(
 
 
 def measure_normalisation(env: TaskVectorEnv, policy: NetworkPolicy) -> None:
-    """Set the policy's normalisation to the observations that its first actions bring about."""
+    """Set the policy's normalisation to mean and deviation of the observations under its first actions."""
     observation, _ = env.reset()
     hidden = policy.new_memory(env.num_envs)
     seen = []
@@ -253,7 +253,7 @@ def measure_normalisation(env: TaskVectorEnv, policy: NetworkPolicy) -> None:
 
 
 def _environment(run: TrainingRun) -> TaskVectorEnv:
-    """Episodes that can be differentiated, as code of the processor where that is possible."""
+    """Return the environments of a run that can be differentiated, with compiled backend where possible."""
     make = functools.partial(
         TaskVectorEnv,
         run.environment,
@@ -284,16 +284,16 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
 
 
 def _reward_to_descend(run: TrainingRun) -> str:
-    """Reward whose gradient is followed; that of the difference to the paper's algorithm is the cost's own."""
+    """Return the reward to differentiate; the difference to the paper's algorithm has the gradient of the cost."""
     kind = run.hyperparameters.get("env_kwargs", {}).get("reward", "cost")
     return "cost" if kind == "relative" else kind
 
 
 def _reward_with_teacher(run: TrainingRun) -> TrainingObjective:
-    """Reward whose gradient is followed, with the share of it that a teacher gives.
+    """Return the reward to differentiate, with the share of a teacher.
 
     Raises:
-        ValueError: if a teacher cannot give it.
+        ValueError: if a student cannot be trained with this reward.
     """
     kind, values = _reward_to_descend(run), run.hyperparameters
     if values.get("teacher") is None:
@@ -305,17 +305,16 @@ def _reward_with_teacher(run: TrainingRun) -> TrainingObjective:
     return TrainingObjective(kind, share)
 
 
-def _agent_of(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
-    """Return the agent that a network in training is by now."""
+def _make_agent(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
     network = LearnedPolicy(model, policy.arrays(), "tanh", ACTIVATION, policy.fields(model))
-    return as_trained(model, network, gated=gated)
+    return wrap_as_trained(model, network, gated=gated)
 
 
 class Descent:
-    """The network of a run, what trains it, and how far it is.
+    """The network of a run with its environments, optimiser and progress.
 
     Args:
-        run: what is trained; it is told what computes the steps.
+        run: the run; its ``backend`` is set to that of the environments.
 
     Raises:
         ValueError: for a control with discrete actions.
@@ -351,7 +350,7 @@ class Descent:
         self.steps_done: int = 0
 
     def flight(self) -> Callable[[Callable[[], None]], float]:
-        """Return what flies an episode in every environment, descends its gradient and returns its mean cost."""
+        """Return the function that simulates an episode in every environment, descends, and returns the mean cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
         teacher = self.values.get("teacher")
@@ -366,25 +365,25 @@ class Descent:
         return functools.partial(descend_episodes, env, policy, truncation, gate=gate, largest=largest)
 
     def update(self) -> float:
-        """Descend the gradient that has been gathered; return its norm."""
+        """Descend the accumulated gradient and return its norm."""
         norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.values["max_grad_norm"])
         self.optimiser.step()
         self.optimiser.zero_grad()
         return float(norm)
 
     def follow_schedule(self) -> None:
-        """Set the learning rate, and the fields that are read, to those of the share of the run that is done."""
+        """Set the learning rate and the fields in use for the current share of the run."""
         done, policy = self.steps_done / self.run.steps, self.policy
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate(1.0 - done)
-        # Geometrically fewer: each time the rest has about as long to learn without what is left out.
+        # Geometrically fewer, so that the network trains about as long after each removal.
         every = len(policy.used)
         policy.use_fields(math.ceil(every * (policy.fields_kept / every) ** min(1.0, done / PRUNED)))
 
     def trainee(self) -> Trainee:
-        """Return the agent as the bookkeeping takes it."""
+        """Return the agent with its functions for saving."""
         run, policy = self.run, self.policy
-        agent = functools.partial(_agent_of, policy, run.gated)
+        agent = functools.partial(_make_agent, policy, run.gated)
 
         def save_agent(place: Path) -> None:
             path = place / "agent.safetensors"
@@ -402,13 +401,13 @@ class Descent:
             "generators": json.dumps(generators),
             "steps": self.steps_done,
         }
-        # Through memory: on a full disk torch raises something of its own.
+        # Through memory: on a full disk torch raises its own exception.
         written = io.BytesIO()
         torch.save(kept, written)
         (folder / "checkpoint.pt").write_bytes(written.getvalue())
 
     def load_checkpoint(self, folder: Path) -> None:
-        """Go on from a checkpoint.
+        """Load a checkpoint to continue from.
 
         Raises:
             ValueError: if it cannot be read.
@@ -422,14 +421,16 @@ class Descent:
             for generator, state in zip(self.env.fleet.generators, states, strict=True):
                 generator.bit_generator.state = state
             self.steps_done = int(kept["steps"])
-        except Exception as error:  # torch raises whatever a corrupt file makes it stumble over
+        except Exception as error:  # for a corrupt file torch raises various exceptions
             raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error
 
 
 def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
-    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
+    """Train until ``run.steps`` environment steps are done, or until Ctrl-C or SIGTERM.
 
-    Arguments as in :func:`.sb3_training.train_sb3`.
+    Args:
+        run: run from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.
+        session: settings of the session.
 
     Raises:
         ValueError: for a control with discrete actions, or a checkpoint that cannot be read.
@@ -443,14 +444,14 @@ def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
     else:
         measure_normalisation(descent.env, descent.policy)
     fly = descent.flight()
-    logger = logger_in(session.folder / "log", descent.steps_done)
+    logger = make_logger(session.folder / "log", descent.steps_done)
 
     def descend() -> None:
         logger.record_mean("train/gradient_norm", descent.update())
 
     per_iteration = run.envs * descent.env.last_decision
     with interruption() as stop:
-        books = Bookkeeping(run, session, descent.trainee(), stop, curves_beside(logger), began)
+        books = Bookkeeping(run, session, descent.trainee(), stop, curve_writer(logger), began)
         stopping = False
         while descent.steps_done < run.steps and not stopping:
             descent.follow_schedule()

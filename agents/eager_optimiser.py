@@ -1,9 +1,9 @@
 """Optimisers of torch without torch's compiler.
 
-Torch's optimisers import ``torch._dynamo`` when the first one is made, and at every step, only to keep the compiler
-away from some of their functions. That import takes longer than an agent needs to beat the paper's algorithm. Nothing
-here is compiled by torch, so they can do without it. This reads names that torch keeps for itself: where another
-version has others, the import happens as ever, and the numbers are the same either way.
+Torch's optimisers import ``torch._dynamo`` when the first one is made, and at every step, only to exclude some of their
+functions from compilation. That import takes longer than an agent needs to beat the paper's algorithm. Torch compiles
+nothing here, so the import is not needed. This module reads private names of torch: where another version has other
+names, the import takes place, and the numbers are the same either way.
 """
 
 import types
@@ -16,7 +16,7 @@ EXCLUDED = ("add_param_group", "zero_grad", "state_dict", "load_state_dict")
 
 
 def exclude_from_compilation() -> None:
-    """Note for these methods that nothing is to be compiled, which torch otherwise asks its compiler to note."""
+    """Mark these methods as excluded from compilation, which torch otherwise does through its compiler."""
     for name in EXCLUDED:
         method = getattr(getattr(torch.optim.Optimizer, name), "__wrapped__", None)
         if method is not None and not hasattr(method, "__dynamo_disable"):
@@ -24,7 +24,7 @@ def exclude_from_compilation() -> None:
 
 
 def step_eagerly(optimizer: torch.optim.Optimizer) -> None:
-    """Let this optimiser step without asking the compiler to look away; not where it is to be differentiated."""
+    """Make this optimiser step without calling torch's compiler, unless it is differentiable."""
     step: Any = getattr(type(optimizer).step, "__wrapped__", None)
     while hasattr(step, "__wrapped__"):
         step = step.__wrapped__

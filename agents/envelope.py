@@ -1,8 +1,8 @@
-"""Whether an agent is shown what it was trained on.
+"""Ranges of the observations in an agent's training, and the comparison of later observations with them.
 
-A network answers whatever it is asked. Its envelope is what it saw of each field in its training: an exported agent
-carries it in its file; of others some hundred episodes of the training distribution are flown again. What an agent is
-shown now is held against that, field by field.
+A network has an output for any input. Its envelope is the range of each field in its training. The file of an exported
+agent contains it; for other agents some hundred episodes of the training distribution are simulated again. Later
+observations are compared with the envelope field by field.
 """
 
 import math
@@ -27,48 +27,47 @@ from ..evaluation.running.seeds import episode_seeds
 from .learned_estimator import fill_missing
 
 EPISODES = 512
-"""Of the training distribution that are flown: of few, an episode of the same distribution would often lie outside."""
+"""Episodes of the training distribution; with few, an episode of the same distribution would often lie outside."""
 EPISODES_NOW = 16
-"""Of what is evaluated."""
+"""Episodes of the evaluated scenario."""
 MOST_DECISIONS = 400
-"""Of an episode that are looked at."""
+"""Decisions of an episode that are compared."""
 TOLERATED = 0.1
-"""Share of a field's values outside of what was seen in training that is not spoken of."""
+"""Share of a field's values outside the range of training that is not reported."""
 
 
 USUAL = 1e-3
-"""Share of a field's values that lie outside of what was seen, in training itself."""
+"""Share of a field's values outside the range, in the training distribution itself."""
 OFTEN = 0.5
-"""The same where an agent is shown what it was not trained on."""
+"""Share of a field's values outside the range, in other distributions."""
 WINDOW = 50.0
-"""Decisions over which a running filter judges what it is shown."""
+"""Decisions over which a running filter averages the share outside the range."""
 
 
 class TrainingRange(NamedTuple):
-    """What an agent has seen of each field in its training."""
+    """Range of each field of the observation in an agent's training."""
 
     fields: tuple[str, ...]
-    """That it takes."""
+    """Names of the fields that the agent reads."""
     low: numpy.ndarray
-    """Smallest value, ``(fields,)``."""
+    """Smallest values, ``(fields,)``."""
     high: numpy.ndarray
-    """Largest value, likewise."""
+    """Largest values, ``(fields,)``."""
 
     def is_outside(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Which values of observations ``(n, fields)`` were not seen in training."""
-        # What is no number was not seen either.
+        """Return which values of observations ``(n, fields)`` are outside the range; NaN is."""
         return numpy.logical_not((observation >= self.low) & (observation <= self.high))
 
 
 class EnvelopeAlarm(Alarm):
-    """Speaks where what an agent is shown leaves what it saw in its training.
+    """Alarm that sounds where the observations leave the range of an agent's training.
 
-    In training a value of a field lies outside once in ``1 / USUAL`` decisions or less, outside of it half of them do:
-    the sum of log-likelihood ratios of each field is an alarm like any other.
+    In training a value of a field lies outside once in ``1 / USUAL`` decisions or less; in other distributions half of
+    the values do. The alarm sums the log-likelihood ratios of each field.
 
     Args:
-        model: whose observations are shown.
-        range: of the training.
+        model: the model whose observations are passed.
+        range: range of the training.
     """
 
     def __init__(self, model: Model, range: TrainingRange) -> None:
@@ -77,22 +76,22 @@ class EnvelopeAlarm(Alarm):
         self.columns: list[int] = model.columns(range.fields)
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Weigh every field for itself."""
+        """Return the log-likelihood ratio of each field, ``(N, fields)``."""
         outside = self.range.is_outside(observation[:, self.columns])
         return numpy.where(outside, math.log(OFTEN / USUAL), math.log((1.0 - OFTEN) / (1.0 - USUAL)))
 
 
 class NetworkWatch:
-    """How much of what a network is shown was not seen in its training.
+    """Share of a network's recent observations that lie outside the range of its training.
 
     Args:
-        model: whose observations it is shown.
-        range: of its training.
-        observe: as of :class:`~.online_state.Watch`.
+        model: the model whose observations are passed.
+        range: range of the training.
+        observe: report of the observation, see :class:`~.online_state.Watch`.
 
     Attributes:
         memory: share of each field's values outside, over the last decisions, ``(tracks, fields)``; None before the
-            first.
+            first decision.
     """
 
     def __init__(self, model: Model, range: TrainingRange, observe: Report | None = None) -> None:
@@ -102,7 +101,7 @@ class NetworkWatch:
         self.memory: numpy.ndarray | None = None
 
     def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
-        """Look at what is shown."""
+        """Update the shares with observations ``(tracks, fields)``."""
         outside = self.range.is_outside(observation[:, self.columns])
         before = 0.0 * outside if self.memory is None else self.memory
         if start.any():
@@ -110,12 +109,12 @@ class NetworkWatch:
         self.memory = before + (outside - before) / WINDOW
 
     def describe(self) -> list[str]:
-        """Say for each track which field is outside too often; empty where none is."""
+        """Return for each track a sentence about the field that is outside too often; empty where none is."""
         if self.memory is None:
             return []
         most, share = self.memory.argmax(axis=1), self.memory.max(axis=1)
         return [
-            f"{100.0 * much:.0f} % of the last values of {self.range.fields[field]} lie outside of all that it saw in "
+            f"{100.0 * much:.0f} % of the last values of {self.range.fields[field]} lie outside the range of its "
             "training"
             if much > TOLERATED
             else ""
@@ -124,12 +123,14 @@ class NetworkWatch:
 
 
 def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
-    """Return what an agent carries of its training, or fly some episodes of it again; None where nobody knows how it
-    was trained, or on a mixture of scenarios.
+    """Return the range of an agent's training, from its file or from new episodes of its training distribution.
 
     Args:
         cls: the task.
-        maker: as of :func:`departure`.
+        maker: factory of a learned policy or estimator, as :func:`.learned_policy.load_policy` returns it.
+
+    Returns:
+        The range; None if the training is unknown, or was on a mixture of scenarios and the file has no range.
     """
     stored = _stored(maker)
     if stored is None:
@@ -146,62 +147,65 @@ def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
 
 
 def _stored(maker: Any) -> Any:
-    """Return what was loaded of a learned policy or estimator; None where its training is not known."""
+    """Return the stored policy inside a learned policy or estimator; None if its training is unknown."""
     for inside in ("maker", "policy"):  # of a gate, of an estimator
         maker = getattr(maker, inside, maker)
     return maker if getattr(maker, "header", None) is not None else None
 
 
 def _own_parameters(cls: type[Task], run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters of the task that an agent was trained under."""
+    """Return the parameters of the task that an agent was trained with."""
     known = parameter_names(cls)
     given = run.get("hyperparameters", {}).get("env_kwargs", {})
     return {name: value for name, value in given.items() if name in known}
 
 
 class Departure(NamedTuple):
-    """How far what an agent is to act in is from what it was trained on."""
+    """Difference between the task that an agent is to act in and its training."""
 
     share: float
-    """Share of the values of one field outside of all that was seen in training: of the field where it is largest."""
+    """Share of the values of one field outside the range of training: the field with the largest share."""
     field: str
-    """Its name; empty where none is outside often."""
+    """Name of that field; empty where no field is outside often."""
     parameters: Mapping[str, tuple[Any, Any]]
-    """Parameters that were set otherwise: value in training, value now."""
+    """Parameters with other values: value in training, value now."""
 
     def __str__(self) -> str:
-        said = [
+        sentences = [
             f"trained with {name} {one!r}, not {other!r}" for name, (one, other) in self.parameters.items()
         ]
         if self.field:
-            said.append(
-                f"{100.0 * self.share:.0f} % of {self.field} lie outside of all that it saw in training"
+            sentences.append(
+                f"{100.0 * self.share:.0f} % of {self.field} lie outside the range of its training"
             )
-        return "; ".join(said)
+        return "; ".join(sentences)
 
 
 def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str, Any]) -> Departure | None:
-    """Say how far an agent is from its training; None where it is within, or nobody knows how it was trained.
+    """Compare the task that an agent is to act in with its training.
 
     Args:
         cls: the task.
-        maker: of a learned policy or estimator, as :func:`.learned_policy.load_policy` returns it.
-        scenario: that it is to act in.
+        maker: factory of a learned policy or estimator, as :func:`.learned_policy.load_policy` returns it.
+        scenario: the scenario that the agent is to act in.
         keywords: parameters of the task there.
+
+    Returns:
+        The difference; None if the task is within the training, or the training is unknown.
     """
     stored = _stored(maker)
     if stored is None or find_mixture(cls, stored.header["run"].get("scenario")) is not None:
         return None
     header, run = stored.header, stored.header["run"]
     own = _own_parameters(cls, run)
-    keywords = {**stored.task_keywords, **keywords}  # what it acts with wherever it acts
+    keywords = {**stored.task_keywords, **keywords}  # the agent always acts with its own
     trained = make_task(cls, run.get("scenario"), **own).parameters
     differing = {name: (getattr(trained, name), value) for name, value in keywords.items()}
-    # How long an episode is, is no other problem.
+    # Another length of the episodes does not change the problem.
     differing = {n: (a, b) for n, (a, b) in differing.items() if a != freeze(b) and n != "horizon"}
     now, then = (cls.default_scenario if one is None else one for one in (scenario, run.get("scenario")))
     if isinstance(now, str) and now == then and not (own.keys() - stored.task_keywords or differing):
-        return None  # it is what it was trained on, and need not be flown
+        return None  # the same task: no episodes are needed
     seen = training_range(cls, maker)
     assert seen is not None
     shown = _observations(cls, stored, scenario, keywords, episode_seeds("test", 0, EPISODES_NOW))
@@ -216,7 +220,7 @@ def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str,
 def _observations(
     cls: type[Task], stored: Any, scenario: Any, keywords: Mapping[str, Any], seeds: Sequence[int]
 ) -> numpy.ndarray:
-    """Fields that an agent takes, of all decisions of some episodes that it flies, ``(n, fields)``."""
+    """Return the fields that an agent reads, at all decisions of some episodes under it, ``(n, fields)``."""
     model = make_model(cls, stored.control, scenario, backend="auto", **keywords)
     lanes = start_lanes(model, seeds)
     policy = SteppingPolicy(model, make_competitor(stored, model))
@@ -230,13 +234,13 @@ def _observations(
 
 
 def observe_network(model: Model, episode: Episode) -> Array:
-    """Report what the network of a learned estimator in a loop is shown of a measurement that has come."""
+    """Report the observation of the network of a learned estimator in a closed loop after a measurement."""
     own, received = model.filter.own, fill_missing(model.task.world.mask_missing(episode.measurement))
     return own.model.observe(Episode(None, received, episode.filter.own.bank))
 
 
 def watch_live(model: Model, maker: Any, kind: Kind) -> NetworkWatch | None:
-    """Return what compares the observations of an agent that runs live with those of its training; None of others."""
+    """Return the comparison of a live agent's observations with its training; None if the range is unknown."""
     seen = training_range(type(model.task), maker)
     if seen is None:
         return None

@@ -1,4 +1,4 @@
-"""From a training run to a learned policy without torch: the network's arrays and the run's record."""
+"""Export of a training run as a learned policy without torch: the network's arrays and the run's record."""
 
 import shutil
 from pathlib import Path
@@ -17,18 +17,18 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
     """Write the best agent of a run as ``out``, with its ``run.json`` beside it under the same name.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         out: file of the agent.
         trust: load a model that has no plain arrays beside it, or import the module that registers the environment;
             both can execute code.
 
     Raises:
-        ValueError: if the folder holds no run, none that can be exported, or one that takes ``trust``, or the file
-            cannot be written.
+        ValueError: if the folder contains no run, the run cannot be exported or needs ``trust``, or the file cannot be
+            written.
     """
     run = load_run(folder, trust)
     if out.suffix != ".safetensors":
-        raise ValueError(f"{out} must end in .safetensors, by which an evaluation knows what it is")
+        raise ValueError(f"{out} must end in .safetensors, by which an evaluation recognises an agent")
     writable_file(out)
     source = best_agent(folder)
     with whole_files(out.parent) as waiting:
@@ -36,7 +36,7 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
         if source.suffix == ".safetensors":
             shutil.copyfile(source, file)
         else:
-            from .network_arrays import network_arrays  # with torch, which the arrays alone do not need
+            from .network_arrays import network_arrays  # imports torch, which plain arrays do not need
 
             agent = load_zipped_model(run.problem.task, source, run.control, trust)
             arrays, output, activation = network_arrays(agent, run.algorithm)

@@ -1,14 +1,14 @@
-"""Do no harm: an agent is trusted only while something is wrong that it has met in its training.
+"""Gates that use an agent only while an alarm is active and the observations resemble its training.
 
-Where filters and sensors are as modelled a classical filter is hard to beat and easy to harm, and what a network
-answers to what it never saw nobody knows. So an agent is trusted while an alarm (:mod:`..baselines.alarm`) has spoken
-within the last decisions, and what it is shown lies within what it saw in training (:mod:`.envelope`). Who is not
-trusted goes on all the same, so that it remembers the whole episode when its time comes.
+Where filters and sensors are as modelled, a classical filter is hard to beat and easy to harm. The output of a network
+far from its training data is unpredictable. So the gate trusts an agent under two conditions: an alarm
+(:mod:`..baselines.alarm`) has sounded within the last decisions, and the observations lie within the range of the
+training (:mod:`.envelope`). An agent that is not trusted still runs, so that its memory covers the whole episode.
 
-There are two gates. ``gated:NAME`` runs two filters side by side, the agent's and a classical one, and answers with the
-estimate of the one that is trusted (:class:`GatedEstimator`): the fallback may be any policy or estimator, whatever the
-agent steers, and in a closed loop the estimate that is trusted flies. In training (``--gated``) both share one filter,
-and the gate holds back the agent's action (:class:`Gated`): the fallback is an action of the same control.
+There are two gates. ``gated:NAME`` runs two filters side by side, the agent's and a classical one, and returns the
+estimate of the trusted one (:class:`GatedEstimator`). The fallback may be any policy or estimator, whatever the agent
+controls; in a closed loop the vehicle follows the trusted estimate. In training (``--gated``) both share one filter,
+and the gate replaces the agent's action (:class:`Gated`): the fallback is an action of the same control.
 """
 
 import math
@@ -47,20 +47,20 @@ from .learned_estimator import EstimatorMaker, LearnedEstimator
 from .residual import ResidualPolicy, policy_to_correct
 
 CHECKED_EPISODES = 128
-"""Of the validation split on which a fallback is compared with the paper's algorithm."""
+"""Episodes of the validation split on which a fallback is compared with the paper's algorithm."""
 MOST_ODDS = math.log(100.0)
-"""Log-odds of one filter to another beyond which nothing is remembered (ours: decisive by Jeffreys' scale)."""
+"""Largest log-odds of one filter to another that are accumulated (ours: decisive by Jeffreys' scale)."""
 SIGNIFICANT = 3.0
-"""Standard errors by which a fallback that is refused costs more, and normalised innovations are too large."""
+"""Standard errors beyond which a fallback is rejected for its cost, and normalised innovations are too large."""
 NIS_MEMORY = 50.0
-"""Measurements over which the normalised innovation squared is averaged, and degrees that count as one before any;
-ours."""
+"""Measurements over which the normalised innovation squared is averaged, and degrees of freedom of the initial mean of
+one; ours."""
 
 
 class FallbackAction(ConstantPolicy):
     """The paper's algorithm as a constant action of a task's control.
 
-    It is the one that the paper's policy has; under another control whose actions lie around zero, zero: the paper's
+    It is the action of the paper's policy. Under another control whose actions lie around zero it is zero: the paper's
     algorithm there, or the classical filter that the environment's page names.
 
     Raises:
@@ -77,35 +77,35 @@ class FallbackAction(ConstantPolicy):
             self.action = (0.0,) * space.shape[0]
         else:
             raise ValueError(
-                f"control {model.control!r} of {model.task.id} has no constant action that is the paper's: give the "
-                "gate a fallback, or choose another control"
+                f"control {model.control!r} of {model.task.id} has no constant action of the paper's algorithm: "
+                "give the gate a fallback, or choose another control"
             )
 
 
 class TrustMemory(NamedTuple):
-    """What is remembered of alarms."""
+    """Memory of the alarms of N episodes."""
 
     alarm: Any
     envelope: Any
-    """None where there is none."""
-    heeded: Array
-    """Decisions for which the alarm is still heeded, ``(N,)``."""
+    """None without an envelope."""
+    active: Array
+    """Remaining decisions for which the alarm is active, ``(N,)``."""
     outside: Array
-    """Decisions for which the agent is not trusted because it was shown what it had not met, ``(N,)``."""
+    """Remaining decisions for which the agent is not trusted after an observation outside its training, ``(N,)``."""
 
 
 class Trust:
-    """Decides at every decision whether an agent is trusted.
+    """Rule that trusts an agent, or not, at every decision.
 
     Args:
-        model: whose observations it is shown.
-        alarm: an object with a method ``hear`` (:class:`.Alarm`), or what makes one for the model; default: that of the
-            environment's baselines, or :class:`.InnovationAlarm`.
-        window: decisions for which an alarm is heeded, that at which it speaks among them; default: the alarm's.
-        envelope: of the agent's training; without it, it is trusted whatever it is shown.
+        model: the model whose observations are passed.
+        alarm: an object with a method ``hear`` (:class:`.Alarm`), or a factory of one for the model; default: that of
+            the environment's baselines, or :class:`.InnovationAlarm`.
+        window: decisions for which an alarm is active, including the one at which it sounds; default: the alarm's.
+        envelope: range of the agent's training; without it, the agent is trusted for all observations.
 
     Raises:
-        ValueError: if the alarm cannot serve the task, or the window is empty.
+        ValueError: if the alarm does not fit the task, or the window is empty.
     """
 
     def __init__(
@@ -125,24 +125,24 @@ class Trust:
     def listen(
         self, observation: numpy.ndarray, memory: TrustMemory | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, TrustMemory]:
-        """Say where the agent is trusted.
+        """Return where the agent is trusted.
 
         Args:
             observation: ``(N, fields)``.
-            memory: what the last call returned; None at the first.
+            memory: memory returned by the last call; None at the first.
             start: true where an episode begins, ``(N,)``.
 
         Returns:
             Booleans ``(N,)``, and memory.
         """
         none = 0.0 * observation[:, 0]
-        alarm, envelope, heeded, outside = (None, None, none, none) if memory is None else memory
+        alarm, envelope, active, outside = (None, None, none, none) if memory is None else memory
         spoken, alarm = self.alarm.hear(observation, alarm, start)
-        heeded = self._count_down(spoken, heeded, start)
+        active = self._count_down(spoken, active, start)
         if self.envelope is not None:
             left, envelope = self.envelope.hear(observation, envelope, start)
             outside = self._count_down(left, outside, start)
-        return (heeded > 0.0) & (outside <= 0.0), TrustMemory(alarm, envelope, heeded, outside)
+        return (active > 0.0) & (outside <= 0.0), TrustMemory(alarm, envelope, active, outside)
 
     def _count_down(self, spoken: Array, before: Array, start: Array) -> Array:
         left = numpy.maximum(numpy.where(start, 0.0, before) - 1.0, 0.0)
@@ -153,23 +153,23 @@ class Trust:
 
 
 class GateMemory(NamedTuple):
-    """What a gate remembers."""
+    """Memory of a gate."""
 
     trust: TrustMemory | None
     fallback: Any
 
 
 class Gate:
-    """Decides between an action and the fallback's, in training.
+    """Choice between an agent's action and that of a fallback, in training.
 
     Args:
-        model: whose observations it is shown.
-        fallback: a policy, or what makes one for the model; default: :class:`FallbackAction`.
-        alarm: as of :class:`Trust`.
-        window: likewise.
+        model: the model whose observations are passed.
+        fallback: a policy, or a factory of one for the model; default: :class:`FallbackAction`.
+        alarm: an alarm, or a factory of one, see :class:`Trust`.
+        window: decisions for which an alarm is active, see :class:`Trust`.
 
     Raises:
-        ValueError: if a default cannot serve the task, the fallback has another control, or the window is empty.
+        ValueError: if a default does not fit the task, the fallback has another control, or the window is empty.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class Gate:
             raise ValueError(f"the fallback is made for control {own!r}, but the task has {model.control!r}")
 
     def begin(self, seeds: Sequence[int]) -> GateMemory:
-        """Memory at the start of the episodes with these seeds."""
+        """Return the memory at the start of the episodes with these seeds."""
         return GateMemory(None, self.fallback.begin(seeds) if isinstance(self.fallback, Policy) else None)
 
     def choose(
@@ -194,16 +194,16 @@ class Gate:
         memory: GateMemory | None,
         start: numpy.ndarray,
     ) -> tuple[numpy.ndarray, numpy.ndarray, GateMemory]:
-        """Answer for every episode the action where the gate is open, and elsewhere the fallback's.
+        """Return for every episode the action where the gate is open, and elsewhere the fallback's.
 
         Args:
             observation: ``(N, fields)``.
-            action: batch first.
-            memory: what the last call returned; None at the first.
+            action: the agent's actions, batch first.
+            memory: memory returned by the last call; None at the first.
             start: true where an episode begins, ``(N,)``.
 
         Returns:
-            Actions, where the gate is open, ``(N,)``, and memory.
+            Actions, batch first; whether the gate is open, booleans ``(N,)``; and memory.
         """
         memory = self.begin(range(len(observation))) if memory is None else memory
         opened, trust = self.trust.listen(observation, memory.trust, start)
@@ -216,18 +216,18 @@ class Gated(Policy):
     """A policy behind a :class:`Gate`, as it acts in its training.
 
     Args:
-        model: of all of them.
-        policy: anything with Stable-Baselines3's ``predict``, or what makes it for the model.
-        fallback: as of :class:`Gate`.
-        alarm: likewise.
-        window: likewise.
+        model: the model of policy and fallback.
+        policy: an object with Stable-Baselines3's ``predict``, or a factory of one for the model.
+        fallback: a policy, or a factory of one, see :class:`Gate`.
+        alarm: an alarm, or a factory of one, see :class:`Trust`.
+        window: decisions for which an alarm is active, see :class:`Trust`.
 
     Raises:
-        ValueError: likewise.
+        ValueError: if the policy has another control, or the gate cannot be made, see :class:`Gate`.
     """
 
     inner: ClassVar[str] = "policy"
-    """Attribute that holds the policy inside."""
+    """Attribute that contains the policy inside."""
 
     def __init__(
         self, model: Model, policy: Any, fallback: Any = None, alarm: Any = None, window: int | None = None
@@ -244,13 +244,13 @@ class Gated(Policy):
         expose_spaces(self, self.policy)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory] | None:
-        """Memories of policy and gate; none of what can be traced, which draws nothing."""
+        """Return the memories of policy and gate; None if both are traceable, as such policies draw no numbers."""
         if self.traceable:
             return None
         return (self.policy.begin(seeds) if isinstance(self.policy, Policy) else None), self.gate.begin(seeds)
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Ask the policy, then the gate."""
+        """Run the policy, then the gate."""
         memory, gate_memory = (None, None) if state is None else state
         own, memory = self.policy.predict(observation, memory, start, deterministic=True)
         action, _, gate_memory = self.gate.choose(observation, own, gate_memory, start)
@@ -260,22 +260,22 @@ class Gated(Policy):
 # --- two filters
 
 
-class ListeningMemory(NamedTuple):
-    """What a policy remembers, and its alarms."""
+class MonitoredMemory(NamedTuple):
+    """Memory of a policy and of its alarms."""
 
     policy: Any
     trust: TrustMemory
     trusted: Array
-    """Whether it is trusted, booleans ``(N,)``."""
+    """Whether the policy is trusted, booleans ``(N,)``."""
 
 
-class ListeningPolicy(Policy):
-    """A policy that acts as it would alone, and keeps whether it is trusted.
+class MonitoredPolicy(Policy):
+    """A policy whose memory includes whether it is trusted; its actions do not change.
 
     Args:
-        policy: anything with Stable-Baselines3's ``predict``.
-        trust: that decides about it.
-        model: of both.
+        policy: an object with Stable-Baselines3's ``predict``.
+        trust: the rule that trusts the policy.
+        model: the model of both.
     """
 
     def __init__(self, policy: Any, trust: Trust, model: Model) -> None:
@@ -285,47 +285,47 @@ class ListeningPolicy(Policy):
         self.trust = trust
 
     def act(
-        self, observation: numpy.ndarray, state: ListeningMemory | None, start: numpy.ndarray
-    ) -> tuple[numpy.ndarray, ListeningMemory]:
-        """Ask the policy, then the alarms."""
+        self, observation: numpy.ndarray, state: MonitoredMemory | None, start: numpy.ndarray
+    ) -> tuple[numpy.ndarray, MonitoredMemory]:
+        """Run the policy, then the alarms."""
         memory, trust = (None, None) if state is None else state[:2]
         action, memory = self.policy.predict(observation, memory, start, deterministic=True)
         trusted, trust = self.trust.listen(observation, trust, start)
-        return action, ListeningMemory(memory, trust, trusted)
+        return action, MonitoredMemory(memory, trust, trusted)
 
 
 class GatedState(NamedTuple):
     """State of a gated filter."""
 
     agent: Any
-    """Of the agent's filter."""
+    """State of the agent's filter."""
     fallback: Any
-    """Of the other."""
+    """State of the fallback."""
     trusted: Array
-    """Whether the agent's filter answers, booleans ``(N,)``."""
+    """Whether the estimate is that of the agent's filter, booleans ``(N,)``."""
     odds: Array
-    """Log-odds of the fallback to the agent's filter by how well they have predicted the measurements, ``(N,)``."""
+    """Log-odds of the fallback to the agent's filter, from the likelihoods of the measurements, ``(N,)``."""
     squares: Array
     """Weighted sum of the fallback's normalised innovations squared, ``(N,)``."""
     degrees: Array
-    """Likewise of their degrees of freedom."""
+    """Weighted sum of their degrees of freedom, ``(N,)``."""
 
 
 class GatedEstimator(Filter[Any, Any, GatedState]):
     """An agent's filter and a fallback side by side.
 
-    Beside its alarms the agent has to stand the comparison: it is not trusted while the fallback has predicted the
-    measurements better. The log-likelihood ratios of the two are summed within :data:`MOST_ODDS`, so that old ones are
-    forgotten as soon as new ones speak against them. Where the fallback takes in what the agent is not told of, such as
-    all plots of a scan, it has no density of the measurement to compare; that speaks against the agent with all odds.
+    The agent is not trusted while the fallback has predicted the measurements better. The log-likelihood ratios of the
+    two are summed within :data:`MOST_ODDS`, so that new ratios soon outweigh old ones. A fallback that uses data that
+    the agent does not receive, such as all plots of a scan, has no density of the measurement to compare; the odds are
+    then the largest ones against the agent.
 
-    Where the fallback's innovations have been significantly larger than it expects, its covariance is answered times
+    Where the fallback's innovations have been significantly larger than predicted, its covariance is multiplied by
     their mean square: the variance factor of an adjustment (Teunissen, Adjustment Theory, 2000), as if all noise were
-    larger alike. Errors that last show little in the innovations, and are not healed. The agent's covariance stays: its
-    innovations are those before its action.
+    larger by one factor. Persistent errors hardly change the innovations and are not corrected. The agent's covariance
+    is not scaled: its innovations are those before its action.
 
     Args:
-        agent: a filter whose policy is a :class:`ListeningPolicy`.
+        agent: a filter whose policy is a :class:`MonitoredPolicy`.
         fallback: a filter.
     """
 
@@ -339,7 +339,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         self.in_python: bool = fallback.in_python or not says_traceable(policy.policy)
 
     def start(self, initial: Any) -> GatedState:
-        """Start both where everyone starts."""
+        """Start both from the initial estimate."""
         none = 0.0 * initial.mean[0]
         expected = none + NIS_MEMORY
         states = self.agent.start(initial), self.fallback.start(initial)
@@ -353,7 +353,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         )
 
     def update(self, state: GatedState, given: FilterInput) -> GatedState:
-        """Let both take the measurement in, and decide who is trusted."""
+        """Update both filters with the measurement, and decide which one is trusted."""
         xp, measurement = self.xp, given.measurement
         agent, fallback = self.agent.update(state.agent, given), self.fallback.update(state.fallback, given)
         mean, other_mean = self.agent.mean(agent), self.fallback.mean(fallback)
@@ -361,12 +361,12 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         other = Likelihood.told(self.fallback.records(fallback, measurement))
         if isinstance(self.fallback, Adapter) and not self.fallback.tells:
             other = Likelihood(None)
-        # A track that is lost altogether, so that its estimate is no number, is no answer either.
+        # A lost track, whose estimate is not finite, is not trusted.
         odds, sound = state.odds, xp.all(xp.isfinite(mean), axis=0)
         if other.log_likelihood is not None:
             silent = xp.isnan(other.log_likelihood) & xp.all(xp.isfinite(other_mean), axis=0)
             if own.log_likelihood is None:
-                # Whether it was told less, or nothing was received, this agent does not say.
+                # This agent does not report whether it received less data, or none.
                 sound = sound & ~silent
             else:
                 ratio = other.log_likelihood - own.log_likelihood
@@ -377,61 +377,62 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         return GatedState(agent, fallback, trusted, odds, squares, degrees)
 
     def mean(self, state: GatedState) -> Array:
-        """That of the filter that is trusted."""
+        """Return the mean of the trusted filter."""
         return self.xp.where(state.trusted, self.agent.mean(state.agent), self.fallback.mean(state.fallback))
 
     def covariance(self, state: GatedState) -> Array:
-        """Likewise."""
+        """Return the covariance of the trusted filter, the fallback's times its variance factor."""
         other = self._variance_factor(state.squares, state.degrees) * self.fallback.covariance(state.fallback)
         return self.xp.where(state.trusted, self.agent.covariance(state.agent), other)
 
     def records(self, state: GatedState, measurement: Any) -> dict[str, Array]:
-        """Nothing: the one that answers changes."""
+        """Return no metrics: the estimate changes between two filters."""
         return {}
 
-    def _sum_squares(self, memory: GatedState, told: Likelihood) -> tuple[Array, Array]:
-        """Sums of the fallback's normalised innovations squared, and of their degrees; what is not told, or not
-        received, leaves them as they are.
+    def _sum_squares(self, memory: GatedState, likelihood: Likelihood) -> tuple[Array, Array]:
+        """Return the sums of the fallback's normalised innovations squared, and of their degrees of freedom.
+
+        A missing measurement, or one without these numbers, does not change them.
         """
-        if self.fallback.adapts_covariance or told.nis is None or told.nis_degrees is None:
+        if self.fallback.adapts_covariance or likelihood.nis is None or likelihood.nis_degrees is None:
             return memory.squares, memory.degrees
         xp, keep = self.xp, 1.0 - 1.0 / NIS_MEMORY
-        there = xp.isfinite(told.nis) & (told.nis_degrees > 0.0)
+        there = xp.isfinite(likelihood.nis) & (likelihood.nis_degrees > 0.0)
         return (
-            xp.where(there, keep * memory.squares + told.nis, memory.squares),
-            xp.where(there, keep * memory.degrees + told.nis_degrees, memory.degrees),
+            xp.where(there, keep * memory.squares + likelihood.nis, memory.squares),
+            xp.where(there, keep * memory.degrees + likelihood.nis_degrees, memory.degrees),
         )
 
     def _variance_factor(self, squares: Array, degrees: Array) -> Array:
-        """Mean square of the fallback's innovations where it is significantly above one, else one, ``(N,)``.
+        """Return the mean square of the fallback's innovations where it is significantly above one, else one, ``(N,)``.
 
-        Squares have the variance 2, and weights that fade slowly halve that of their mean: its deviation is one over
-        the root of the degrees.
+        Squares have the variance 2, and weights that fade slowly halve that of their mean. So the standard deviation of
+        the mean is one over the root of the degrees of freedom.
         """
         mean = squares / degrees
         return self.xp.where(mean > 1.0 + SIGNIFICANT / self.xp.sqrt(degrees), mean, 1.0)
 
 
 def is_gateable(maker: Any) -> bool:
-    """Whether a competitor has actions that follow from what is measured, so that there is something to hold back."""
+    """Return whether a competitor has actions that depend on measurements, which a gate can replace."""
     return isinstance(maker, EstimatorMaker) or (kind_of(maker) == "policy" and maker is not RandomPolicy)
 
 
 class GatedMaker:
-    """Makes an agent behind a gate for a task; what an evaluation calls.
+    """Factory of an agent behind a gate, which an evaluation calls with a task.
 
     Args:
-        problem: of both.
-        name: of the agent, in errors.
-        maker: of it.
+        problem: the problem of agent and fallback.
+        name: name of the agent, for errors.
+        maker: factory of the agent.
         fallback: name of one of the environment's own policies or estimators; default: ``Baselines.fallback``, or the
             paper's algorithm.
-        alarm: as of :class:`Trust`.
-        window: likewise.
+        alarm: an alarm, or a factory of one, see :class:`Trust`.
+        window: decisions for which an alarm is active, see :class:`Trust`.
 
     Raises:
-        ValueError: if the agent has no actions, nothing is known to fall back on, or that is significantly worse than
-            the paper's algorithm.
+        ValueError: if the agent has no actions, there is no fallback, or its cost is significantly above that of the
+            paper's algorithm.
     """
 
     kind: ClassVar[Kind] = "estimator"
@@ -448,8 +449,7 @@ class GatedMaker:
     ) -> None:
         if not is_gateable(maker):
             raise ValueError(
-                f"{name!r} is of kind {kind_of(maker)} and has no actions that follow from what is measured: an alarm "
-                "has nothing to listen to"
+                f"{name!r} is of kind {kind_of(maker)} and has no actions that depend on measurements for a gate"
             )
         self.problem = problem
         self.name = name
@@ -459,23 +459,23 @@ class GatedMaker:
         self.window = window
         learned = isinstance(maker, EstimatorMaker)
         self._policy = maker.policy if learned else maker
-        self._is_asked_always = learned
+        self._decides_always = learned
         self.control: str = maker.bank if learned else control_of(maker, None, problem.task, name)
         self.task_keywords: Any = getattr(maker, "task_keywords", {})
         self._fallback = problem.competitor(self.fallback)
         self._check_fallback()
         self.envelope: TrainingRange | None = training_range(problem.task, maker)
-        """What the agent saw in its training; None where nobody knows."""
+        """Range of the agent's training; None if unknown."""
 
     def _check_fallback(self) -> None:
         kind, keywords = kind_of(self._fallback), dict(getattr(self._fallback, "task_keywords", {}))
-        # Its actions hold for as long as it says, whatever the agent's do.
+        # Its actions last for its own decision interval, independent of the agent's.
         keywords.pop("decision_interval", None)
         if kind not in ("policy", "estimator") or self._fallback is RandomPolicy:
-            raise ValueError(f"{self.fallback!r} is of kind {kind} and nothing that a gate can fall back on")
+            raise ValueError(f"{self.fallback!r} is of kind {kind} and cannot be the fallback of a gate")
         if keywords:
             raise ValueError(
-                f"{self.fallback!r} has parameters of the task of its own ({', '.join(keywords)}) and cannot run "
+                f"{self.fallback!r} has task parameters of its own ({', '.join(keywords)}) and cannot run "
                 "beside an agent: choose another fallback"
             )
         excess, errors = excess_cost(self.problem, self.fallback)
@@ -487,11 +487,11 @@ class GatedMaker:
             )
 
     def __call__(self, task: Task, replace: Callable[[Any], Any] | None = None) -> GatedEstimator:
-        """Make it.
+        """Make the gated estimator.
 
         Args:
-            task: that it is made for.
-            replace: from the agent's policy to what stands in its place.
+            task: the task.
+            replace: function from the agent's policy to its replacement.
         """
         model = Model(task, self.control)
         shown = model.on_numpy()
@@ -499,8 +499,8 @@ class GatedMaker:
         if replace is not None:
             policy = replace(policy)
         trust = Trust(shown, self.alarm, self.window, self.envelope)
-        interval = 1 if self._is_asked_always else task.decision_interval
-        agent = LearnedEstimator(model, ListeningPolicy(policy, trust, shown), interval)
+        interval = 1 if self._decides_always else task.decision_interval
+        agent = LearnedEstimator(model, MonitoredPolicy(policy, trust, shown), interval)
         return GatedEstimator(agent, self._make_fallback(task))
 
     def _make_fallback(self, task: Task) -> Filter[Any, Any, Any]:
@@ -527,10 +527,10 @@ def _excess_cost(name: str, fallback: str) -> tuple[float, float]:
 
 
 def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
-    """How much more a competitor costs than the paper's algorithm, on validation episodes of the training distribution.
+    """Return the excess cost of a competitor over the paper's algorithm, on validation episodes.
 
     Args:
-        problem: of both.
+        problem: the problem of both; the episodes are of its training distribution.
         fallback: name of the competitor.
 
     Returns:
@@ -542,12 +542,12 @@ def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
 
 
 class PolicyMaker:
-    """Makes for a model a policy with others around it.
+    """Factory of a policy with wrappers, which is called with a model.
 
     Args:
-        maker: of the policy inside, or that policy.
-        wrap: from the task and the policy inside to the whole.
-        control: of both; default: the maker's own.
+        maker: the policy inside, or a factory of it.
+        wrap: function from the model and the policy inside to the wrapped policy.
+        control: control of both; default: the maker's own.
     """
 
     kind = "policy"
@@ -560,21 +560,21 @@ class PolicyMaker:
             self.control = control
 
     def __call__(self, model: Model) -> Any:
-        """Make it."""
+        """Make the policy."""
         return self.wrap(model, make_competitor(self.maker, model))
 
 
-def as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool = False) -> Any:
+def wrap_as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool = False) -> Any:
     """Return an agent as it acts in its training run.
 
     Args:
-        model: of the run.
+        model: model of the run.
         agent: the network alone.
-        residual_to: name of the policy that it corrects, if there is one; a gate then holds back the correction.
-        gated: whether it acts behind a gate.
+        residual_to: name of the policy that the agent corrects; empty: none. A gate then removes the correction.
+        gated: whether the agent acts behind a gate.
 
     Raises:
-        ValueError: if that cannot be.
+        ValueError: if the policy cannot be corrected, or the gate cannot be made.
     """
     corrected = policy_to_correct(model, residual_to) if residual_to else None
     if corrected is not None:

@@ -1,7 +1,7 @@
 """A learned estimator: a filter with a network inside, as plain arrays.
 
-The filter is a bank of the environment (:class:`.TrainedBanks`), the network is a learned policy that acts in it. From
-outside there is neither observation nor action: measurements go in, mean and covariance come out.
+The filter is a bank of the environment (:class:`.TrainedBanks`), and the network is a learned policy that acts in it.
+The interface has neither observations nor actions: the input is measurements, the output mean and covariance.
 """
 
 from collections.abc import Callable
@@ -18,12 +18,12 @@ from ..evaluation.competitors.steered_filter import PolicyFilterState, SteeredFi
 
 
 class LearnedEstimator(SteeredFilter):
-    """A bank with the policy that closes it, given zero where nothing was received, as banks are.
+    """A bank with the policy that acts in it; missing values are passed as zeros.
 
     Args:
-        model: with the bank.
-        network: a policy made for the bank, on NumPy.
-        interval: measurements for which an action holds.
+        model: model with the bank.
+        network: policy for the bank, on NumPy.
+        interval: measurements for which an action is held.
     """
 
     def __init__(self, model: Model, network: Policy, interval: int = 1) -> None:
@@ -35,21 +35,21 @@ class LearnedEstimator(SteeredFilter):
         return super().predict(state, fill_missing(measurement))
 
     def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
-        """Show the network what has come, and update as it answers."""
+        """Run the network on the measurement, and update with its action."""
         return super().update(state, FilterInput(fill_missing(given.measurement)))
 
 
 def fill_missing(measurement: Any) -> Any:
-    """Put numbers in place of what is missing: banks weigh values by their availability."""
+    """Replace missing values by zeros: banks weight values by their availability."""
     return map_arrays(numpy.nan_to_num, measurement)
 
 
 class EstimatorMaker:
-    """Makes a learned estimator for a task; what an evaluation calls.
+    """Factory of a learned estimator, which an evaluation calls with a task.
 
     Args:
         bank: name of the filter among the trained banks of the task.
-        policy: what makes the network for a model of that bank.
+        policy: factory of the network for a model of that bank.
     """
 
     kind: ClassVar[Kind] = "estimator"
@@ -60,6 +60,6 @@ class EstimatorMaker:
         self.policy = policy
 
     def __call__(self, task: Task) -> LearnedEstimator:
-        """Make it."""
+        """Make the learned estimator."""
         model = Model(task, self.bank)
         return LearnedEstimator(model, self.policy(model.on_numpy()))

@@ -1,11 +1,11 @@
 """Learned policies as plain arrays: NumPy inference, no torch, nothing executed on load.
 
-A file is in the safetensors form: arrays, and a header of words. ``observation_mean`` and
+A file is in the safetensors form: arrays, and a header of strings. ``observation_mean`` and
 ``observation_scale`` normalise the observation, ``gru_*`` are a gated recurrent unit in torch's layout
 (reset, update, new), ``lstm_*`` a long short-term memory (input, forget, cell, output), ``weight_i`` and
-``bias_i`` the layers after it, and ``envelope_low`` and ``envelope_high``, of an exported agent, what it saw of each
-field in its training. The header names the environment, the control and the fields of the
-observation: by their names an agent finds its columns, wherever they stand and whatever else is shown.
+``bias_i`` the layers after it. ``envelope_low`` and ``envelope_high``, of an exported agent, are the range of each
+field in its training. The header names the environment, the control and the fields of the observation. The agent
+selects its columns by these names, independent of their order and of other fields.
 """
 
 import json
@@ -25,7 +25,7 @@ from ..envs.engine.catalogue import short_name, task_class
 from ..evaluation.competitors.kinds import Policy
 from ..evaluation.storage.files import whole_file
 from ..evaluation.storage.stored import fits
-from .gate import as_trained
+from .gate import wrap_as_trained
 from .learned_estimator import EstimatorMaker
 from .training_run import TrainingRun
 
@@ -35,14 +35,14 @@ ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
     "relu": lambda x: numpy.maximum(x, 0.0),
 }
 OUTPUTS = ("clip", "tanh", "argmax")
-"""How the last layer becomes an action: cut to the box, squashed into it, or the largest entry's index."""
+"""Maps from the last layer to an action: clipped to the box, squashed into it, or the index of the largest entry."""
 ENVELOPE = ("envelope_low", "envelope_high")
-"""Arrays beside those of the network: least and largest value of each field in training, see :mod:`.envelope`."""
+"""Optional arrays: smallest and largest value of each field in training, see :mod:`.envelope`."""
 HEADER = ("environment", "control", "interface", "fields", "output", "activation", "run")
 MOST_BYTES = 64_000_000
-"""Of a file; a network of twice 256 units has 0.3 MB."""
+"""Largest size of a file; a network of twice 256 units has 0.3 MB."""
 OBSERVATION_LIMIT = 10.0
-"""Normalised observations are cut here, as in VecNormalize."""
+"""Largest magnitude of a normalised observation, as in VecNormalize."""
 
 
 ROWS = 8
@@ -50,8 +50,10 @@ ROWS = 8
 
 
 def _product(rows: numpy.ndarray, weight: numpy.ndarray) -> numpy.ndarray:
-    """``rows @ weight.T`` in products of one shape: BLAS rounds by the shape, and an observation's action must
-    not depend on how many others there are. Of symbols the compiler makes a loop.
+    """Return ``rows @ weight.T`` in products of one shape.
+
+    BLAS rounds by the shape, and an observation's action must not depend on the number of others. The compiler makes a
+    loop of traced rows.
     """
     if not isinstance(rows, numpy.ndarray):
         return rows @ weight.T
@@ -69,18 +71,18 @@ class LearnedPolicy(Policy):
     """A network with fixed weights, with or without memory.
 
     Args:
-        model: whose observations it is shown.
-        arrays: named as in the module's description; of float32, as they are stored, or wider.
+        model: the model whose observations are passed.
+        arrays: arrays by the names in the module's description; float32, as in a file, or wider.
         output: one of ``OUTPUTS``.
-        activation: between layers, "tanh" or "relu".
-        fields: names of what it takes of an observation, in its order; default: all that the model shows.
+        activation: function between layers, "tanh" or "relu".
+        fields: names of the fields that the network reads, in its order; default: all fields of the model.
 
     Raises:
-        ValueError: if the model does not show one of the fields.
+        ValueError: if the model's observation lacks one of the fields.
     """
 
     traced_as: ClassVar[str] = "network"
-    """In an export, whose code the network's own stands beside."""
+    """Name in an export, beside the network's own code."""
     observation_limit: ClassVar[float] = OBSERVATION_LIMIT
 
     traceable = True
@@ -106,8 +108,9 @@ class LearnedPolicy(Policy):
         ]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Run the network, in float64 as the filters: asked here, compiled with them or written in NumPy, it answers
-        the same to rounding.
+        """Run the network in the precision of its arrays.
+
+        Interpreted, compiled with the filters and written in NumPy, the outputs agree to rounding.
         """
         a = self.arrays
         x = (observation[:, self.columns] - a["observation_mean"]) / a["observation_scale"]
@@ -131,13 +134,13 @@ class LearnedPolicy(Policy):
         return space.low + (space.high - space.low) * 0.5 * (1.0 + numpy.tanh(x)), state
 
     def _memory(self, state: Any, start: numpy.ndarray, width: int) -> numpy.ndarray:
-        """What is remembered, ``(N, width)``: nothing at the start of an episode."""
+        """Return the memory, ``(N, width)``; zeros at the start of an episode."""
         dtype = self.arrays["observation_mean"].dtype
         memory = numpy.zeros((len(start), width), dtype) if state is None else state
         return numpy.where(start[:, None], dtype.type(0.0), memory)
 
     def _gru_step(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
-        """One step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
+        """Apply one step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
         a = self.arrays
         from_input = _product(x, a["gru_input_weight"]) + a["gru_input_bias"]
         from_input = numpy.split(from_input, 3, axis=1)
@@ -149,7 +152,7 @@ class LearnedPolicy(Policy):
         return (1.0 - update) * new + update * memory
 
     def _long_short_term(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
-        """One step of the long short-term memory (Gers et al., 2000): what it shows, beside its cells."""
+        """Apply one step of the long short-term memory (Gers et al., 2000); return outputs, then cells."""
         a = self.arrays
         shown, cells = numpy.split(memory, 2, axis=1)
         gates = _product(x, a["lstm_input_weight"]) + a["lstm_input_bias"]
@@ -167,7 +170,7 @@ def write_arrays(
     activation: str = "tanh",
     fields: Sequence[str] | None = None,
 ) -> None:
-    """Write a learned policy and the record of the run that it comes from; arguments as of a learned policy."""
+    """Write a learned policy and the record of its run; arguments as of :class:`LearnedPolicy`."""
     from safetensors.numpy import save
 
     model = run.make_model()
@@ -186,12 +189,12 @@ def write_arrays(
 
 
 def write_envelope(path: Path, low: numpy.ndarray, high: numpy.ndarray) -> None:
-    """Add to a learned policy's file what it saw of each field in its training.
+    """Add the range of each field in training to a learned policy's file.
 
     Args:
-        path: of the file.
-        low: least values, ``(fields,)``.
-        high: largest values, likewise.
+        path: the file.
+        low: smallest values, ``(fields,)``.
+        high: largest values, ``(fields,)``.
     """
     from safetensors import safe_open
     from safetensors.numpy import save
@@ -199,7 +202,7 @@ def write_envelope(path: Path, low: numpy.ndarray, high: numpy.ndarray) -> None:
     with safe_open(path, framework="numpy") as file:
         header = dict(file.metadata())
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-    # To float32 outwards: the ends themselves were seen.
+    # Rounded to float32 outwards, so that the ends stay inside.
     ends = (
         numpy.nextafter(numpy.float32(end), numpy.float32(away))
         for end, away in ((low, -numpy.inf), (high, numpy.inf))
@@ -210,17 +213,17 @@ def write_envelope(path: Path, low: numpy.ndarray, high: numpy.ndarray) -> None:
 
 
 def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
-    """Return the arrays of a learned policy's file, and its header, of which ``run`` and ``fields`` are parsed.
+    """Return the arrays of a learned policy's file, and its header with parsed ``run`` and ``fields``.
 
     Raises:
-        ValueError: if the file is not one.
+        ValueError: if the file is not a learned policy.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
     try:
         content = read_content(path, MOST_BYTES)
-        arrays = load(content)  # first: it checks sizes and places
+        arrays = load(content)  # first, as it checks sizes and offsets
         size = int.from_bytes(content[:8], "little")
         header: dict[str, Any] = dict(parse_json(content[8 : 8 + size]).get("__metadata__") or {})
         lacking = [name for name in HEADER if name not in header]
@@ -243,10 +246,10 @@ def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
 
 
 def _check_run(run: Any) -> None:
-    """Check that what a header says of the run is of the types that a run's record has.
+    """Check the types of the run's record in a header.
 
     Raises:
-        ValueError: if not.
+        ValueError: for a value of another type.
     """
     if not isinstance(run, dict):
         raise ValueError("its header has no record of a run")
@@ -260,14 +263,14 @@ def _check_run(run: Any) -> None:
 
 
 def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
-    """Check that arrays are those of a network, and return how many numbers it answers with.
+    """Check that arrays form a network, and return the number of its outputs.
 
     Args:
-        arrays: of the file.
-        width: of the observation.
+        arrays: arrays of the file.
+        width: number of fields of the observation.
 
     Raises:
-        ValueError: if an array is missing or unknown, or not of the shape that the others ask for.
+        ValueError: if an array is missing or unknown, or its shape does not match the others.
     """
     expected: dict[str, tuple[int, ...]] = {"observation_mean": (width,), "observation_scale": (width,)}
     for unit, gates in (("gru", 3), ("lstm", 4)):
@@ -284,7 +287,7 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
         expected |= dict.fromkeys(ENVELOPE, expected["observation_mean"])
     if arrays.keys() != expected.keys():
         raise ValueError(
-            f"it holds the arrays {', '.join(sorted(arrays))}, not {', '.join(sorted(expected))}"
+            f"it contains the arrays {', '.join(sorted(arrays))}, not {', '.join(sorted(expected))}"
         )
     for name, shape in expected.items():
         if arrays[name].shape != shape or not numpy.isfinite(arrays[name]).all():
@@ -297,7 +300,7 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
 
 
 class StoredPolicy:
-    """Makes the policy of a file for a model; what an evaluation calls."""
+    """Factory of the policy of a file, which an evaluation calls with a model."""
 
     def __init__(self, path: Path) -> None:
         self.arrays, self.header = read_arrays(path)
@@ -311,12 +314,12 @@ class StoredPolicy:
 
     @property
     def task_keywords(self) -> dict[str, Any]:
-        """How far its actions reach (:class:`.Actions`), where its training said so."""
+        """Parameters of the reach of its actions (:class:`.Actions`) that its training set."""
         reach = action_reach(task_class(self.header["environment"]), self.control)
         return {name: value for name, value in self._keywords.items() if name in reach}
 
     def _check_reach(self, model: Model) -> None:
-        """Raise ValueError if an action of the model does not reach as far as in training."""
+        """Raise ValueError if the reach of the model's actions differs from that in training."""
         now, keywords = model.task.parameters, self.task_keywords
         defaults = type(now)()
         for name in action_reach(model.task, self.control):
@@ -325,15 +328,15 @@ class StoredPolicy:
             trained = keywords.get(name, getattr(defaults, name))
             if getattr(now, name) != trained:
                 raise ValueError(
-                    f"{self.path} was trained with {name}={trained!r}, and its actions mean something else with "
+                    f"{self.path} was trained with {name}={trained!r}, and its actions have another meaning with "
                     f"{name}={getattr(now, name)!r}: leave out {name}"
                 )
 
     def __call__(self, model: Model) -> Policy:
-        """Make it, with what was around it in training."""
+        """Make the policy, with the policy that it corrects and its gate."""
         if self.header["interface"] != str(model.task.interface):
             raise ValueError(
-                f"{self.path} was trained when fields or actions of {model.task.id} meant something else (its "
+                f"{self.path} was trained with another meaning of the fields or actions of {model.task.id} (its "
                 f"interface {quote_shortened(self.header['interface'])}, now {model.task.interface}): train it again"
             )
         self._check_reach(model)
@@ -343,23 +346,23 @@ class StoredPolicy:
             )
         except ValueError as error:
             raise ValueError(
-                f"{self.path} was trained on other fields than {model.task.id} shows: {error}"
+                f"{self.path} was trained on other fields than those of {model.task.id}: {error}"
             ) from None
         space: Any = model.action_space
         count = int(space.n) if hasattr(space, "n") else space.shape[0]
         if (self.header["output"] == "argmax") != hasattr(space, "n") or self.header["answers"] != count:
             raise ValueError(
-                f"{self.path} answers with {self.header['output']} of {self.header['answers']} numbers, which is no "
+                f"{self.path} returns {self.header['output']} of {self.header['answers']} numbers, which is no "
                 f"action of control {model.control!r}: {space}"
             )
-        return as_trained(model, network, *self.around)
+        return wrap_as_trained(model, network, *self.around)
 
 
 def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
-    """Load a learned policy or estimator of an environment from a file: what makes it.
+    """Load the factory of a learned policy or estimator of an environment from a file.
 
     Raises:
-        ValueError: if the file is not one, or it is of another environment.
+        ValueError: if the file is not a learned policy, or belongs to another environment.
     """
     stored = StoredPolicy(path)
     if stored.header["environment"] != cls.id:
@@ -370,5 +373,5 @@ def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
 
 
 def pretrained_path(id: str, name: str) -> Path:
-    """File of an agent that is shipped for a Gymnasium id, whether or not there is one."""
+    """Return the path of a shipped agent for a Gymnasium id; the file need not exist."""
     return PRETRAINED / short_name(id) / f"{name}.safetensors"

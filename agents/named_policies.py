@@ -1,4 +1,4 @@
-"""Policies that an evaluation finds by name, file or folder: shipped agents, exported ones, models' zips, and runs."""
+"""Policies by name, file or folder: shipped agents, exported agents, zips of models, and training runs."""
 
 import hashlib
 from pathlib import Path
@@ -9,28 +9,28 @@ from ..envs.contract.companions import action_reach
 from ..envs.contract.task import Task
 from ..envs.data.foreign_files import is_folder
 from ..evaluation.competitors.kinds import Competitor, CompetitorFiles
-from .gate import PolicyMaker, as_trained
+from .gate import PolicyMaker, wrap_as_trained
 from .learned_policy import load_policy, pretrained_path
 from .training_run import TrainingRun, best_agent, load_run
 
 
 def pretrained_agents(id: str) -> list[str]:
-    """Names of the agents that are shipped for the environment of a Gymnasium id."""
+    """Return the names of the agents shipped for the environment of a Gymnasium id."""
     return sorted(path.stem for path in pretrained_path(id, "").parent.glob("*.safetensors"))
 
 
 def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
-    """Return what makes a learned policy, or None if the name means nothing here.
+    """Return the factory of a learned policy; None for another name.
 
     Args:
         cls: the environment.
-        name: of a shipped agent (``ppo``, ``bptt``); or a file: ``.safetensors``, or the ``.zip`` of a
+        name: name of a shipped agent (``ppo``, ``bptt``); or a file: ``.safetensors``, or the ``.zip`` of a
             Stable-Baselines3 model, which can execute code while it is loaded; or the folder of a training run, which
             means its best agent.
         trust: load such a zip.
 
     Raises:
-        ValueError: if the file or folder is not what its name says, or takes ``trust``.
+        ValueError: if the content of the file or folder does not match its name, or needs ``trust``.
     """
     if name in pretrained_agents(cls.id):
         return load_policy(cls, pretrained_path(cls.id, name))
@@ -42,9 +42,11 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
     if not name.endswith(".zip"):
         return None
     model = load_zipped_model(cls, path, None, trust)
-    # Beside the model of a run that is more than its network lies what it is.
+    # A run.json beside the model describes the policy that it corrects, and its gate.
     return (
-        _as_recorded(model, load_run(path.parent, trust)) if (path.parent / "run.json").is_file() else model
+        _wrap_as_in_run(model, load_run(path.parent, trust))
+        if (path.parent / "run.json").is_file()
+        else model
     )
 
 
@@ -52,7 +54,7 @@ def load_zipped_model(cls: type[Task], path: Path, control: str | None, trust: b
     """Load a model of Stable-Baselines3, the network alone.
 
     Raises:
-        ValueError: if the file is none, or is not trusted.
+        ValueError: if the file is not a model, or is not trusted.
     """
     try:
         from .sb3_policy import load_sb3_policy
@@ -62,7 +64,7 @@ def load_zipped_model(cls: type[Task], path: Path, control: str | None, trust: b
 
 
 def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
-    """Load the best agent of a run, of ``filtergym train`` or of rl-zoo3: as plain arrays where there are any."""
+    """Load the best agent of a run of ``filtergym train`` or rl-zoo3, from plain arrays where they exist."""
     if not (folder / "run.json").exists():
         # rl-zoo3: ENV_1/best_model.zip if there was an evaluation, and ENV_1/ENV.zip at the end.
         for name in ("best_model", folder.absolute().name.rpartition("_")[0]):
@@ -74,23 +76,23 @@ def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
         return load_policy(cls, agent)
     own = run.environment.rpartition(":")[2]
     if own != cls.id:
-        raise ValueError(f"{folder} holds a run of {own}, not of {cls.id}")
-    return _as_recorded(load_zipped_model(cls, agent, run.control, trust), run)
+        raise ValueError(f"{folder} contains a run of {own}, not of {cls.id}")
+    return _wrap_as_in_run(load_zipped_model(cls, agent, run.control, trust), run)
 
 
-def _as_recorded(model: Any, run: TrainingRun) -> Any:
-    """Return a model with what was around it in training, and the reach of its actions."""
+def _wrap_as_in_run(model: Any, run: TrainingRun) -> Any:
+    """Return a model with the policy that it corrects, its gate, and the reach of its actions."""
     reach = action_reach(run.problem.task, run.control)
     model.task_keywords = {name: run.task_keywords[name] for name in reach if name in run.task_keywords}
     if not (run.residual_to or run.gated):
         return model
     return PolicyMaker(
-        model, lambda task, agent: as_trained(task, agent, run.residual_to, run.gated), run.control
+        model, lambda task, agent: wrap_as_trained(task, agent, run.residual_to, run.gated), run.control
     )
 
 
 def with_normalisation(found: Any) -> Any:
-    """Return a model of Stable-Baselines3 with the normalisation that it was trained with; whatever else as it is."""
+    """Return a model of Stable-Baselines3 with the normalisation of its training; other objects unchanged."""
     if isinstance(found, type) or not hasattr(found, "get_vec_normalize_env"):
         return found
     from .sb3_policy import Sb3Policy
@@ -99,7 +101,7 @@ def with_normalisation(found: Any) -> Any:
 
 
 def _find_learned(name: str, problem: Problem, trust: bool, find_shipped: Any) -> Competitor | None:
-    """Return a shipped agent, or that of a file or folder; None where the name means neither."""
+    """Return a shipped agent, or that of a file or folder; None for another name."""
     maker = find_learned_policy(problem.task, name, trust)
     if maker is None:
         return None

@@ -1,4 +1,4 @@
-"""The plain arrays of a trained model's network, as a learned policy takes them."""
+"""The plain arrays of a trained model's network, in the form of a learned policy."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import torch
 
 
 def _layers(*modules: torch.nn.Module) -> tuple[dict[str, numpy.ndarray], str]:
-    """Arrays of the linear layers in order, and the activation between them."""
+    """Return the arrays of the linear layers in order, and the activation between them."""
     parts = [part for module in modules for part in module.modules() if not list(part.children())]
     linear = [part for part in parts if isinstance(part, torch.nn.Linear)]
     between = {type(part) for part in parts} - {torch.nn.Linear, torch.nn.Flatten}
@@ -23,7 +23,6 @@ def _layers(*modules: torch.nn.Module) -> tuple[dict[str, numpy.ndarray], str]:
 
 
 def _lstm(module: torch.nn.LSTM) -> dict[str, numpy.ndarray]:
-    """Arrays of a long short-term memory of one layer."""
     names = {
         "weight_ih_l0": "lstm_input_weight", "bias_ih_l0": "lstm_input_bias",
         "weight_hh_l0": "lstm_memory_weight", "bias_hh_l0": "lstm_memory_bias",
@@ -31,16 +30,16 @@ def _lstm(module: torch.nn.LSTM) -> dict[str, numpy.ndarray]:
     parameters = {name: values.detach().numpy() for name, values in module.named_parameters()}
     if parameters.keys() != names.keys():
         raise ValueError(
-            f"cannot export {module}: a learned policy holds one layer, with biases and no projection"
+            f"cannot export {module}: a learned policy has one layer, with biases and without projection"
         )
     return {names[name]: values for name, values in parameters.items()}
 
 
 def network_arrays(agent: Any, algorithm: str) -> tuple[dict[str, numpy.ndarray], str, str]:
-    """Arrays, float32, output and activation of a trained model's deterministic action.
+    """Return the arrays, float32, output and activation of a trained model's deterministic action.
 
     Raises:
-        ValueError: for an algorithm or network that a learned policy cannot hold.
+        ValueError: for an algorithm or network that a learned policy cannot represent.
     """
     policy: Any = agent.model.policy
     discrete = not hasattr(agent.action_space, "low")

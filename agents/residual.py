@@ -1,7 +1,7 @@
-"""Residual agents: the agent's action is added to that of a policy that already works.
+"""Residual agents: the agent's action is added to that of an existing policy.
 
-Zero is exactly the policy, so learning starts from it instead of from nothing. The sum is taken at the edge
-of the action space, as every action is. Training over many environments: ``to_sb3(env, residual_to=policy)``.
+Zero is exactly the policy, so training starts from it. The sum is clipped to the action space, as every action is.
+Training over many environments: ``to_sb3(env, residual_to=policy)``.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ def check_residual(model: Model, policy: Any) -> None:
     """Raise ValueError if actions of this task and policy cannot be added."""
     if not isinstance(model.action_space, gymnasium.spaces.Box):
         raise ValueError(
-            f"a residual action is added: control {model.control!r} has {model.action_space}, choose another"
+            f"a residual action needs a continuous control: {model.control!r} has {model.action_space}, choose another"
         )
     own = getattr(policy, "control", model.control)
     if own != model.control:
@@ -30,18 +30,19 @@ def policy_to_correct(model: Model, name: str) -> Any:
     """Make the policy that an agent corrects in a training run.
 
     Args:
-        model: of both.
+        model: the model of both.
         name: one of the environment's own policies, tuned or not.
 
     Raises:
-        ValueError: for an unknown name, what does not act, acts under parameters of its own, or cannot be corrected.
+        ValueError: for an unknown name, a competitor without actions, a policy with parameters of the task of its own,
+            or one that cannot be corrected.
     """
     maker = Problem.of(type(model.task)).competitor(name)
     if kind_of(maker) != "policy":
-        raise ValueError(f"{name!r} is of kind {kind_of(maker)} and has no actions that could be corrected")
+        raise ValueError(f"{name!r} is of kind {kind_of(maker)} and has no actions to correct")
     if getattr(maker, "task_keywords", {}):
         raise ValueError(
-            f"policy {name!r} acts under parameters of its own, and an agent trains under the environment's: choose "
+            f"policy {name!r} has task parameters of its own, and an agent trains with the environment's: choose "
             "another policy to correct"
         )
     check_residual(model, maker)
@@ -52,8 +53,8 @@ class ResidualPolicy(Policy):
     """A policy and the agent that corrects it, as one policy for an evaluation.
 
     Args:
-        model: of both.
-        policy: the one that is corrected.
+        model: the model of both.
+        policy: the corrected policy.
         agent: the correction.
 
     Raises:
@@ -61,7 +62,7 @@ class ResidualPolicy(Policy):
     """
 
     inner: ClassVar[str] = "agent"
-    """Attribute that holds the policy inside."""
+    """Attribute that contains the policy inside."""
 
     def __init__(self, model: Model, policy: Any, agent: Any) -> None:
         super().__init__(model)
@@ -73,7 +74,7 @@ class ResidualPolicy(Policy):
         expose_spaces(self, agent)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, Any] | None:
-        """Memories of both; none of what can be traced, which draws nothing."""
+        """Return the memories of both; None if both are traceable, as such policies draw no numbers."""
         if self.traceable:
             return None
         both = self.policy, self.agent
@@ -81,7 +82,7 @@ class ResidualPolicy(Policy):
         return first, second
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Add both answers."""
+        """Return the sum of both actions."""
         memory, agent_memory = (None, None) if state is None else state
         own, memory = self.policy.predict(observation, memory, start, deterministic=True)
         correction, agent_memory = self.agent.predict(observation, agent_memory, start, deterministic=True)

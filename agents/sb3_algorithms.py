@@ -17,4 +17,4 @@ SPACES: dict[str, tuple[type[gymnasium.Space[Any]], ...]] = {
     "sac": (gymnasium.spaces.Box,),
     "dqn": (gymnasium.spaces.Discrete,),
 }
-"""Action spaces that each can steer."""
+"""Action spaces of each algorithm."""

@@ -1,7 +1,7 @@
 """Trained models of Stable-Baselines3 and sb3-contrib as policies, with the normalisation that they expect.
 
-A model that was trained under ``VecNormalize`` knows normalised observations only, and its zip does not hold the
-statistics: they are in a file of their own. Shown raw observations such a model answers too, but badly.
+A model that was trained under ``VecNormalize`` expects normalised observations, and its zip does not contain the
+statistics: they are in a file of their own. With raw observations such a model runs without an error, but badly.
 """
 
 import pickle
@@ -39,8 +39,8 @@ POLICY_CLASSES: tuple[tuple[type[BaseAlgorithm], str, str], ...] = (
     (QRDQN, "QRDQNPolicy", ""),
     (TQC, "TQCPolicy", ""),
 )
-"""What a zip can hold, which does not name its algorithm. The first line that fits it: class, the policy class that its
-policy is or comes from, and a value that it must store beside ("" for none). DDPG's is loaded as TD3, which it is."""
+"""Algorithms of a zip, which does not name its own; the first match counts. Each entry is the algorithm, the class that
+the stored policy is or inherits from, and a value that the zip must contain ("" for none). DDPG is loaded as TD3."""
 NAMES = "PPO, RecurrentPPO, A2C, TRPO, SAC, TD3, DDPG, TQC, CrossQ, DQN, QR-DQN and ARS"
 
 
@@ -48,17 +48,17 @@ class Sb3Policy:
     """A trained model with the normalisation of its observations, as a policy.
 
     Args:
-        model: of Stable-Baselines3 or sb3-contrib.
-        normalisation: whose statistics it was trained with; default: those of the environment that the model holds, if
-            it is a ``VecNormalize``.
-        control: that the model steers; default: the one that fits its action space.
-        name: of the model, in warnings.
+        model: model of Stable-Baselines3 or sb3-contrib.
+        normalisation: the normalisation of its training; default: the environment that the model contains, if that is
+            a ``VecNormalize``.
+        control: control of the model; default: the one that fits its action space.
+        name: name of the model in warnings.
 
     Raises:
         ValueError: if the statistics are of observations of another shape than the model's.
 
     Warns:
-        UserWarning: if the model shows that it was trained on normalised observations, and no statistics are there.
+        UserWarning: if the model was trained on normalised observations, and the statistics are missing.
     """
 
     def __init__(
@@ -80,15 +80,15 @@ class Sb3Policy:
             _check_shape(self.normalisation, model)
         elif was_trained_normalised(model):
             warnings.warn(
-                f"{name} was trained under VecNormalize, and its statistics are not here, so it is shown raw "
+                f"{name} was trained under VecNormalize, and its statistics are missing, so it receives raw "
                 "observations and its score is not the model's: keep vecnormalize.pkl beside the zip, or in Python "
                 "pass Sb3Policy(model, normalisation)",
                 stacklevel=2,
             )
         if _is_wrapped(model):
             warnings.warn(
-                f"{name} was trained on what Gymnasium's NormalizeObservation makes of observations, and is shown raw "
-                "ones, so its score is not the model's: train under VecNormalize instead",
+                f"{name} was trained on the output of Gymnasium's NormalizeObservation, and receives raw observations, "
+                "so its score is not the model's: train under VecNormalize instead",
                 stacklevel=2,
             )
 
@@ -99,7 +99,7 @@ class Sb3Policy:
         episode_start: numpy.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[numpy.ndarray, Any]:
-        """Choose actions for observations as the environment shows them, as Stable-Baselines3 does."""
+        """Return actions for raw observations, with the interface of Stable-Baselines3."""
         if self.normalisation is not None:
             normalised: Any = self.normalisation.normalize_obs(observation)
             observation = normalised
@@ -107,7 +107,7 @@ class Sb3Policy:
 
 
 def _reach(model: BaseAlgorithm) -> dict[str, Any]:
-    """How far actions reach (:class:`.Actions`) in the environment that a model holds, where not as by default."""
+    """Return the reach of actions (:class:`.Actions`) in the environment of a model, where it is not the default."""
     held = model.get_env()
     inner: Any = None if held is None else held.unwrapped
     env = inner.envs[0].unwrapped if isinstance(inner, DummyVecEnv) else getattr(inner, "env", None)
@@ -128,13 +128,13 @@ def _check_shape(normalisation: VecNormalize, model: BaseAlgorithm) -> None:
 
 
 def was_trained_normalised(model: BaseAlgorithm) -> bool:
-    """Whether a model shows that it was trained under ``VecNormalize``.
+    """Return whether a model was detectably trained under ``VecNormalize``.
 
-    A model keeps, and stores, what it was shown last and, under ``VecNormalize``, what that was before; algorithms
-    with a replay buffer keep an earlier observation there without it, too. What ``VecNormalize`` normalises is float32,
-    whatever the environment shows. So where that is float64, the two say it exactly. Where it is float32 an algorithm
-    without replay buffer says it too, also where only rewards were normalised, and one with a replay buffer nothing. A
-    model that never learned says nothing either, and does not need to.
+    A model stores its last observation and, under ``VecNormalize``, the original of it. Algorithms with a replay buffer
+    store an earlier observation in its place without ``VecNormalize``, too. ``VecNormalize`` returns float32. So with
+    float64 observations the two types decide exactly. With float32 observations an algorithm without replay buffer is
+    detected, even if only rewards were normalised, and one with a replay buffer is not. A model without training is not
+    detected either.
     """
     shown, original = model._last_obs, model._last_original_obs
     if not isinstance(original, numpy.ndarray):
@@ -145,7 +145,7 @@ def was_trained_normalised(model: BaseAlgorithm) -> bool:
 
 
 def _is_wrapped(model: BaseAlgorithm) -> bool:
-    """Whether Gymnasium's own wrapper normalises in the environment that a model holds."""
+    """Return whether the environment of a model contains Gymnasium's own wrapper of normalisation."""
     env = model.get_env()
     inner = None if env is None else env.unwrapped
     wrapper = gymnasium.wrappers.NormalizeObservation
@@ -153,11 +153,11 @@ def _is_wrapped(model: BaseAlgorithm) -> bool:
 
 
 def statistics_places(path: Path, environment: str | None = None) -> Iterator[Path]:
-    """Files in which the statistics of a model's zip may be, nearest first.
+    """Return the files that may contain the statistics of a model's zip, nearest first.
 
     Args:
-        path: of the zip.
-        environment: id of the environment that it is of.
+        path: path of the zip.
+        environment: id of the model's environment.
     """
     steps = re.fullmatch(r"(.+)_(\d+)_steps", path.stem)
     if steps:  # as Stable-Baselines3's CheckpointCallback names them
@@ -176,20 +176,20 @@ def load_sb3_policy(
 ) -> Sb3Policy:
     """Load a model's zip with the statistics of its ``VecNormalize``, if there are any.
 
-    They are looked for in ``vecnormalize.pkl`` beside the zip, where rl-zoo3 puts them (``ENV/vecnormalize.pkl`` below
-    the folder), and beside a checkpoint of Stable-Baselines3's ``CheckpointCallback``, under its name for them.
+    The statistics may be in ``vecnormalize.pkl`` beside the zip, in rl-zoo3's place (``ENV/vecnormalize.pkl`` below the
+    folder), or beside a checkpoint of Stable-Baselines3's ``CheckpointCallback``, under its name for them.
 
     Args:
-        path: of the zip.
-        environment: id of the environment that the model is of, by which rl-zoo3 names a folder.
-        control: that the model steers; default: the one that fits its action space.
-        trust: both files can execute code while they are loaded, and are not without this.
+        path: path of the zip.
+        environment: id of the model's environment, by which rl-zoo3 names a folder.
+        control: control of the model; default: the one that fits its action space.
+        trust: load both files, which can execute code while they are loaded.
 
     Raises:
-        ValueError: if there is no such file, it is not trusted, or not a model.
+        ValueError: if the file does not exist, is not trusted, or is not a model.
 
     Warns:
-        UserWarning: if the model was trained on normalised observations, and there are no statistics.
+        UserWarning: if the model was trained on normalised observations, and the statistics are missing.
     """
     path = Path(path)
     if not path.is_file():
@@ -204,17 +204,17 @@ def load_sb3_policy(
             with found.open("rb") as file:
                 normalisation = pickle.load(file)
             normalisation.training = False
-        looked = ", ".join(place.relative_to(path.parent).as_posix() for place in places)
-        return Sb3Policy(model, normalisation, control, f"model {path} (beside it looked for {looked})")
-    except Exception as error:  # unpickling a corrupt file stumbles over anything
+        searched = ", ".join(place.relative_to(path.parent).as_posix() for place in places)
+        return Sb3Policy(model, normalisation, control, f"model {path} (no file {searched} beside it)")
+    except Exception as error:  # for a corrupt file unpickling raises various exceptions
         raise ValueError(f"cannot read the model {path}: {error}") from error
 
 
 def _load_model(path: Path) -> BaseAlgorithm:
-    """Load a zip by the class that fits what it stores.
+    """Load a zip with the class of its algorithm.
 
     Raises:
-        ValueError: if none does.
+        ValueError: for an unknown algorithm.
     """
     data = load_from_zip_file(path, device="cpu")[0] or {}
     names = {cls.__name__ for cls in data["policy_class"].__mro__}
@@ -223,5 +223,5 @@ def _load_model(path: Path) -> BaseAlgorithm:
             exclude_from_compilation()
             return algorithm.load(path, device="cpu")
     raise ValueError(
-        f"its policy, {data['policy_class'].__name__}, is of none of the algorithms that are known: {NAMES}"
+        f"its policy, {data['policy_class'].__name__}, belongs to none of the supported algorithms: {NAMES}"
     )

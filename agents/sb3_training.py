@@ -1,9 +1,8 @@
-"""Training with Stable-Baselines3 over the native vector environment, to be stopped and resumed at will.
+"""Training with Stable-Baselines3 over the native vector environment, which can be stopped and resumed.
 
-A checkpoint holds the model with its optimiser, the normalisation, the replay buffer if there is one, the
-environments in the middle of their episodes, and every random generator: a run that was resumed equals one
-that never stopped. It is loaded with pickle, which can execute code, so that takes ``trust``. Beside the best model
-lie its plain arrays, which take none.
+A checkpoint contains the model with its optimiser, the normalisation, the replay buffer if there is one, the
+environments in the middle of their episodes, and every random generator: a resumed run equals an uninterrupted one. It
+is loaded with pickle, which can execute code and so needs ``trust``. The plain arrays beside the best model need none.
 """
 
 import contextlib
@@ -30,18 +29,18 @@ from ..envs.contract.model import Model
 from ..evaluation.running.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
 from .eager_optimiser import exclude_from_compilation, step_eagerly
-from .gate import Gate, PolicyMaker, as_trained
+from .gate import Gate, PolicyMaker, wrap_as_trained
 from .learned_policy import LearnedPolicy, write_arrays
 from .network_arrays import network_arrays
 from .residual import policy_to_correct
 from .sb3_algorithms import ALGORITHMS, SPACES
 from .sb3_policy import Sb3Policy
 from .training_run import TrainingRun, check_trust, save_run, schedule
-from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
+from .training_session import Bookkeeping, Session, Trainee, curve_writer, interruption, make_logger
 
 
 class _Trainer(BaseCallback):
-    """Lets the bookkeeping work between an update and the next rollout."""
+    """Callback that runs the bookkeeping between an update and the next rollout."""
 
     def __init__(self, books: Bookkeeping, progress: Callable[[int], None]) -> None:
         super().__init__()
@@ -70,12 +69,11 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
     inner = env.unwrapped.model
     corrected = policy_to_correct(inner, run.residual_to) if run.residual_to else None
     gate = Gate(inner, corrected) if run.gated else None
-    # A rollout is shorter than an episode: side by side in step, it would show one part of the flight only.
+    # A rollout is shorter than an episode: without staggering it would cover one part of the episode only.
     return to_sb3(env, staggered=True, residual_to=corrected, gate=gate)
 
 
 def _step_eagerly(model: BaseAlgorithm) -> None:
-    """Let every optimiser of a model step without torch's compiler."""
     found = [getattr(module, "optimizer", None) for module in model.policy.modules()]
     for optimiser in (*found, getattr(model, "ent_coef_optimizer", None)):
         if optimiser is not None:
@@ -84,7 +82,7 @@ def _step_eagerly(model: BaseAlgorithm) -> None:
 
 def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder: Path) -> None:
     """Write ``model.zip`` and ``vecnormalize.pkl``."""
-    # Through memory: on a full disk torch raises something of its own.
+    # Through memory: on a full disk torch raises its own exception.
     written = io.BytesIO()
     model.save(written)
     (folder / "model.zip").write_bytes(written.getvalue())
@@ -93,19 +91,19 @@ def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder:
 
 
 def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
-    """Write a model, and beside it ``agent.safetensors``, its plain arrays, if a learned policy can hold it."""
+    """Write a model, and its plain arrays as ``agent.safetensors`` if a learned policy can represent it."""
     save_model(agent.model, agent.normalisation, folder)
     if run.residual_to or run.gated:
-        save_run(run, folder / "run.json")  # without it nobody who finds the model knows how it acts
+        save_run(run, folder / "run.json")  # with the policy that it corrects, and its gate
     with contextlib.suppress(ValueError):
         arrays, output, activation = network_arrays(agent, run.algorithm)
         write_arrays(folder / "agent.safetensors", arrays, run, output, activation)
 
 
 def as_saved_agent(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPolicy | Sb3Policy:
-    """Return an agent as :func:`save_agent` keeps it and an evaluation finds it: several times as fast as the model.
+    """Return an agent as :func:`save_agent` stores it, which is several times as fast as the model.
 
-    The model itself, if a learned policy cannot hold it.
+    An agent that a learned policy cannot represent is returned unchanged.
     """
     try:
         return LearnedPolicy(model, *network_arrays(agent, algorithm))
@@ -136,7 +134,7 @@ def save_checkpoint(
 def load_checkpoint(
     run: TrainingRun, folder: Path, trust: bool
 ) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
-    """Go on where a checkpoint was written.
+    """Load a checkpoint to continue from.
 
     Raises:
         ValueError: if it is not trusted, or a file is missing or corrupt.
@@ -164,7 +162,7 @@ def load_checkpoint(
         model.action_space._np_random = rest["action_space"]
         if isinstance(model, RecurrentPPO):
             model._last_lstm_states = rest["lstm"]  # loading has set them to zero
-    except Exception as error:  # unpickling a corrupt file stumbles over anything
+    except Exception as error:  # for a corrupt file unpickling raises various exceptions
         raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error
     return model, adapted, normalisation
 
@@ -181,8 +179,8 @@ def check_algorithm(run: TrainingRun) -> None:
 
 
 def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
-    """Make the model of a run that begins, with its environments and their normalisation."""
-    # A copy all the way down: Stable-Baselines3 writes into policy_kwargs.
+    """Make the model of a new run, with its environments and their normalisation."""
+    # A deep copy: Stable-Baselines3 writes into policy_kwargs.
     values = copy.deepcopy(run.hyperparameters)
     for name in ("learning_rate", "clip_range"):
         if name in values:
@@ -193,21 +191,21 @@ def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormali
     adapted = training_environment(run)
     env: Any = adapted
     if normalize:
-        # A Q-value of minus hundreds learns slowly; a discounted return of order one does not.
+        # A Q-value of minus hundreds is learned slowly; a discounted return of order one is not.
         env = normalisation = VecNormalize(adapted, gamma=values.get("gamma", 0.99))
     exclude_from_compilation()
     model = ALGORITHMS[run.algorithm](env=env, seed=run.seed, device="cpu", **values)
     _step_eagerly(model)
-    adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))  # the model has seeded it too
+    adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))  # after the model, which seeds it too
     return model, adapted, normalisation
 
 
 def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
-    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
+    """Train until ``run.steps`` environment steps are done, or until Ctrl-C or SIGTERM.
 
     Args:
-        run: from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.
-        session: how it is trained.
+        run: run from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.
+        session: settings of the session.
 
     Raises:
         ValueError: for an algorithm that does not fit the control, or a checkpoint that is not trusted or cannot be
@@ -221,20 +219,20 @@ def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
         model, env, normalisation = load_checkpoint(run, session.folder / "checkpoint", session.trust)
     else:
         model, env, normalisation = begin_model(run)
-    logger = logger_in(session.folder / "log", model.num_timesteps)
+    logger = make_logger(session.folder / "log", model.num_timesteps)
     model.set_logger(logger)
     policy = Sb3Policy(model, normalisation, run.control)
     trainee = Trainee(
         PolicyMaker(
             functools.partial(as_saved_agent, policy, run.algorithm),
-            lambda task, agent: as_trained(task, agent, run.residual_to, run.gated),
+            lambda task, agent: wrap_as_trained(task, agent, run.residual_to, run.gated),
             run.control,
         ),
         lambda place: save_checkpoint(model, env, normalisation, place),
         lambda place: save_agent(policy, run, place),
     )
     with contextlib.closing(logger), interruption() as stop:
-        books = Bookkeeping(run, session, trainee, stop, curves_beside(logger), began)
+        books = Bookkeeping(run, session, trainee, stop, curve_writer(logger), began)
         trainer = _Trainer(books, session.progress)
         remaining = run.steps - model.num_timesteps
         if remaining > 0:

@@ -1,7 +1,7 @@
-"""What a user changes of a training run: settings of the environment and of the algorithm, in words or in a file.
+"""A user's settings of a training run: those of the environment and of the algorithm, as options or in a file.
 
-Values are read as YAML reads them. Later sources go before earlier ones: the file of hyperparameters that is shipped, a
-file of one's own, single settings. Mappings are merged key by key.
+Values are parsed as YAML. Later sources override earlier ones: the shipped file of hyperparameters, the user's file,
+single settings. Mappings are merged key by key.
 """
 
 import inspect
@@ -15,32 +15,32 @@ from ..envs.data.foreign_files import read_yaml
 from ..envs.engine.catalogue import nearest, parameter_names
 
 SCIENTIFIC = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
-"""Numbers such as 1e-3, which YAML 1.1 takes for words."""
+"""Numbers such as 1e-3, which YAML 1.1 parses as strings."""
 OPTIONS = ("control", "scenario", "backend")
-"""Keywords of an environment that a run has options for."""
+"""Keywords of an environment that are also options of a run."""
 SETTABLE = (*OPTIONS, "reward", "dtype")
-"""Keywords of an environment, beside its parameters, that training takes."""
+"""Keywords of an environment, beside its parameters, that training accepts."""
 ESTIMATORS = ("kalman-net", "student")
-"""Algorithms that make a learned estimator: they steer a filter of their own (:class:`.TrainedBanks`)."""
+"""Algorithms that train a learned estimator: a network that acts in a filter of its own (:class:`.TrainedBanks`)."""
 THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
-OF_THE_RUN = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
-"""Arguments of an algorithm that a run gives itself."""
+RUN_ARGUMENTS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+"""Arguments of an algorithm that a run sets itself."""
 
 
-def with_numbers(value: Any) -> Any:
-    """Return what YAML has read, with numbers in scientific notation as numbers."""
+def convert_numbers(value: Any) -> Any:
+    """Return a parsed YAML value with numbers in scientific notation converted."""
     if isinstance(value, str) and SCIENTIFIC.fullmatch(value):
         return float(value)
     if isinstance(value, list):
-        return [with_numbers(item) for item in value]
+        return [convert_numbers(item) for item in value]
     if isinstance(value, dict):
-        return {name: with_numbers(item) for name, item in value.items()}
+        return {name: convert_numbers(item) for name, item in value.items()}
     return value
 
 
 def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
-    """Return two mappings as one; the second goes before the first, within mappings too."""
+    """Merge two mappings recursively; the second overrides the first."""
     both = dict(first)
     for name, value in then.items():
         own = both.get(name)
@@ -51,7 +51,7 @@ def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[st
 
 
 def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for what is inside a mapping.
+    """Parse ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
 
     Returns:
         Keywords of the environment, and hyperparameters.
@@ -70,7 +70,7 @@ def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]
                 f"--set needs env.NAME=VALUE or algo.NAME=VALUE, such as --set algo.learning_rate=0.001, got {word!r}"
             )
         try:
-            value = with_numbers(yaml.safe_load(text))
+            value = convert_numbers(yaml.safe_load(text))
         except yaml.YAMLError as error:
             raise ValueError(f"--set {path}: cannot read the value {text!r} as YAML") from error
         for name in reversed(names):
@@ -83,10 +83,10 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
     """Read a YAML file of sections.
 
     Raises:
-        ValueError: if it cannot be read, or is no mapping; ``needs`` says of what.
+        ValueError: if it cannot be read, or is not a mapping; ``needs`` describes the expected form.
     """
     try:
-        table = with_numbers(read_yaml(path))
+        table = convert_numbers(read_yaml(path))
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ValueError(f"cannot read settings from {path}: {reason}") from error
@@ -113,7 +113,7 @@ def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a file of settings.
 
     Args:
-        path: of a YAML file: hyperparameters in sections by environment id or ``default``, as rl-zoo3 has them, with
+        path: YAML file with hyperparameters in sections by environment id or ``default``, as in rl-zoo3, with
             keywords of the environment in ``env_kwargs``; or with the keys ``env`` and ``algo``.
         id: environment id.
 
@@ -137,22 +137,22 @@ def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def check_keywords(cls: type[Task], algorithm: str, keywords: Mapping[str, Any]) -> None:
-    """Raise ValueError for a keyword of the environment that there is not, or that training cannot take."""
+    """Raise ValueError for a keyword of the environment that is unknown or that training does not accept."""
     known = [*parameter_names(cls), *SETTABLE]
     for name in keywords:
         if name not in known:
             raise nearest("setting", f"env.{name}", [f"env.{other}" for other in known])
     if algorithm in THROUGH_THE_FILTER and keywords.get("dtype", "float64") != "float64":
-        raise ValueError(f"algorithm {algorithm!r} is shown float64: leave out env.dtype")
+        raise ValueError(f"algorithm {algorithm!r} needs float64: leave out env.dtype")
 
 
 def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Mapping[str, Any]) -> None:
     """Raise ValueError for a hyperparameter that the algorithm does not have.
 
     Args:
-        algorithm: name.
-        values: to be checked.
-        shipped: those of the file that is shipped.
+        algorithm: name of the algorithm.
+        values: hyperparameters to check.
+        shipped: hyperparameters of the shipped file.
     """
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
@@ -162,7 +162,7 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
         from .sb3_algorithms import ALGORITHMS
 
         cls = ALGORITHMS[algorithm]
-        known |= {"normalize", *inspect.signature(cls).parameters} - OF_THE_RUN
+        known |= {"normalize", *inspect.signature(cls).parameters} - RUN_ARGUMENTS
         policy = cls.policy_aliases.get(str(values.get("policy")))
         own = values.get("policy_kwargs") or {}
         if not isinstance(own, Mapping):

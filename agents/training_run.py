@@ -1,7 +1,7 @@
-"""What every training run has, whatever the algorithm: what is asked of it, its record and its folder.
+"""Training runs of all algorithms: their options, their record and their folder.
 
 A run's folder holds ``run.json`` (command, versions, seeds, duration, validation), ``checkpoint/`` (the last
-one, from which ``--resume`` goes on, with the ``run.json`` of its time), ``best/`` (the agent with the lowest
+one, from which ``--resume`` continues, with the ``run.json`` of its time), ``best/`` (the agent with the lowest
 validation cost) and the log.
 """
 
@@ -66,7 +66,7 @@ FILES = {
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib")
-"""What a run's result depends on, with the versions of those that are installed."""
+"""Libraries that a run's result depends on; the run stores the versions of the installed ones."""
 
 
 class ValidationEntry(TypedDict):
@@ -81,12 +81,12 @@ class ValidationEntry(TypedDict):
     """Value and 95 % interval."""
 
 
-class Passed(TypedDict):
-    """When an agent was first better than the paper's algorithm."""
+class FirstWin(TypedDict):
+    """Steps and time until an agent was first better than the paper's algorithm."""
 
     steps: int
     seconds: float
-    """Time spent till then, from the making of the environments on, validations included."""
+    """Time from the creation of the environments to that validation, in s, including validations."""
 
 
 @dataclass
@@ -101,46 +101,46 @@ class TrainingRun:
     seed: int
     envs: int
     steps: int
-    """Environment steps asked for."""
+    """Requested environment steps."""
     hyperparameters: dict[str, Any]
-    """With keywords of the environment in ``env_kwargs``, as in rl-zoo3's form."""
+    """Hyperparameters, with keywords of the environment in ``env_kwargs``, as in rl-zoo3's form."""
     backend: str = "auto"
-    """What computes the steps of the environments: as asked for, and once they are made what does."""
+    """Backend of the environments: the requested one, and the actual one once they exist."""
     command: str = ""
     steps_done: int = 0
     seconds: float = 0.0
-    """Time spent, over all sessions."""
+    """Time spent in all sessions, in s."""
     versions: dict[str, str] = field(default_factory=dict)
     validation: list[ValidationEntry] = field(default_factory=list)
     exported: dict[str, Any] | None = None
-    """Cost of the exported agent on the first episodes of the validation split, to be checked anywhere."""
+    """Cost of the exported agent on the first episodes of the validation split, which any machine can reproduce."""
     interface: int = 1
-    """Of the environment when the run began, see :class:`~..envs.task.Task`."""
+    """Interface number of the environment when the run began, see :class:`~..envs.task.Task`."""
     residual_to: str = ""
-    """Name of the policy that the agent corrects; none if empty."""
+    """Name of the policy that the agent corrects; empty: none."""
     gated: bool = False
-    """Whether the agent acts only where something is wrong, see :mod:`.gate`."""
-    beat_paper: Passed | None = None
-    """The first validation whose cost is below that of the paper's algorithm with its whole interval."""
+    """Whether the agent acts behind a gate, see :mod:`.gate`."""
+    beat_paper: FirstWin | None = None
+    """The first validation whose relative cost difference to the paper's algorithm has an interval below zero."""
 
     @functools.cached_property
     def problem(self) -> Problem:
-        """Of its environment."""
+        """Problem of the environment."""
         return problem_of(self.environment)
 
     @property
     def task_keywords(self) -> dict[str, Any]:
-        """Parameters of the task, without what concerns training only, such as the reward."""
+        """Parameters of the task, without keywords of the training alone, such as the reward."""
         known = parameter_names(self.problem.task)
         return {n: value for n, value in self.hyperparameters.get("env_kwargs", {}).items() if n in known}
 
     def make_model(self, scenario: str | None = None) -> Model:
-        """Make the model that is trained on, in one of its scenarios."""
+        """Make the model of the training in one of its scenarios."""
         return make_model(self.problem.task, self.control, scenario, **self.task_keywords)
 
     @property
     def is_complete(self) -> bool:
-        """Whether all steps asked for are done."""
+        """Whether all requested steps are done."""
         return self.steps_done >= self.steps
 
     @property
@@ -151,45 +151,45 @@ class TrainingRun:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What somebody asks of a run; what is left out comes from the algorithm's hyperparameters."""
+    """A user's options of a run; options that are None come from the algorithm's hyperparameters."""
 
     algorithm: str
     """One of ``FILES``."""
     control: str | None = None
-    """What the agent steers; None: that of the settings, or the environment's first."""
+    """Control of the agent; None: that of the settings, or the environment's first."""
     steps: int | None = None
-    """Environment steps in all."""
+    """Total environment steps."""
     envs: int | None = None
-    """Environments side by side."""
+    """Number of parallel environments."""
     seed: int = 0
-    """Of the episodes and the network."""
+    """Seed of the episodes and the network."""
     scenario: Any = None
     """A training scenario, or a mixture of such."""
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    """Hyperparameters that go before those of the files."""
+    """Hyperparameters that override those of the files."""
     keywords: Mapping[str, Any] = field(default_factory=dict)
-    """Of the environment, parameters, ``reward`` or ``dtype``, likewise."""
+    """Keywords of the environment (parameters, ``reward`` or ``dtype``) that override those of the files."""
     config: Path | None = None
-    """File of settings, see :func:`.settings.read_config`; it goes before the file that is shipped."""
+    """File of settings, see :func:`.settings.read_config`; it overrides the shipped file."""
     backend: str = "auto"
-    """What computes the steps."""
+    """Backend of the environments."""
     residual_to: str = ""
-    """Name of a policy of the environment's own to whose actions the agent's are added; the default control is then
-    that policy's."""
+    """Name of one of the environment's own policies, to whose actions the agent's are added; the default control is
+    then that policy's."""
     gated: bool = False
-    """Let the agent act only where something is wrong, see :mod:`.gate`."""
+    """Whether the agent acts behind a gate, see :mod:`.gate`."""
 
 
 def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
-    """Describe a run.
+    """Return a new run with options and hyperparameters merged.
 
     Args:
-        problem: that is trained on.
-        options: what is asked of the run.
+        problem: the problem of the training.
+        options: the user's options.
 
     Raises:
         ValueError: for an unknown name, a value out of its limits, a scenario that is held out, or an agent that cannot
-            be around that policy or inside the gate.
+            correct that policy or act behind a gate.
     """
     cls, algorithm = problem.task, options.algorithm
     if algorithm not in FILES:
@@ -199,7 +199,7 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
     named = {name: of_environment.pop(name, None) for name in OPTIONS}
     control = options.control
     if options.residual_to and control is None and "control" not in own_keywords:
-        # Before the file that is shipped, which knows nothing of that policy.
+        # Overrides the shipped file, which is independent of that policy.
         control = getattr(problem.competitor(options.residual_to), "control", None)
     control = named["control"] if control is None else control
     controls = controls_of(cls, algorithm)
@@ -212,13 +212,13 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
     _check_environment(problem, options, control, flown, of_environment)
     if of_environment or "env_kwargs" in values:
         values["env_kwargs"] = of_environment
-    default_envs, default_steps = (_without_point(values.pop(name)) for name in ("n_envs", "n_timesteps"))
+    default_envs, default_steps = (_as_integer(values.pop(name)) for name in ("n_envs", "n_timesteps"))
     envs = check_integer("envs", default_envs if options.envs is None else options.envs, 1)
     steps = check_integer("steps", default_steps if options.steps is None else options.steps, 1)
     return TrainingRun(
         problem.name,
         control or controls[0],
-        in_words(flown),
+        scenario_text(flown),
         algorithm,
         check_integer("seed", options.seed, 0),
         envs,
@@ -232,10 +232,10 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
 
 
 def _merge_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return hyperparameters, and the keywords of the environment that do not come from the file that is shipped.
+    """Return the hyperparameters, and the keywords of the environment that do not come from the shipped file.
 
     Raises:
-        ValueError: for one that there is not.
+        ValueError: for an unknown name.
     """
     shipped = read_hyperparameters(problem.id, options.algorithm)
     keywords, values = ({}, {}) if options.config is None else read_config(options.config, problem.id)
@@ -265,13 +265,13 @@ def _check_environment(
             raise nearest(name, keywords[name], words)
 
 
-def _without_point(value: Any) -> Any:
-    """Return a whole number as one: files write 1e6."""
+def _as_integer(value: Any) -> Any:
+    """Return a whole number as an integer: files contain 1e6."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
-    """Raise ValueError if an agent cannot correct that policy, or act inside the gate."""
+    """Raise ValueError if an agent cannot correct that policy, or act behind a gate."""
     algorithm, residual_to = options.algorithm, options.residual_to
     if len(models) > 1:
         raise ValueError(
@@ -292,7 +292,7 @@ def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
 
 
 def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
-    """What an algorithm can steer: the controls of an environment, or the filter of a learned estimator.
+    """Return the controls that an algorithm can train: those of an environment, or the filter of a learned estimator.
 
     Raises:
         ValueError: if the environment has no such filter.
@@ -302,13 +302,13 @@ def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
     if algorithm not in trained_banks(cls):
         having = [other.id for other in catalogue().values() if algorithm in trained_banks(other)]
         raise ValueError(
-            f"{cls.id} has no filter for {algorithm!r} to steer: choose another algorithm, or {', '.join(having)}"
+            f"{cls.id} has no filter for algorithm {algorithm!r}: choose another algorithm, or {', '.join(having)}"
         )
     return (algorithm,)
 
 
 def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
-    """Return the scenarios that a run flies, with their weights.
+    """Return the scenarios of a run with their weights.
 
     Raises:
         ValueError: for an unknown scenario, or one that is held out, alone or in a mixture.
@@ -324,17 +324,17 @@ def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
     return weights
 
 
-def in_words(weights: Mapping[str, float]) -> str:
-    """Name a scenario, or a mixture, as an option and ``gymnasium.make`` take it."""
+def scenario_text(weights: Mapping[str, float]) -> str:
+    """Return a scenario or a mixture in the form of the option ``--scenario`` and of ``gymnasium.make``."""
     if len(weights) == 1:
         return next(iter(weights))
     return ",".join(f"{name}:{weight!r}" for name, weight in weights.items())
 
 
 def read_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
-    """Return the hyperparameters of an algorithm for an environment; default ones where it has none.
+    """Return the hyperparameters of an algorithm for an environment; default ones if the file has no section for it.
 
-    A file that is ``based_on`` another algorithm's says only what is different, everywhere and in an environment.
+    A file that is ``based_on`` another algorithm's contains only the differences, by default and for an environment.
     """
     import yaml
 
@@ -347,10 +347,10 @@ def read_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
 
 
 def schedule(name: str, value: float | str) -> Callable[[float], float]:
-    """Return a hyperparameter over the share of the run that is left, 1 to 0.
+    """Return a hyperparameter as a function of the remaining share of the run, 1 to 0.
 
     Args:
-        name: of it, such as ``learning_rate``.
+        name: its name, such as ``learning_rate``.
         value: a constant, or in rl-zoo3's form "lin_0.001": from there linearly to zero.
 
     Raises:
@@ -367,11 +367,11 @@ def schedule(name: str, value: float | str) -> Callable[[float], float]:
 
 
 def check_trust(what: str, trust: bool) -> None:
-    """Raise ValueError if something that can execute code is not trusted.
+    """Raise ValueError if a file or module that can execute code is not trusted.
 
     Args:
-        what: it is, and what happens to it.
-        trust: whether the user says so.
+        what: the file or module, and how it is loaded.
+        trust: whether the user trusts it.
     """
     if not trust:
         raise ValueError(
@@ -380,7 +380,7 @@ def check_trust(what: str, trust: bool) -> None:
 
 
 def save_run(run: TrainingRun, path: Path) -> None:
-    """Write a run's record, whole or not at all."""
+    """Write a run's record in one atomic step."""
     write_text(path, json.dumps(asdict(run), indent=1) + "\n")
 
 
@@ -388,12 +388,12 @@ def load_run(folder: Path, trust: bool = False) -> TrainingRun:
     """Read ``run.json``.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         trust: import the module that registers the environment, which executes it. An environment of filtergym, or one
-            whose module is imported already, such as one that the command line names, takes no trust.
+            whose module is already imported, such as one that the command line names, needs no trust.
 
     Raises:
-        ValueError: if there is none, it is not one, or its environment takes ``trust``.
+        ValueError: if the file is missing, is not a run's record, or its environment needs ``trust``.
     """
     path = folder / "run.json"
     try:
@@ -408,13 +408,13 @@ def load_run(folder: Path, trust: bool = False) -> TrainingRun:
     if not colon:
         return run
     if module not in sys.modules:
-        check_trust(f"{path} asks for an import of module {module!r}", trust)
+        check_trust(f"{path} imports module {module!r}", trust)
         import_task(run.environment)
     return replace(run, environment=importable_name(task_class(run.environment)))
 
 
 def best_agent(folder: Path) -> Path:
-    """File of a run's agent with the lowest validation cost, as an evaluation takes it.
+    """Return the file of a run's agent with the lowest validation cost, in the form that an evaluation reads.
 
     Raises:
         ValueError: if the run has not been validated yet.
@@ -426,21 +426,21 @@ def best_agent(folder: Path) -> Path:
     raise ValueError(f"{folder} has no best agent yet: train it up to its first validation")
 
 
-def resume_run(folder: Path, asked: TrainingRun, same: bool = False) -> TrainingRun:
-    """Read the run of a folder to go on with it, up to the steps asked for; what a crash left is put in order.
+def resume_run(folder: Path, requested: TrainingRun, same: bool = False) -> TrainingRun:
+    """Read the run of a folder to continue it up to the requested steps, and repair folders that a crash left.
 
     Args:
-        folder: of the run.
-        asked: what the user says that it is.
-        same: with the run's own hyperparameters, of which the user says nothing.
+        folder: folder of the run.
+        requested: the run that the user describes.
+        same: keep the run's own hyperparameters, as the user gives none.
 
     Raises:
-        ValueError: if it is a run of something else.
+        ValueError: if the folder contains a different run.
     """
     checkpoint = folder / "checkpoint"
     for place in (checkpoint, folder / "best"):
         settle_folder(place)
-    # A crash between the two leaves a checkpoint that is newer than the folder's record: its own one counts.
+    # A crash between the two writes leaves a checkpoint that is newer than the folder's record: its own record counts.
     own = (checkpoint / "run.json").exists()
     try:
         run = load_run(checkpoint if own else folder)
@@ -461,46 +461,49 @@ def resume_run(folder: Path, asked: TrainingRun, same: bool = False) -> Training
         "gated",
     )
     for name in compared:
-        has, wanted = getattr(run, name), getattr(run if same and name == "hyperparameters" else asked, name)
+        has, wanted = (
+            getattr(run, name),
+            getattr(run if same and name == "hyperparameters" else requested, name),
+        )
         while isinstance(has, dict) and isinstance(wanted, dict) and has != wanted:
             inside = next(n for n in {**has, **wanted} if has.get(n) != wanted.get(n))
             name, has, wanted = f"{name}.{inside}", has.get(inside), wanted.get(inside)
         if has != wanted:
-            raise ValueError(f"{folder} holds a run with {name} {has!r}, not {wanted!r}")
+            raise ValueError(f"{folder} contains a run with {name} {has!r}, not {wanted!r}")
     if not checkpoint.is_dir():
         raise ValueError(f"{folder} has no checkpoint to resume from")
     if not (folder / "run.json").exists() or load_run(folder) != run:
         save_run(run, folder / "run.json")
-    run.steps = asked.steps
-    if asked.backend != "auto":
-        run.backend = asked.backend
+    run.steps = requested.steps
+    if requested.backend != "auto":
+        run.backend = requested.backend
     return run
 
 
-def holds_run(folder: Path) -> bool:
-    """Whether a training run was begun in a folder, up to its first checkpoint at least."""
+def has_run(folder: Path) -> bool:
+    """Return whether a folder contains a training run with at least one checkpoint."""
     return (folder / "run.json").exists() or find_folder(folder / "checkpoint").exists()
 
 
-def open_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
-    """Begin a run in a folder, or go on with the one that is there; its command and versions are noted.
+def open_run(folder: Path, requested: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
+    """Begin a run in a folder, or continue the one there, and store its command and versions.
 
     Args:
-        folder: of the run.
-        asked: what the user says that it is.
-        resume: go on with it.
-        same: as of :func:`resume_run`.
+        folder: folder of the run.
+        requested: the run that the user describes.
+        resume: continue the run of the folder.
+        same: keep the run's own hyperparameters, see :func:`resume_run`.
 
     Raises:
-        ValueError: if the folder cannot be written to, holds a run already, or holds another one.
+        ValueError: if the folder cannot be written to, or contains a run that is not to be resumed or a different one.
     """
-    if not resume and holds_run(folder):
+    if not resume and has_run(folder):
         raise ValueError(
-            f"{folder} holds a training run: add --resume to go on with it, or choose another folder"
+            f"{folder} contains a training run: add --resume to continue it, or choose another folder"
         )
     if resume and folder.is_dir():
-        claim_folder(folder)  # before anything in it is put in order
-    run = resume_run(folder, asked, same) if resume else asked
+        claim_folder(folder)  # before anything in it is repaired
+    run = resume_run(folder, requested, same) if resume else requested
     writable_folder(folder)
     run.command = " ".join(
         [
@@ -508,16 +511,14 @@ def open_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False)
             f"--scenario {run.scenario} --steps {run.steps} --envs {run.envs} --seed {run.seed}",
             *([f"--residual-to {run.residual_to}"] if run.residual_to else []),
             *(["--gated"] if run.gated else []),
-            *_settings_in_words(run),
+            *_settings_as_options(run),
         ]
     )
     run.versions = library_versions(LIBRARIES)
     return run
 
 
-def _settings_in_words(run: TrainingRun) -> Iterator[str]:
-    """What differs from the hyperparameters that are shipped, as options."""
-
+def _settings_as_options(run: TrainingRun) -> Iterator[str]:
     def differing(path: str, own: Any, shipped: Any) -> Iterator[str]:
         if isinstance(own, dict):
             for name, value in own.items():

@@ -1,4 +1,4 @@
-"""A training run while it goes on: what it is told and tells, when it is validated and saved, and how it is stopped."""
+"""A training run in progress: its callbacks, validations, checkpoints, and how it is stopped."""
 
 import importlib.util
 import signal
@@ -17,7 +17,7 @@ from .validation import Validation
 
 
 def _curve(entry: ValidationEntry) -> dict[str, float]:
-    """Numbers of a validation, as a log shows them over environment steps."""
+    """Return the numbers of a validation for the log."""
     curve = {"validation/cost": entry["cost"]}
     if "paper_cost" in entry and "relative_cost_difference" in entry:
         curve["validation/paper_cost"] = entry["paper_cost"]
@@ -25,12 +25,12 @@ def _curve(entry: ValidationEntry) -> dict[str, float]:
     return curve
 
 
-def logger_in(folder: Path, steps_done: int) -> Any:
+def make_logger(folder: Path, steps_done: int) -> Any:
     """Return a logger of Stable-Baselines3 that writes CSV and, where it is installed, TensorBoard.
 
     Args:
-        folder: for the files.
-        steps_done: before; a resumed run writes files of its own.
+        folder: folder of the files.
+        steps_done: environment steps before this session; a resumed run writes its own files.
     """
     from stable_baselines3.common.logger import Logger, make_output_format
 
@@ -39,8 +39,8 @@ def logger_in(folder: Path, steps_done: int) -> Any:
     return Logger(str(folder), [make_output_format(name, str(folder), suffix) for name in formats])
 
 
-def curves_beside(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
-    """Return what writes numbers at once where a logger writes, and leaves alone what that one has gathered."""
+def curve_writer(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
+    """Return a function that writes numbers at once to a logger's files, without the values pending in the logger."""
     from stable_baselines3.common.logger import Logger
 
     own = Logger(None, logger.output_formats)
@@ -56,9 +56,9 @@ def curves_beside(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
 
 @contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a wish to stop at the next safe point; the second stops at once."""
+    """Make the first Ctrl-C or SIGTERM request a stop at the next safe point; the second stops at once."""
     wished = False
-    if threading.current_thread() is not threading.main_thread():  # of a worker, which no signal reaches
+    if threading.current_thread() is not threading.main_thread():  # signals reach the main thread only
         yield lambda: False
         return
 
@@ -80,37 +80,36 @@ def interruption() -> Iterator[Callable[[], bool]]:
         restore()
 
 
-def _tell_nobody(news: Any) -> None:
+def _ignore(value: Any) -> None:
     """Do nothing."""
 
 
-def _go_on(entry: ValidationEntry) -> bool:
-    """Do not stop, whatever a validation says."""
+def _never_stop(entry: ValidationEntry) -> bool:
     return False
 
 
 @dataclass(frozen=True)
 class Session:
-    """How a run is trained, from its beginning or from where it stopped.
+    """Settings of a session that trains a run, from its beginning or from a checkpoint.
 
     Raises:
         ValueError: for less than one environment step between validations.
     """
 
     folder: Path
-    """Of the run; exists."""
+    """Folder of the run, which exists."""
     resume: bool = False
-    """Go on from the folder's checkpoint."""
+    """Continue from the folder's checkpoint."""
     validate_every: int | None = None
     """Environment steps between two validations; None: a twentieth of the run."""
     trust: bool = False
-    """Load the checkpoint even if it can execute code; resuming a model of Stable-Baselines3 takes it."""
-    progress: Callable[[int], None] = _tell_nobody
-    """Told of all environment steps done so far."""
-    report: Callable[[str], None] = _tell_nobody
-    """Told of every validation in words."""
-    validated: Callable[[ValidationEntry], bool] = _go_on
-    """Told of every validation; returns whether to stop, with a checkpoint."""
+    """Load the checkpoint even if it can execute code; needed to resume a model of Stable-Baselines3."""
+    progress: Callable[[int], None] = _ignore
+    """Called with the number of environment steps done."""
+    report: Callable[[str], None] = _ignore
+    """Called with a sentence about every validation."""
+    on_validation: Callable[[ValidationEntry], bool] = _never_stop
+    """Called with every validation; returns whether to stop with a checkpoint."""
 
     def __post_init__(self) -> None:
         if self.validate_every is not None:
@@ -125,23 +124,23 @@ class Trainee(NamedTuple):
     """An agent while it is trained."""
 
     policy: Any
-    """For an evaluation."""
+    """The policy, for an evaluation."""
     save_checkpoint: Callable[[Path], None]
-    """Writes all that training goes on from into an empty folder."""
+    """Writes all that later steps depend on into an empty folder."""
     save_agent: Callable[[Path], None]
     """Writes the agent alone into an empty folder."""
 
 
 class Bookkeeping:
-    """Decides when a run is validated and checkpointed, and does what that takes.
+    """Validations and checkpoints of a run, with its record.
 
     Args:
-        run: the record, kept up to date.
-        session: how it is trained; every validation is followed by a checkpoint.
+        run: the record, which is updated.
+        session: settings of the session; every validation is followed by a checkpoint.
         trainee: the agent.
-        stop: whether somebody wishes to stop.
-        log: writes numbers by name at so many environment steps.
-        began: when the run began to make its environments, of ``time.monotonic``.
+        stop: returns whether a stop was requested.
+        log: writes numbers by name at a number of environment steps.
+        began: ``time.monotonic`` before the environments were made, in s.
     """
 
     def __init__(
@@ -161,14 +160,14 @@ class Bookkeeping:
         self.folder: Path = session.folder
         self.interval: int = session.steps_between_validations(run)
         self.report: Callable[[str], None] = session.report
-        self.validated: Callable[[ValidationEntry], bool] = session.validated
+        self.on_validation: Callable[[ValidationEntry], bool] = session.on_validation
         self.policy, self.save_checkpoint, self.save_agent = trainee
         self.validation: Validation = Validation(run)
         self.due: int = run.steps_done + self.interval
         self.seconds_before: float = run.seconds
 
     def safe_point(self, steps_done: int, last: bool = False) -> bool:
-        """Between two updates: validate and save if it is time; returns whether to stop."""
+        """Validate and save between two updates if it is time, and return whether to stop."""
         stopping = self.stop()
         if not (stopping or last or steps_done >= self.due):
             return False
@@ -197,4 +196,4 @@ class Bookkeeping:
         if passed:
             line += f"; better than {self.validation.paper} for the first time, after {run.seconds:.1f} s"
         self.report(line)
-        return self.validated(entry) or stopping
+        return self.on_validation(entry) or stopping

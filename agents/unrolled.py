@@ -1,8 +1,8 @@
 """Back-propagation through compiled episodes and a small network, written out step by step.
 
-On small arrays nearly all the time of automatic differentiation goes into keeping its own record. Here the episodes'
-part is compiled (:class:`~..envs.rollout.Rollout`), and the policy's is the chain rule by hand; the gradients are
-those that torch finds.
+On small arrays automatic differentiation spends nearly all its time on its own tape. Here the part of the episodes
+is compiled (:class:`~..envs.rollout.Rollout`), and that of the policy is the chain rule by hand. The gradients equal
+those of torch.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,32 +23,32 @@ from ..evaluation.competitors.kinds import kind_of
 from .gate import Gate
 
 LIMIT = 10.0
-"""Largest normalised observation that the policy sees."""
+"""Largest magnitude of a normalised observation."""
 
 
 class UnrolledPolicy:
-    """Answers of a :class:`~.bptt.NetworkPolicy` to N episodes, kept to be differentiated.
+    """Forward and backward pass of a :class:`~.bptt.NetworkPolicy` over N episodes.
 
     Args:
-        policy: whose parameters are used, and whose gradients are added to.
-        envs: episodes.
-        decisions: that are kept at once.
+        policy: the policy whose parameters are used, and to whose gradients are added.
+        envs: number of episodes.
+        decisions: largest number of decisions between two backward passes.
     """
 
     def __init__(self, policy: Any, envs: int, decisions: int) -> None:
         self._policy, self._fields = policy, len(policy.mean)
         dtype = policy.mean.numpy().dtype
-        # What is shown, memory, and 1, which the biases are multiplied with.
+        # Observation, memory, and 1, the factor of the biases.
         self._seen = numpy.ones((decisions + 1, self._fields + policy.memory_size + 1, envs), dtype)
         self._memory = None if policy.gru is None else UnrolledMemory(policy.gru, self._seen)
         self._layers = UnrolledLayers(policy.layers, envs, decisions)
 
     def begin(self) -> None:
-        """Forget everything."""
+        """Set the memory to zero."""
         self._seen[0, self._fields : -1] = 0.0
 
     def read(self) -> None:
-        """Take the parameters as they are now."""
+        """Copy the current parameters."""
         policy = self._policy
         self._mean, self._scale, self._used, self._low, high = (
             part.numpy()[:, None]
@@ -60,7 +60,7 @@ class UnrolledPolicy:
             self._memory.read()
 
     def forward(self, decision: int, observation: numpy.ndarray) -> numpy.ndarray:
-        """Answer observations ``(fields, N)`` with actions ``(A, N)``."""
+        """Return the actions ``(A, N)`` for observations ``(fields, N)``."""
         seen = self._seen[decision]
         shown = seen[: self._fields]
         numpy.subtract(observation, self._mean, out=shown, casting="same_kind")
@@ -71,14 +71,14 @@ class UnrolledPolicy:
         return self._low + self._half * (1.0 + self._layers.forward(decision, features))
 
     def backward_from_here(self) -> None:
-        """Let the gradient with respect to the memory as it is now be zero."""
+        """Set the gradient with respect to the current memory to zero."""
         if self._memory is not None:
             self._memory.backward_from_here()
 
     def backward(self, decision: int, of_action: numpy.ndarray) -> numpy.ndarray:
-        """Turn the gradient with respect to actions ``(A, N)`` into that with respect to observations.
+        """Return the gradient with respect to observations ``(fields, N)`` from that for actions ``(A, N)``.
 
-        The last decision comes first.
+        Decisions are passed in reverse order.
         """
         of_features = self._layers.backward(decision, of_action * self._half)
         of_shown = of_features if self._memory is None else self._memory.backward(decision, of_features)
@@ -87,7 +87,7 @@ class UnrolledPolicy:
         return of_shown
 
     def add_gradients(self, decisions: int) -> None:
-        """Add the gradients of the parameters, and go on from the memory after so many decisions."""
+        """Add the gradients of the parameters, and continue from the memory after ``decisions`` decisions."""
         self._layers.add_gradients()
         if self._memory is not None:
             self._memory.add_gradients()
@@ -98,9 +98,9 @@ class UnrolledLayers:
     """Linear layers, ``f([weights, bias] @ [features, 1])``; f is the rectifier, and tanh after the last of them.
 
     Args:
-        layers: of torch.
-        envs: episodes.
-        decisions: that are kept at once.
+        layers: linear layers of torch.
+        envs: number of episodes.
+        decisions: largest number of decisions between two backward passes.
     """
 
     def __init__(self, layers: Sequence[Any], envs: int, decisions: int) -> None:
@@ -111,13 +111,16 @@ class UnrolledLayers:
         self._vanished = numpy.sqrt(numpy.finfo(dtype).tiny)
 
     def read(self) -> None:
-        """Take the parameters as they are now."""
+        """Copy the current parameters."""
         pairs = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in self._layers]
         self._matrices = [numpy.concatenate([weight, bias[:, None]], axis=1) for weight, bias in pairs]
         self._of_matrices = [numpy.zeros_like(matrix) for matrix in self._matrices]
 
     def forward(self, decision: int, features: numpy.ndarray) -> numpy.ndarray:
-        """Answer features, 1 below them; they are kept and must not be changed until they were differentiated."""
+        """Return the outputs for features with a last row of ones.
+
+        The features are stored by reference: they must not change before the backward pass.
+        """
         self._inputs[0][decision] = features
         last = len(self._layers) - 1
         for i, matrix in enumerate(self._matrices):
@@ -126,13 +129,13 @@ class UnrolledLayers:
         return output
 
     def backward(self, decision: int, gradient: numpy.ndarray) -> numpy.ndarray:
-        """Turn the gradient with respect to the answer into that with respect to the features."""
+        """Return the gradient with respect to the features from that with respect to the output."""
         last = len(self._layers) - 1
         for i in reversed(range(len(self._layers))):
             answer = self._outputs[i][decision, :-1]
             slope = 1.0 - answer * answer if i == last else answer > 0.0
             gradient = (gradient * slope).astype(answer.dtype, copy=False)
-            # Products of what has nearly vanished fall below the smallest normal number, where processors are slow.
+            # Products of tiny numbers fall below the smallest normal number, where processors are slow.
             gradient *= numpy.abs(gradient) > self._vanished
             self._of_matrices[i] += gradient @ self._inputs[i][decision].T
             gradient = self._matrices[i][:, :-1].T @ gradient
@@ -148,7 +151,7 @@ class UnrolledLayers:
 class UnrolledMemory:
     """The recurrent unit of a policy.
 
-    All that a GRU multiplies with its parameters is one matrix times one vector of what is shown, memory, and 1::
+    All products of a GRU with its parameters are one matrix times one vector of observation (shown), memory, and 1::
 
         [reset    ]   [input weights  memory weights  both biases ]   [shown ]
         [update   ] = [     "               "              "      ] @ [memory]
@@ -158,8 +161,8 @@ class UnrolledMemory:
         memory' = candidate + update (memory - candidate),  candidate = tanh(candidate + reset recalled)
 
     Args:
-        gru: of torch.
-        seen: what is shown, memory, and 1, ``(decisions + 1, fields + memory + 1, N)``; the memory is written there.
+        gru: GRU cell of torch.
+        seen: observation, memory, and 1, ``(decisions + 1, fields + memory + 1, N)``; the memory is written there.
     """
 
     def __init__(self, gru: Any, seen: numpy.ndarray) -> None:
@@ -175,7 +178,7 @@ class UnrolledMemory:
         self._vanished = numpy.sqrt(numpy.finfo(dtype).tiny)
 
     def read(self) -> None:
-        """Take the parameters as they are now."""
+        """Copy the current parameters."""
         fields, size = self._fields, self._size
         input, memory, input_bias, memory_bias = (part.detach().numpy() for part in self._gru.parameters())
         self._matrix = matrix = numpy.zeros((4 * size, fields + size + 1), input.dtype)
@@ -186,7 +189,7 @@ class UnrolledMemory:
         self._of_matrix = numpy.zeros_like(matrix)
 
     def forward(self, decision: int) -> numpy.ndarray:
-        """Return the memory after a decision, 1 below it."""
+        """Return the memory after a decision, with a last row of ones."""
         size, seen, gates = self._size, self._seen[decision], self._gates[decision]
         hidden, after = seen[self._fields : -1], self._seen[decision + 1, self._fields :]
         numpy.matmul(self._matrix, seen, out=gates)
@@ -204,15 +207,15 @@ class UnrolledMemory:
         return after
 
     def backward_from_here(self) -> None:
-        """Let the gradient with respect to the memory as it is now be zero."""
+        """Set the gradient with respect to the current memory to zero."""
         self._of_hidden[...] = 0.0
 
     def backward(self, decision: int, of_after: numpy.ndarray) -> numpy.ndarray:
-        """Turn the gradient with respect to the memory after a decision into that with respect to what was shown.
+        """Return the gradient with respect to the observation from that with respect to the memory after a decision.
 
         Args:
-            decision: the last one comes first.
-            of_after: the gradient as far as it does not flow through later decisions.
+            decision: number of the decision; decisions are passed in reverse order.
+            of_after: the part of the gradient that does not flow through later decisions.
         """
         fields, size, seen, gates = self._fields, self._size, self._seen[decision], self._gates[decision]
         hidden = seen[fields:-1]
@@ -251,20 +254,19 @@ class UnrolledMemory:
 
 
 def _add_gradient(parameter: Any, gradient: numpy.ndarray) -> None:
-    """Add to the gradient of a parameter of torch."""
     added = torch.from_numpy(gradient.copy())
     parameter.grad = added if parameter.grad is None else parameter.grad + added
 
 
 class Teacher:
-    """A filter that takes in the measurements of episodes, and whose estimates a student learns from.
+    """A filter over the measurements of episodes, whose estimates are the targets of a student.
 
     Args:
-        env: whose episodes they are, with compiled backend.
-        name: of an estimator of the environment's own, or of a reference, which is told more.
+        env: environments of the episodes, with compiled backend.
+        name: name of one of the environment's own estimators, or of a reference, which knows the truth.
 
     Raises:
-        ValueError: if there is none, it cannot run as compiled code, or the world follows its estimates.
+        ValueError: for an unknown name, a filter without compiled code, or a world that depends on the estimates.
     """
 
     def __init__(self, env: TaskVectorEnv, name: str) -> None:
@@ -274,7 +276,7 @@ class Teacher:
             raise ValueError(f"a teacher is an estimator or a reference, but {name!r} is of kind {kind}")
         if env.task.closes_loop:
             raise ValueError(
-                f"{name!r} cannot teach in {env.task.id}: what is measured follows its own estimates there"
+                f"{name!r} cannot teach in {env.task.id}: the measurements depend on its own estimates"
             )
         model = put_in_loop(env.model, competitor, kind, name, env.num_envs)
         if not can_step(model, _estimate):
@@ -285,7 +287,7 @@ class Teacher:
         """Return means ``(measurements, C, width)`` and covariances ``(measurements, C, C, width)`` of episodes.
 
         Args:
-            identities: of the episodes, ``(2, width)``.
+            identities: identities of the episodes, ``(2, width)``.
         """
         self._lanes.begin(identities[:, : self._lanes.count])
         found: tuple[numpy.ndarray, numpy.ndarray] = self._lanes.run(_estimate)[0]
@@ -300,17 +302,17 @@ COST = TrainingObjective("cost")
 
 
 class Unrolled:
-    """Windows of decisions of N compiled episodes under a policy, flown and differentiated.
+    """Simulation and differentiation of N compiled episodes under a policy, in windows of decisions.
 
     Args:
-        env: with compiled backend, continuous actions and autoreset mode "Disabled"; it gives the episodes and their
-            noise.
+        env: environments with compiled backend, continuous actions and autoreset mode "Disabled"; they give the
+            episodes and their noise.
         policy: a :class:`~.bptt.NetworkPolicy`.
         truncation: most decisions of a window.
-        reward: that is ascended: the agent's own part of it.
-        teacher: whose estimates are learned from, where the reward has a share of them.
-        gate: that decides whether the policy acts; a decision in which it does not, has no gradient.
-        largest: see :func:`.bptt.descend_episodes`.
+        reward: the reward to maximise: the agent's own part of it.
+        teacher: teacher whose estimates are the targets of a share of the reward.
+        gate: gate that decides whether the policy acts; other decisions have no gradient.
+        largest: norm to which gradients are clipped, see :func:`.bptt.descend_episodes`.
     """
 
     def __init__(
@@ -337,7 +339,7 @@ class Unrolled:
         self._last = [i for i in range(len(fields)) if i not in self._means.columns]
 
     def descend_episodes(self, descend: Callable[[], None]) -> float:
-        """Fly one episode in every environment; see :func:`.bptt.descend_episodes`."""
+        """Simulate one episode in every environment and descend, see :func:`.bptt.descend_episodes`."""
         self._begin()
         total, last = 0.0, self._env.last_decision
         for first in range(0, last, self._truncation):
@@ -350,22 +352,22 @@ class Unrolled:
         self._observation = self._env.reset()[0].T
         self._rollout.load(self._lanes.state)
         if self._teacher is not None:
-            self._taught, self._flown = self._teacher.estimates(self._lanes.noise.identities), 0
+            self._targets, self._flown = self._teacher.estimates(self._lanes.noise.identities), 0
         self._policy.begin()
         self._gate_memory, self._start = None, numpy.ones(self._env.num_envs, dtype=bool)
 
     def _add_gradients(self, decisions: int) -> float:
-        """Add the gradients of the mean cost of the coming decisions; return it.
+        """Add the gradients of the mean cost of the next decisions, and return the cost.
 
         Raises:
-            ValueError: if an action is no finite number.
+            ValueError: if an action is not finite.
         """
         rollout, policy, count, interval = self._rollout, self._policy, self._lanes.count, self._interval
-        earned = 0.0
+        reward = 0.0
         policy.read()
         if self._teacher is not None:
             window = slice(self._flown, self._flown + decisions * interval)
-            for given, answers in zip(rollout.teacher, self._taught, strict=True):
+            for given, answers in zip(rollout.teacher, self._targets, strict=True):
                 given[: decisions * interval] = answers[window].reshape(-1, *given.shape[1:])
             self._flown = window.stop
         for decision in range(decisions):
@@ -377,11 +379,11 @@ class Unrolled:
                 rollout.action[measurement, :, :count] = action
                 rollout.noise[measurement] = self._lanes.next_row()
                 rollout.forward()
-                earned += float(rollout.reward[:count].sum())
+                reward += float(rollout.reward[:count].sum())
                 total = self._means.add(total, rollout.shown[:, :count])
             self._observation = numpy.array(self._means.show(rollout.shown[:, :count], total, numpy))
         if not numpy.isfinite(rollout.action[: decisions * interval]).all():
-            raise ValueError("the policy has answered with what are no finite numbers")
+            raise ValueError("the policy has returned actions that are not finite")
         share = 1.0 / (count * decisions * interval)
         rollout.reward_adjoint[:count] = -share
         rollout.backward_from_here()
@@ -403,10 +405,10 @@ class Unrolled:
             rollout.shown_adjoint[self._means.columns] /= interval
         policy.add_gradients(decisions)
         rollout.go_on()
-        return -earned * share
+        return -reward * share
 
     def _through_gate(self, decision: int, action: numpy.ndarray) -> numpy.ndarray:
-        """Hold back actions ``(A, N)`` where nothing is wrong, and remember where they are not."""
+        """Replace actions ``(A, N)`` where the gate is closed, and store where it is open."""
         chosen, opened, self._gate_memory = self._gate.choose(
             self._observation.T, action.T, self._gate_memory, self._start
         )

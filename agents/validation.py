@@ -1,4 +1,4 @@
-"""Validation of what is trained, on the validation split, beside the paper's algorithm."""
+"""Validation of agents in training against the paper's algorithm, on the validation split."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -25,15 +25,15 @@ def _cost(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
 
 
 class TrainingEpisodes:
-    """Episodes of the validation split under what a run trains on; who flies them is scored.
+    """Episodes of the validation split in a run's environment and scenario, for the scores of competitors.
 
-    Of a mixture, every scenario flies all episodes, and what is measured is weighted as they are: the same expectation
-    with less variance than drawing.
+    All episodes are simulated in every scenario of a mixture, and the results are weighted as in the mixture: the same
+    expectation with less variance than random scenarios.
 
     Args:
-        run: gives environment, scenario, and parameters of the task.
+        run: the run with environment, scenario, and parameters of the task.
         episodes: number of episodes.
-        backend: what computes the steps.
+        backend: backend of the steps.
     """
 
     def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
@@ -45,7 +45,7 @@ class TrainingEpisodes:
         self._models: dict[tuple[str | None, str, str], Model] = {}
 
     def _model(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Model:
-        """Return a model that is made once: compiling it takes time."""
+        """Return a model from a cache, as compilation takes time."""
         key = control, scenario, repr(keywords)
         if key not in self._models:
             cls, parameters = self.problem.task, {**keywords, **self.keywords}
@@ -59,13 +59,13 @@ class TrainingEpisodes:
         report: Callable[[Model, Episode], dict[str, numpy.ndarray]] = _cost,
         episodes: int | None = None,
     ) -> dict[str, numpy.ndarray]:
-        """Return what is reported, as means over every episode, ``(episodes,)``.
+        """Return the mean of each reported metric over every episode, ``(episodes,)``.
 
         Args:
-            competitor: policy, estimator or reference, or what makes it.
-            control: in which it acts; default: its own.
-            report: as of :func:`.run_competitor`, with one number for every episode.
-            episodes: fly the first of them only.
+            competitor: policy, estimator or reference, or a factory of one.
+            control: control of a policy; default: its own.
+            report: function of :func:`.run_competitor`, with one number for every episode.
+            episodes: number of first episodes to simulate; None: all.
         """
         kind = kind_of(competitor)
         control = control or getattr(competitor, "control", None)
@@ -79,20 +79,20 @@ class TrainingEpisodes:
         return total
 
     def costs(self, competitor: Any, control: str | None = None) -> numpy.ndarray:
-        """Mean cost of every episode, ``(episodes,)``; arguments as of :meth:`means`."""
+        """Return the mean cost of every episode, ``(episodes,)``; arguments as of :meth:`means`."""
         return self.means(competitor, control)["cost"]
 
 
 def validation_backend(run: TrainingRun) -> str:
-    """What computes the steps of a run's validations: policies answer in NumPy arrays, not in torch's."""
+    """Return the backend of a run's validations: policies return NumPy arrays, not torch's tensors."""
     return "auto" if run.backend == "torch" else run.backend
 
 
 class Validation:
-    """Scores an agent, and the paper's algorithm if there is one, on the same episodes of the validation split.
+    """Scores of an agent and of the paper's algorithm, if any, on the same episodes of the validation split.
 
     Args:
-        run: what is trained.
+        run: the run of the agent.
     """
 
     def __init__(self, run: TrainingRun) -> None:
@@ -101,17 +101,17 @@ class Validation:
         self.paper: str = problem.baselines.score_paper
         self.bootstrap: Bootstrap = Bootstrap(VALIDATION_EPISODES)
         self.episodes: TrainingEpisodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
-        # Once: neither the paper's algorithm nor the episodes change in a run.
+        # Once, as neither the paper's algorithm nor the episodes change in a run.
         self.paper_cost = self._costs(problem.competitor(self.paper), None) if self.paper else None
 
     def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
-        """Mean cost over the episodes and over every resample of them."""
+        """Return the mean cost over the episodes and over every resample of them."""
         return self.bootstrap.means(self.episodes.costs(policy, control))
 
     def score(self, policy: Any) -> ValidationEntry:
         """Return an entry of ``TrainingRun.validation``."""
         acts = self.run.algorithm not in ESTIMATORS
-        # A maker of its own: what is compiled is kept by it, and the network has changed since the last validation.
+        # A copy, as the factory caches compiled code and the network has changed since the last validation.
         cost = self._costs(copy.copy(policy), self.run.control if acts else None)
         entry: ValidationEntry = {"steps": self.run.steps_done, "cost": float(cost[0])}
         if self.paper is None or self.paper_cost is None:

@@ -11,25 +11,25 @@ import numpy
 
 from .c_text import WIDTH, Scalar, array_text, comment, expression, literal
 from .program import StraightLineProgram
-from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, steady
+from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, common_difference
 
 MOST = 4
-"""Functions that the comment before a loop names."""
+"""Most functions named in the comment before a loop."""
 SAVED = 40
-"""Bytes of tables that a second loop must save, and again for each place that it goes on from."""
+"""Bytes of tables that a second loop must save, and again for each start of a run."""
 
 
 class Rows(NamedTuple):
-    """Where the rows of an argument lie, for loops over them."""
+    """Places of an argument's rows, for loops over them."""
 
     array: str
     """Expression of a pointer to numbers."""
     places: Mapping[int, int] | Sequence[int]
-    """Place of every row behind it."""
+    """Offset of every row from the pointer."""
 
 
 class Arrays(NamedTuple):
-    """Where the rows of all arguments lie."""
+    """Places of the rows of all arguments."""
 
     read: Mapping[int, Rows]
     written: Mapping[int, Rows]
@@ -39,14 +39,14 @@ class Loops:
     """Loops of a program as text.
 
     Args:
-        program: that was rolled up.
-        name: that tables begin with.
-        read: expression of a row of an argument.
-        write: where a row of an argument goes.
-        arrays: where these rows lie.
+        program: the program in loops.
+        name: prefix of tables.
+        read: function from argument and row to the expression of an input.
+        write: function from argument and row to the destination of a result.
+        arrays: places of these rows.
         scalar: kind of numbers.
-        tables: by where ``take`` finds them.
-        qualifier: of tables.
+        tables: names of the tables of ``take`` by their index in the constants.
+        qualifier: qualifier of tables.
     """
 
     def __init__(
@@ -75,8 +75,9 @@ class Loops:
         self._starts: dict[tuple[int, ...], str] = {}
 
     def loop(self, loop: Loop) -> list[str]:
-        """Return the lines of a loop. Before the first stands a comment, unless the loop before has the same: which
-        functions its operations are of.
+        """Return the lines of a loop.
+
+        A comment before the first line names the functions of its operations, unless the previous loop has the same.
         """
         first, *rest = self._lines(loop)
         callers = dict.fromkeys(self.program.callers.get(statement.origin, "") for statement in loop.body)
@@ -89,8 +90,9 @@ class Loops:
         return [first, *rest]
 
     def _lines(self, loop: Loop) -> list[str]:
-        """Return the lines of a loop, or of two where rows and columns, or runs of members whose places are steadily
-        apart, take shorter tables than all members.
+        """Return the lines of a loop, or of two nested ones where those need shorter tables.
+
+        The nested loops are over rows and columns, or over runs of members with constant distances.
         """
         self._choose_form(loop)
         lines = []
@@ -124,7 +126,7 @@ class Loops:
         return [*head, *(f"    {line}" for line in lines), "}"]
 
     def _in_runs(self, lines: list[str], turns: int, uses_k: bool) -> list[str]:
-        """A loop over runs around one over their members."""
+        """Return a loop over runs around one over their members."""
         lengths = [end - start for start, end in pairwise([*self._runs, turns])]
         begin, on = [], ["--n", *["++k"] * uses_k]
         for places, name in self._starts.items():
@@ -142,14 +144,14 @@ class Loops:
         ]
 
     def _entry(self, numbers: Sequence[int]) -> str:
-        """Expression of a number of run ``i``."""
-        if steady(numbers) is None:
+        """Return the expression of a number of run ``i``."""
+        if common_difference(numbers) is None:
             return f"{self._table(tuple(numbers))}[i]"
         least, text = self._term(numbers, "i")
         return " + ".join([str(least)] * (least != 0 or not text) + [text] * (text != ""))
 
     def _choose_form(self, loop: Loop) -> None:
-        """Find the form in which the tables of a loop are shortest."""
+        """Select the form with the shortest tables of a loop."""
         self._columns, self._runs, self._starts = 1, [0], {}
         irregular = set()
         for statement in loop.body:
@@ -160,8 +162,8 @@ class Loops:
                 for operand in operands:
                     if operand.array not in (TURN, CONSTANTS):
                         places = self._own_places(operand, rows)
-                        if steady(places) is None:
-                            irregular.add(_from_least(places))
+                        if common_difference(places) is None:
+                            irregular.add(_distances(places))
         if not irregular:
             return
 
@@ -200,7 +202,7 @@ class Loops:
         return f"({text} != {literal(0.0, self.scalar)})" if operand.logical else text
 
     def _place(self, operand: Operand, single: Callable[[int, int], str], rows: Mapping[int, Rows]) -> str:
-        """Expression of a member of an array, in a turn of the loop."""
+        """Return the expression of a member of an array, in a turn of the loop."""
         array, places = operand.array, operand.places
         if array != SCRATCH and len(set(places)) == 1:
             return single(array, places[0])
@@ -208,34 +210,34 @@ class Loops:
         return f"{pointer}[{self._index(self._own_places(operand, rows))}]"
 
     def _own_places(self, operand: Operand, rows: Mapping[int, Rows]) -> tuple[int, ...]:
-        """Places of the members behind the pointer to their array."""
+        """Return the offsets of the members from the pointer to their array."""
         if operand.array == SCRATCH:
             return operand.places
         of_row = rows[operand.array].places
         return tuple(of_row[row] for row in operand.places)
 
     def _index(self, places: tuple[int, ...]) -> str:
-        """Expression of the place of member ``k``, which is the one in row ``i`` and column ``j``."""
-        if len(self._runs) > 1 and steady(places) is None:
-            name = self._starts.setdefault(_from_least(places), f"r{len(self._starts)}")
+        """Return the expression of the offset of member ``k``, in row ``i`` and column ``j``."""
+        if len(self._runs) > 1 and common_difference(places) is None:
+            name = self._starts.setdefault(_distances(places), f"r{len(self._starts)}")
             return f"{min(places)} + {name}" if min(places) else name
-        grid = _grid(places, self._columns) if steady(places) is None else None
+        grid = _grid(places, self._columns) if common_difference(places) is None else None
         parts = zip(grid, "ij", strict=True) if grid else [(places, "k")]
         terms = [self._term(part, letter) for part, letter in parts]
         first = sum(least for least, _ in terms)
         return " + ".join([str(first)] * (first != 0) + [text for _, text in terms if text]) or "0"
 
     def _term(self, places: Sequence[int], letter: str) -> tuple[int, str]:
-        """The least of some places, and an expression of how far the others are from it."""
-        step, least = steady(places), min(places)
+        """Return the least of some places, and an expression of the distance of the others from it."""
+        step, least = common_difference(places), min(places)
         if step is None:
-            return least, f"{self._table(_from_least(places))}[{letter}]"
+            return least, f"{self._table(_distances(places))}[{letter}]"
         if step < 0:
             letter = f"({len(places) - 1} - {letter})"
         return least, "" if step == 0 else letter if abs(step) == 1 else f"{abs(step)} * {letter}"
 
     def _table(self, values: tuple[Any, ...]) -> str:
-        """Name of a constant array: of numbers, or of distances."""
+        """Return the name of a constant array of numbers or of distances."""
         key = (type(values[0]), *(struct.pack("d", value) for value in values))
         if key not in self._found:
             name = self._found[key] = (
@@ -251,7 +253,7 @@ class Loops:
 
 
 def _grid(places: Sequence[int], columns: int) -> list[tuple[int, ...]] | None:
-    """Places of rows and of columns whose sums all places are, row by row; None where there are none."""
+    """Return the places of rows and of columns whose sums are all places, row by row; None if there are none."""
     if columns == 1:
         return None
     rows, row = tuple(places[::columns]), tuple(place - places[0] for place in places[:columns])
@@ -259,13 +261,13 @@ def _grid(places: Sequence[int], columns: int) -> list[tuple[int, ...]] | None:
     return [rows, row] if alike else None
 
 
-def _from_least(places: Sequence[int]) -> tuple[int, ...]:
+def _distances(places: Sequence[int]) -> tuple[int, ...]:
     least = min(places)
     return tuple([place - least for place in places])
 
 
 def _kind(numbers: Sequence[int]) -> str:
-    """Type of C that holds some numbers."""
+    """Return the shortest integer type of C for some numbers."""
     for size, kind in ((8, "char"), (16, "short")):
         if min(numbers) >= 0 and max(numbers) < 2**size:
             return f"unsigned {kind}"
@@ -275,26 +277,26 @@ def _kind(numbers: Sequence[int]) -> str:
 
 
 def _bytes(numbers: Sequence[int]) -> int:
-    """Size of a table, none where its entries are steadily apart."""
-    if steady(numbers) is not None:
+    """Return the size of a table in bytes, zero where its entries have constant distances."""
+    if common_difference(numbers) is not None:
         return 0
     return len(numbers) * {"char": 1, "short": 2}.get(_kind(numbers).split()[-1], 4)
 
 
 def _runs(tables: Collection[tuple[int, ...]], turns: int) -> list[int]:
-    """Members with which runs begin, in each of which every table's entries are steadily apart."""
+    """Return the first members of runs, in each of which every table's entries have constant distances."""
     apart = numpy.diff(numpy.array(list(tables)), axis=1)
     bends = (apart[:, 1:] != apart[:, :-1]).any(axis=0).tolist()
     starts = [0]
     for member in range(2, turns):
-        # Two members are always steadily apart.
+        # Two members always have a constant distance.
         if bends[member - 2] and member - starts[-1] >= 2:
             starts.append(member)
     return starts
 
 
 def _steps(places: Sequence[int], runs: Sequence[int], turns: int) -> list[int]:
-    """Distance from member to member in every run; of a run of one, for which any will do, that of the run before."""
+    """Return the distance from member to member in every run; for a run of one member, that of the previous run."""
     steps: list[int] = []
     for start, end in pairwise([*runs, turns]):
         alone = steps[-1] if steps else 1

@@ -1,9 +1,9 @@
-"""A program as text of C99, of one lane in double or float; the same statements are the body of a kernel of CUDA.
+"""A program as text of C99 for one lane, in double or float; the same statements are the body of a kernel of CUDA.
 
-Every step is one statement, or, in a loop, every array operation (:mod:`.rolling`); numbers that cross from one static
-function or loop to the next lie in a scratch array ``w``.
-Comparisons with what is no number, and what ``maximum``, ``minimum``, ``sign``, ``remainder`` and ``take`` make of it,
-are those of the code of :mod:`.emission`; of the two zeros a ``maximum`` may return either.
+Every step is one statement, or, in a loop, every array operation (:mod:`.rolling`). Numbers that pass from one static
+function or loop to the next are stored in a scratch array ``w``. Comparisons with NaN, and the results of ``maximum``,
+``minimum``, ``sign``, ``remainder`` and ``take`` for NaN, are those of :mod:`.emission`; of the two zeros a ``maximum``
+may return either.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -28,25 +28,25 @@ from .program import StraightLineProgram
 from .rolling import roll_where_shorter
 
 PART = 200
-"""Statements of a function."""
+"""Most statements of a function."""
 INLINED = 8_000
-"""Operations of a program above which the compiler of CUDA keeps its functions apart: put into one, 23,000 operations
-take it more than three minutes in place of half of one, and 9,500 run a quarter slower; 2,700 run twice as fast."""
+"""Operations of a program above which CUDA's compiler must not inline its functions: inlined, 23,000 operations compile
+in more than three minutes in place of half a minute, and 9,500 run a quarter slower; 2,700 run twice as fast."""
 
 
 class ProgramSource(NamedTuple):
     """A program as text."""
 
     functions: str
-    """Tables and static functions that stand before."""
+    """Tables and static functions, to be defined before the function."""
     body: list[str]
     """Statements of the function itself."""
     operations: int
-    """Steps that compute something."""
+    """Number of computed steps."""
     scratch: int
-    """Numbers in the scratch array."""
+    """Length of the scratch array."""
     replaced: tuple[float, ...]
-    """Constants beyond the range of the kind of number, in whose place its nearest ones stand."""
+    """Constants beyond the range of the kind of number, which were replaced by the nearest ones."""
 
 
 _HELPERS = {
@@ -71,7 +71,7 @@ _HELPERS = {
 def helper_functions(
     programs: Sequence[StraightLineProgram], scalar: Scalar = DOUBLE, qualifier: str = "static "
 ) -> str:
-    """Return the functions that statements of these programs call beside those of ``math.h``."""
+    """Return the functions that statements of these programs call in addition to those of ``math.h``."""
     used = {name for program in programs for name in program.steps.operations}
     words = {
         "real": scalar.name,
@@ -83,7 +83,7 @@ def helper_functions(
 
 
 class _ProgramText:
-    """Statements of a program; values are named by the steps that they come from."""
+    """Statements of a program; values are named by their steps."""
 
     def __init__(
         self,
@@ -99,7 +99,6 @@ class _ProgramText:
         return literal(value, self.scalar)
 
     def value(self, step: int) -> str:
-        """Return an expression for a step's value where it is used."""
         operation, arguments, logical = self.steps[step]
         if operation == "input":
             return self.read(*arguments)
@@ -120,7 +119,6 @@ class _ProgramText:
         return f"const {kind} v{step} = {expression};"
 
     def expression(self, index: int) -> str:
-        """Return what computes a step."""
         operation, arguments, _ = self.steps[index]
         parts = self.steps[index].parts
         known = [self.steps[part].operation == "constant" for part in parts]
@@ -142,22 +140,22 @@ def write_program(
 ) -> ProgramSource:
     """Write a program as statements, in loops where that is shorter.
 
-    A result is written as soon as it is computed: what is written must not be what is read.
+    A result is written as soon as it is computed, so results must not overwrite inputs.
 
     Args:
-        program: to write.
-        name: of the function that the statements are for, which those before it begin with.
-        parameters: of that function; static functions are handed all of them.
-        read: from argument and row to the expression of an input.
-        write: from argument and row to where a result goes; ``""``: nowhere.
+        program: the program.
+        name: name of the function that contains the statements, and prefix of the static functions.
+        parameters: parameters of that function and of all static functions.
+        read: function from argument and row to the expression of an input.
+        write: function from argument and row to the destination of a result; ``""``: no destination.
         scalar: kind of numbers.
-        qualifier: of static functions.
-        between: statements that stand where the first results are known, before any other input is read.
-        results: how many these are.
-        arrays: where the rows of all arguments lie, for loops; default: no loops.
+        qualifier: qualifier of static functions.
+        between: statements after the first results, before any other input is read.
+        results: number of these results.
+        arrays: places of the rows of all arguments, for loops; default: no loops.
     """
     if "product" in program.steps.operations:
-        raise ValueError("a product that is a loop has no form in C: trace it with Graph(loops=False)")
+        raise ValueError("a product that is a loop cannot be written in C: trace it with Graph(loops=False)")
     starts = sorted({step.arguments[:2] for step in program.steps.named("take")})
     tables = {start: f"{name}_table_{i}" for i, (start, _) in enumerate(starts)}
     count_operations = int(numpy.count_nonzero(~program.steps.which(*FREE)))
@@ -168,7 +166,7 @@ def write_program(
     rolled = None if arrays is None else roll_where_shorter(program, results if between else 0)
     if arrays is not None and rolled is not None:
         loops = Loops(program, name, read, write, arrays, scalar, tables, qualifier)
-        blocks, before = _packed([loops.loop(loop) for loop in rolled.loops], rolled.before)
+        blocks, before = _merge_blocks([loops.loop(loop) for loop in rolled.loops], rolled.before)
         defined += loops.defined
         count, together = rolled.scratch, len(blocks) == 1
     else:
@@ -202,8 +200,8 @@ def write_program(
     return ProgramSource("\n".join(defined), body, count_operations, count, replaced)
 
 
-def _packed(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
-    """Blocks put together as long as a function is not too long, and how many of them are before a pause."""
+def _merge_blocks(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
+    """Return the blocks merged up to the length of a function, and the number of them before a pause."""
     packed: list[list[str]] = []
     before = 0
     for i, block in enumerate(blocks):
@@ -221,7 +219,6 @@ def _statements(
     write: Callable[[int, int], str],
     slots: Mapping[int, int],
 ) -> list[str]:
-    """Statements of a part."""
     lines: list[str] = []
     fetched: set[int] = set()
     steps = text.steps
@@ -249,16 +246,16 @@ def _function(name: str, parameters: Sequence[Parameter], body: Sequence[str], q
 def write_lanes(
     program: StraightLineProgram, name: str, lane_first: Sequence[bool], cuda: bool = False
 ) -> str:
-    """Write a program as a function that goes through lanes, in double; of CUDA as a kernel, a thread for each lane.
+    """Write a program as a function over lanes, in double; for CUDA as a kernel with a thread for each lane.
 
-    The function takes ``a``, the arrays one after another, ``stride``, numbers from one row of each to the next, and
-    the lanes ``first`` to ``last``; the kernel ``a``, ``stride`` and the number of lanes.
+    The function takes ``a``, the addresses of the arrays, ``stride``, the distance from row to row of each, and the
+    lanes ``first`` to ``last``; the kernel takes ``a``, ``stride`` and the number of lanes.
 
     Args:
-        program: to write.
-        name: of the function.
-        lane_first: of every argument whether it is written lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
-        cuda: as CUDA in place of C.
+        program: the program.
+        name: name of the function.
+        lane_first: for every argument whether its layout is lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
+        cuda: write CUDA instead of C.
     """
 
     def place(argument: int, row: int) -> str:

@@ -1,6 +1,6 @@
-"""Words of C99: names, numbers, comments, expressions, functions.
+"""Text of C99: names, numbers, comments, expressions, functions.
 
-No name and no sentence gets into a text but through :func:`identifier` and :func:`comment`.
+All names and sentences from outside pass through :func:`identifier` and :func:`comment`.
 """
 
 import math
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy
 
 WIDTH = 100
-"""Characters of a line of a comment."""
+"""Most characters in a line of a comment."""
 _INFIX = {
     "add": "+",
     "subtract": "-",
@@ -40,7 +40,7 @@ _RESERVED = frozenset(
         "NAN INFINITY FLT_MAX FLT_MIN DBL_MAX sign_of remainder_of place_of",
     )
 )
-"""Words that mean something to C, to its neighbours, or to the text made here."""
+"""Names reserved by C, by related languages, or by the text made here."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Scalar:
 
     name: str
     suffix: str
-    """Of its functions and literals."""
+    """Suffix of its functions and literals."""
     dtype: type
     largest: str
     """Macro of ``float.h``."""
@@ -64,16 +64,16 @@ class Parameter(NamedTuple):
     """A parameter of a function."""
 
     type: str
-    """Whatever stands before the name."""
+    """Text before the name."""
     name: str
 
 
 def identifier(words: str, taken: Collection[str] = ()) -> str:
-    """Return a name of C for some words: letters, digits and single underscores, and none that means something already.
+    """Return a name in C for a text: letters, digits and single underscores, and not a reserved name.
 
     Args:
-        words: anything.
-        taken: names that it must not be.
+        words: any text.
+        taken: names that are already in use.
     """
     plain = unicodedata.normalize("NFKD", words).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:60] or "x"
@@ -89,18 +89,18 @@ def identifier(words: str, taken: Collection[str] = ()) -> str:
 
 
 def plain_words(text: str) -> str:
-    """Return text that is safe within a comment of C: printable ASCII in one line that neither ends nor begins one."""
+    """Return a text that is safe in a comment of C: one line of printable ASCII without begin or end of a comment."""
     ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "replace").decode()
     line = " ".join("".join(c if c.isprintable() else " " for c in ascii_text).split()).replace("\\", "|")
-    # No end, no beginning, and no trigraph.
+    # No end, no begin, and no trigraph.
     return re.sub(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)", " ", line)
 
 
 def comment(*paragraphs: str, indent: str = "") -> str:
-    """Return a comment of C, a paragraph for each text; one that begins with blanks keeps them.
+    """Return a comment of C with a paragraph for each text; leading blanks of a text are preserved.
 
     Args:
-        *paragraphs: of anything.
+        *paragraphs: any texts.
         indent: blanks before every line.
     """
     lines: list[str] = []
@@ -114,12 +114,12 @@ def comment(*paragraphs: str, indent: str = "") -> str:
 
 
 def literal(value: float, scalar: Scalar = DOUBLE) -> str:
-    """Return a number as C reads it again to the last bit, of ``float`` its nearest one.
+    """Return a number as a literal of C that has the same bits; for ``float`` the nearest number.
 
-    What is beyond the range of ``float`` is the largest or the smallest normal number that it has.
+    A number beyond the range of ``float`` becomes its largest or smallest normal number.
     """
     if value != value:
-        return f"({scalar.name})NAN"  # of C they are float
+        return f"({scalar.name})NAN"  # in C they are float
     if math.isinf(value):
         return f"({'-' * (value < 0.0)}({scalar.name})INFINITY)"
     if is_beyond(value, scalar):
@@ -130,7 +130,7 @@ def literal(value: float, scalar: Scalar = DOUBLE) -> str:
 
 
 def is_beyond(value: float, scalar: Scalar) -> bool:
-    """Whether a finite number is beyond the range of normal numbers of ``float``; of ``double`` none is."""
+    """Return whether a finite number is beyond the range of normal numbers of ``float``; False for ``double``."""
     limits = numpy.finfo(scalar.dtype)
     size = abs(value)
     return scalar.dtype is not numpy.float64 and (
@@ -141,7 +141,7 @@ def is_beyond(value: float, scalar: Scalar) -> bool:
 def array_text(
     name: str, values: numpy.ndarray, scalar: Scalar = DOUBLE, qualifier: str = "static const"
 ) -> str:
-    """Return the definition of a constant array; rows of a matrix stand in lines."""
+    """Return the definition of a constant array, with a line for each row of a matrix."""
 
     def braces(part: numpy.ndarray) -> str:
         if part.ndim == 1:
@@ -161,14 +161,14 @@ def expression(
     scalar: Scalar,
     table: tuple[str, int] | None = None,
 ) -> str:
-    """Return what computes an operation.
+    """Return the expression of an operation.
 
     Args:
-        operation: of a step.
-        values: its arguments.
-        known: which of them are constants.
+        operation: operation of a step.
+        values: expressions of its arguments.
+        known: whether each argument is a constant.
         scalar: kind of numbers.
-        table: of ``take``, its name and its length.
+        table: for ``take``, name and length of its table.
     """
     if table is not None:
         return f"{table[0]}[place_of({values[0]}, {table[1]})]"
@@ -192,15 +192,15 @@ def expression(
 
 
 def _extreme(values: Sequence[str], known: Sequence[bool], sign: str) -> str:
-    """The larger or smaller of two; what is no number stays that."""
+    """Return the expression of the larger or smaller of two numbers, NaN if one of them is."""
     one, other = values if known[0] or not known[1] else values[::-1]
-    # A constant is a number: see Graph.
+    # A constant is never NaN, see Graph.
     unordered = "" if any(known) else f" || {one} != {one}"
     return f"{one} {sign} {other}{unordered} ? {one} : {other}"
 
 
 def function_text(returns: str, name: str, parameters: Sequence[Parameter], body: Sequence[str]) -> str:
-    """Return the definition of a function; parameters that it does not use are marked as such."""
+    """Return the definition of a function, with unused parameters marked."""
     listed = ", ".join(_declare(parameter) for parameter in parameters)
     words = set(re.findall(r"\w+", "\n".join(body)))
     unused = [f"(void){parameter.name};" for parameter in parameters if parameter.name not in words]

@@ -1,12 +1,12 @@
-"""Compiled code of earlier processes, kept by content in the user's cache folder.
+"""Cache of compiled code in the user's cache folder, by content.
 
-An entry is written beside its place and moved into it, begins with its own checksum, and is ignored when anything
-about it is wrong. The folder keeps below a size: what was not used for longest goes first. Whatever the operating
-system refuses, there is simply no entry.
+An entry is written to a temporary file and moved into place, begins with its own checksum, and is ignored if it is
+invalid. The size of the folder is limited: the least recently used entries are removed first. If the operating system
+refuses an access, the entry is treated as missing.
 
-An entry is executed. So it is used, as ssh uses a key, only if nobody else can have written it: folder and entry belong
-to this user or to root, and neither group nor others may write to them. What is checked is what was opened, so that
-nothing can be exchanged in between.
+An entry is executed. So it is used, like a key of ssh, only if no other user can have written it: folder and entry
+belong to this user or to root, and neither group nor others may write to them. The checks use the opened file itself,
+so that it cannot be exchanged in between.
 """
 
 import contextlib
@@ -19,29 +19,29 @@ from collections.abc import Iterator
 from pathlib import Path
 
 LIMIT = 256 * 2**20
-"""Bytes that the folder may hold."""
+"""Largest size of the folder in bytes."""
 SLACK = 2**23
-"""Bytes that a process may write before it looks again how many the folder holds, and the first time it writes."""
+"""Bytes that a process writes between two checks of the folder's size; the first check is at its first write."""
 SUFFIX = ".code"
-"""Of entries; nothing else in the folder is touched."""
+"""Suffix of entries; other files in the folder are not touched."""
 SWITCH = "FILTERGYM_COMPILER_CACHE"
 """Environment variable: a folder to use in place of the default one, or ``off``."""
 
 
 def folder() -> Path | None:
-    """Where entries lie; None if nothing is to be kept."""
+    """Return the folder of the entries; None if the cache is off."""
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off":
         return None
     if chosen:
         return Path(chosen)
-    import platformdirs  # beside llvmlite: only who compiles has it
+    import platformdirs  # installed with llvmlite only
 
     return platformdirs.user_cache_path("filtergym") / "compiled"
 
 
 def key(*texts: str) -> str:
-    """Name of what is made of some texts."""
+    """Return the name of an entry made from some texts."""
     digest = hashlib.sha256()
     for text in texts:
         digest.update(f"{len(text)}:{text}".encode())
@@ -49,7 +49,7 @@ def key(*texts: str) -> str:
 
 
 def load(name: str) -> bytes | None:
-    """Return an entry, or None."""
+    """Return an entry; None if it is missing or invalid."""
     place = folder()
     if place is None:
         return None
@@ -64,14 +64,14 @@ def load(name: str) -> bytes | None:
     return code if hashlib.sha256(code).digest() == checksum else None
 
 
-def holds(name: str) -> bool:
-    """Whether there is an entry, good or not."""
+def contains(name: str) -> bool:
+    """Return whether an entry exists, valid or not."""
     place = folder()
     return place is not None and (place / f"{name}{SUFFIX}").exists()
 
 
-def keep(name: str, code: bytes) -> None:
-    """Write an entry, if that is possible."""
+def store(name: str, code: bytes) -> None:
+    """Write an entry, if possible."""
     place = folder()
     if place is None:
         return
@@ -97,39 +97,38 @@ def keep(name: str, code: bytes) -> None:
             _UNCHECKED[place] = 0
 
 
-class _Untrusted(Exception):  # noqa: N818  (no error of a user's: why an entry is not used)
-    """Somebody else can have written what would be executed."""
+class _Untrusted(Exception):  # noqa: N818  (the reason why an entry is not used, not a user's error)
+    """A file that another user can have written."""
 
 
 _REPORTED_FOLDERS: set[Path] = set()
-"""Folders of which it was said why they are not used."""
+"""Folders with a warning that they are not used."""
 
 
 def _explain(place: Path, reason: _Untrusted) -> None:
-    """Say once why a folder, or an entry in it, is not used."""
+    """Warn once that a folder, or an entry in it, is not used, with the reason."""
     if place not in _REPORTED_FOLDERS:
         _REPORTED_FOLDERS.add(place)
         warnings.warn(
-            f"compiled code in {place} is not used, and compiled anew: {reason}, so that somebody else can have "
-            f"written what would be executed. Remove the folder, or set {SWITCH} to one that only you can write to, or "
-            "to off",
+            f"compiled code in {place} is not used, and compiled anew: {reason}, so that another user can have "
+            f"written it. Remove the folder, or set {SWITCH} to one that only you can write to, or to off",
             stacklevel=2,
         )
 
 
 def _read(place: Path, name: str) -> bytes:
-    """Read an entry that nobody else can have written; what was used is young again.
+    """Read an entry and renew its time of use.
 
     Raises:
-        _Untrusted: if somebody else can.
-        OSError: if there is none.
+        _Untrusted: if another user can have written it.
+        OSError: if it does not exist.
     """
     with (
         _open_folder(place) as within,
         _open(place / name if within is None else name, 0, within) as handle,
     ):
         if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise OSError(f"{name} is no file")
+            raise OSError(f"{name} is not a file")
         with contextlib.suppress(OSError):
             os.utime(handle if os.utime in os.supports_fd else place / name)
         with open(handle, "rb", closefd=False) as file:
@@ -138,11 +137,11 @@ def _read(place: Path, name: str) -> bytes:
 
 @contextlib.contextmanager
 def _open_folder(place: Path) -> Iterator[int | None]:
-    """Open the folder, so that entries are looked up in what was checked; None on systems without owners."""
-    if not hasattr(os, "getuid"):  # Windows: folders below a user's own are his own
+    """Open the folder, so that entries are opened in the checked folder; None on systems without owners."""
+    if not hasattr(os, "getuid"):  # Windows: a user's own folders are not writable for others
         yield None
         return
-    if place.is_symlink():  # whoever made the link chooses the folder
+    if place.is_symlink():  # the owner of the link chooses the folder
         raise _Untrusted("the folder is a symbolic link")
     with _open(place, os.O_DIRECTORY, None) as handle:
         yield handle
@@ -150,13 +149,13 @@ def _open_folder(place: Path) -> Iterator[int | None]:
 
 @contextlib.contextmanager
 def _open(path: str | Path, flags: int, within: int | None) -> Iterator[int]:
-    """Open a file or a folder, no link, that nobody else can have written.
+    """Open a file or a folder, but not a link.
 
     Raises:
-        _Untrusted: if somebody else can.
+        _Untrusted: if another user can have written it.
         OSError: if it cannot be opened.
     """
-    # Not to wait for the other end of a pipe; Windows has none of these, but text files.
+    # O_NONBLOCK: do not wait for the other end of a pipe; Windows has only O_BINARY.
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"):
         flags |= getattr(os, name, 0)
     handle = os.open(path, os.O_RDONLY | flags, dir_fd=within)
@@ -173,7 +172,7 @@ def _open(path: str | Path, flags: int, within: int | None) -> Iterator[int]:
 
 
 _UNCHECKED: dict[Path, int] = {}
-"""Bytes written into a folder since its size was looked at."""
+"""Bytes written into a folder since the last check of its size."""
 
 
 def _bound(place: Path) -> None:

@@ -1,7 +1,7 @@
-"""Random numbers by counter as code: the algorithm of :mod:`.counter_numbers` printed for LLVM.
+"""Random numbers by counter as code: the algorithm of :mod:`.counter_numbers` as text of LLVM.
 
-:class:`Value` stands for a number in the text; the functions of :mod:`.counter_numbers` run on such values as they run
-on arrays, and leave their text behind. :func:`bind_numbers` gives compiled code.
+A :class:`Value` represents a number in the text. The functions of :mod:`.counter_numbers` run on such values as on
+arrays, and write their text. :func:`bind_numbers` returns compiled code.
 """
 
 import functools
@@ -22,9 +22,9 @@ class Value:
     """A number in the text: a whole number of 64 bits (``whole``), or a float64.
 
     Args:
-        text: where its operations are written.
-        name: by which the text calls it.
-        whole: which of the two it is.
+        text: text to which its operations are written.
+        name: name in the text.
+        whole: whether it is a whole number.
     """
 
     def __init__(self, text: "_VectorText", name: str, whole: bool) -> None:
@@ -68,8 +68,8 @@ class _VectorText:
     """Vector code for a block of lanes, and the :class:`~.counter_numbers.Machine` of its values.
 
     Args:
-        prefix: of the names that are given here.
-        block: the lanes.
+        prefix: prefix of new names.
+        block: block of lanes.
     """
 
     def __init__(self, prefix: str, block: LaneBlock) -> None:
@@ -78,12 +78,10 @@ class _VectorText:
         self.block = block
 
     def name(self) -> str:
-        """Name that is not taken."""
         self._count += 1
         return f"{self._prefix}{self._count}"
 
     def word(self, name: str) -> Value:
-        """A whole number that the text knows by this name."""
         return Value(self, name, True)
 
     def new(self, expression: str) -> str:
@@ -92,13 +90,12 @@ class _VectorText:
         return name
 
     def constant(self, value: int | float) -> str:
-        """Text of a constant."""
         if isinstance(value, int):
             return self.block.constant(str(value), "i64")
         return self.block.constant(f"0x{numpy.float64(value).view('u8'):016X}")
 
     def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
-        """Write an operation; returns the name of its result."""
+        """Write an operation and return the name of its result."""
         if whole:
             return self.new(f"{_LLVM[operator]} {self.block.words} {one}, {other}")
         return self.new(f"f{_LLVM.get(operator, 'div')} {self.block.numbers} {one}, {other}")
@@ -135,7 +132,7 @@ Make = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
-    """Write how two numbers are made of key, episode, measurement and pair; returns their names."""
+    """Write the code of two numbers from key, episode, measurement and pair; return their names."""
     one, other = make(text, *pair_of_bits(*(text.word(name) for name in names)))
     return one.name, other.name
 
@@ -143,7 +140,7 @@ def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str])
 def _loop(
     block: LaneBlock, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
 ) -> list[str]:
-    """Loop over the pairs of a kind, entered from the block ``before``; it leaves to ``done_KIND``."""
+    """Return the loop over the pairs of a kind, from the block ``before`` to the block ``done_KIND``."""
     text = _VectorText(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [
@@ -161,7 +158,7 @@ def _loop(
         f"%at_{kind} = add i64 %start_{kind}, %lane",
         f"%to_{kind} = getelementptr double, ptr %rows, i64 %at_{kind}",
         f"store {block.numbers} {one}, ptr %to_{kind}, align 8",
-        # The second number of the last pair may be one too many.
+        # The second number of the last pair may be unused.
         f"%beyond_{kind} = getelementptr double, ptr %to_{kind}, i64 %stride",
         f"%second_{kind} = add i64 %place_{kind}, 1",
         f"%both_{kind} = icmp slt i64 %second_{kind}, {count}",
@@ -176,10 +173,10 @@ def _loop(
 
 @functools.cache
 def llvm_text(block: LaneBlock) -> str:
-    """Text whose ``@program(table, first, last)`` goes on to the next measurement in some lanes and makes its numbers.
+    """Return the text of ``@program(table, first, last)``, which makes the numbers of the next measurement of lanes.
 
-    The table holds nothing, then address and stride of identities, of measurements and of the rows, then how many of
-    these are normal and how many uniform.
+    The table contains an unused entry, then address and stride of identities, of measurements and of the rows, then the
+    number of normal rows and that of uniform rows.
 
     Args:
         block: lanes that are computed at a time.
@@ -214,7 +211,7 @@ def llvm_text(block: LaneBlock) -> str:
         f"%before = load {block.words}, ptr %at_t, align 8",
         f"%following = add {block.words} %before, {block.constant('1', 'i64')}",
         f"store {block.words} %following, ptr %at_t, align 8",
-        # The counter's word: code for products of 32 bits may be used where it is known to be one.
+        # A word of 32 bits, so that LLVM may use the code for products of 32 bits.
         f"%t = and {block.words} %following, {block.constant(str(0xFFFFFFFF), 'i64')}",
         *_loop(block, "normal", normal_pair, "0", "%normals", 0, "body"),
         *_loop(block, "uniform", uniform_pair, "%normals", "%uniforms", UNIFORM_PAIRS, "done_normal"),
@@ -228,17 +225,17 @@ def llvm_text(block: LaneBlock) -> str:
 
 
 def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarray, normals: int) -> Call:
-    """Return what goes on to the next measurement and makes its numbers, in compiled code.
+    """Return a compiled call that advances to the next measurement and makes its numbers.
 
-    Every run adds one to ``t`` and then writes what :func:`~.counter_numbers.numbers` gives there, the same bits. So an
-    episode begins with ``t = -1``: the first run makes the numbers of its start, the next those of its first
+    Every run adds one to ``t`` and then writes the numbers of :func:`~.counter_numbers.numbers` with the same bits. So
+    an episode begins with ``t = -1``: the first run makes the numbers of its start, the next those of its first
     measurement.
 
     Args:
-        identities: of the episodes, ``(2, width)`` uint64.
-        t: measurement that was last made, ``(width,)`` int64.
-        rows: written, ``(numbers, width)``; the caller may :meth:`~.functions.Call.replace` it as array 2.
-        normals: how many of its first rows are normal numbers; the others are uniform.
+        identities: identities of the episodes, ``(2, width)`` uint64.
+        t: last measurement, ``(width,)`` int64.
+        rows: output, ``(numbers, width)``; the caller may :meth:`~.functions.Call.replace` it as array 2.
+        normals: number of first rows with normal numbers; the others are uniform.
 
     Raises:
         ImportError: without llvmlite.

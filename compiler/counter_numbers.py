@@ -1,7 +1,7 @@
 """Random numbers by counter: every number is a function of its name, and the same bits on every machine.
 
-**Names.** Episode ``(key, episode)``, two whole numbers of 64 bits; measurement ``t``; pair ``p``. Nothing has to be
-drawn before, so numbers may be made in any order, anywhere, and twice.
+**Names.** Episode ``(key, episode)``, two whole numbers of 64 bits; measurement ``t``; pair ``p``. No number depends on
+earlier draws, so numbers may be made in any order, anywhere, and repeatedly.
 
 **Bits.** Philox4x32-10 makes four words of 32 bits of the counter ``(p, t, episode low, episode high)`` under the key
 ``(key low, key high)``. Ten times, with ``M`` and ``W`` of the paper::
@@ -10,14 +10,14 @@ drawn before, so numbers may be made in any order, anywhere, and twice.
     (k0, k1) <- (k0 + W0, k1 + W1)
 
 Two words make a number of 64 bits, ``first`` and ``second``. Pairs of normal numbers are counted from 0, pairs of
-uniform ones from 2^31: how many there are of one kind changes nothing of the other.
+uniform ones from 2^31, so that the count of one kind does not affect the other.
 
 **Uniform.** The upper 52 bits n of 64 give ``(n + 1/2) / 2^52``, exactly: between 2^-53 and 1 - 2^-53, symmetrical, and
 never 0 or 1.
 
 **Normal** (Box and Muller). With ``r = sqrt(-2 log u)``, u of ``first``, and an angle of ``second``: its upper 52 bits
 give the angle ``pi/2 x`` between -45 and 45 degrees, ``x = u - 1/2``, bit 1 reflects it about the diagonal, and bit 0
-adds half a circle. The largest normal number is ``sqrt(106 log 2) = 8.57``; of 10^16 numbers not one lies further out.
+adds half a circle. The largest normal number is ``sqrt(106 log 2) = 8.57``; of 10^16 numbers none is larger.
 
 **The same bits everywhere.** Only ``+ - * / sqrt`` of float64, which every processor rounds alike, and operations on
 bits; nothing fused, no function of a library. The functions are written out::
@@ -27,11 +27,11 @@ bits; nothing fused, no function of a library. The functions are written out::
     sin(pi/2 x) = x S(x^2),   cos(pi/2 x) = C(x^2),   x^2 <= 1/4
 
 Each of P, S and C has seven coefficients. It interpolates its function in the seven Chebyshev nodes of its interval,
-where the error is within a small factor of the least possible one, and the coefficients are rounded to float64. What is
-left is below what the operations round: 2^-51.5 of P, of which 0.015 at most counts in the logarithm; 2^-53.9
-of S; 2^-53.1 of C. A test derives the coefficients again.
+where the error is within a small factor of the least possible one, and the coefficients are rounded to float64. The
+remaining error is below the rounding of the operations: 2^-51.5 of P, of which 0.015 at most counts in the logarithm;
+2^-53.9 of S; 2^-53.1 of C. A test derives the coefficients again.
 
-The algorithm is written once, for operands that know ``+ - * / & | ^ << >>``: arrays of NumPy here, text of LLVM in
+The algorithm is written once, for operands with ``+ - * / & | ^ << >>``: arrays of NumPy here, text of LLVM in
 :mod:`.counter_code`.
 
 Sources: J. K. Salmon, M. A. Moraes, R. O. Dror, D. E. Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC'11
@@ -57,7 +57,7 @@ ROOT_HALF = 0x3FE6A09E667F3BCD
 FRACTION = 0x000FFFFFFFFFFFFF
 """Bits of a float64 below its exponent."""
 RAISED = 1024
-"""Added to exponents, that they are not negative."""
+"""Offset that makes exponents nonnegative."""
 POWER_52 = 0x4330000000000000
 """Bits of 2^52, whose unit in the last place is 1."""
 LOG_2 = float.fromhex("0x1.62e42fefa39efp-1")
@@ -106,23 +106,23 @@ C = tuple(
 
 
 class Machine(Protocol):
-    """What the operands' own operators do not say."""
+    """Operations beyond the operands' own operators."""
 
     def bits(self, number: Any) -> Any:
-        """Bits of a float64 as a whole number."""
+        """Return the bits of a float64 as a whole number."""
 
     def number(self, bits: Any) -> Any:
-        """The float64 of these bits."""
+        """Return the float64 with these bits."""
 
     def sqrt(self, number: Any) -> Any:
-        """Square root."""
+        """Return the square root."""
 
     def choose(self, condition: Any, one: Any, other: Any) -> Any:
-        """One number where a whole number is not zero, else the other."""
+        """Return one number where a whole number is not zero, else the other."""
 
 
 def philox(counter: tuple[Any, Any, Any, Any], key: tuple[Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """Four words of Philox4x32-10; words are whole numbers of 64 bits below 2^32."""
+    """Return four words of Philox4x32-10; words are whole numbers of 64 bits below 2^32."""
     (c0, c1, c2, c3), (k0, k1) = counter, key
     for number in range(ROUNDS):
         if number > 0:
@@ -133,18 +133,18 @@ def philox(counter: tuple[Any, Any, Any, Any], key: tuple[Any, Any]) -> tuple[An
 
 
 def pair_of_bits(key: Any, episode: Any, t: Any, pair: Any) -> tuple[Any, Any]:
-    """Two numbers of 64 bits of an episode, a measurement and a pair."""
+    """Return the two numbers of 64 bits of an episode, a measurement and a pair."""
     c0, c1, c2, c3 = philox((pair, t, episode & LOW, episode >> 32), (key & LOW, key >> 32))
     return (c0 << 32) | c1, (c2 << 32) | c3
 
 
 def uniform(machine: Machine, bits: Any) -> Any:
-    """Uniform number of the upper 52 of 64 bits."""
+    """Return the uniform number of the upper 52 of 64 bits."""
     return machine.number((bits >> 12) | ONE) - (1.0 - 2.0**-53)
 
 
 def polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
-    """Sum of ``coefficients[i] x^i``, by Horner's rule."""
+    """Return the sum of ``coefficients[i] x^i``, by Horner's rule."""
     total = x * coefficients[-1] + coefficients[-2]
     for coefficient in coefficients[-3::-1]:
         total = total * x + coefficient
@@ -152,7 +152,7 @@ def polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
 
 
 def logarithm(machine: Machine, u: Any) -> Any:
-    """Natural logarithm of numbers from 2^-1000 to 2^1000."""
+    """Return the natural logarithm of numbers from 2^-1000 to 2^1000."""
     bits = machine.bits(u) + ((RAISED << 52) - ROOT_HALF)
     m = machine.number((bits & FRACTION) + ROOT_HALF)
     e = machine.number((bits >> 52) | POWER_52) - (2.0**52 + RAISED)
@@ -162,7 +162,7 @@ def logarithm(machine: Machine, u: Any) -> Any:
 
 
 def normal_pair(machine: Machine, first: Any, second: Any) -> tuple[Any, Any]:
-    """Two normal numbers of two numbers of 64 bits."""
+    """Return two normal numbers from two numbers of 64 bits."""
     r = machine.sqrt(logarithm(machine, uniform(machine, first)) * -2.0)
     x = uniform(machine, second) - 0.5
     y = x * x
@@ -173,7 +173,7 @@ def normal_pair(machine: Machine, first: Any, second: Any) -> tuple[Any, Any]:
 
 
 def uniform_pair(machine: Machine, first: Any, second: Any) -> tuple[Any, Any]:
-    """Two uniform numbers of two numbers of 64 bits."""
+    """Return two uniform numbers from two numbers of 64 bits."""
     return uniform(machine, first), uniform(machine, second)
 
 
@@ -197,13 +197,14 @@ ARRAYS = _Arrays()
 
 
 def numbers(identities: numpy.ndarray, t: numpy.ndarray, normals: int, uniforms: int) -> numpy.ndarray:
-    """Random numbers of episodes at measurements: ``normals`` standard normal ones, then ``uniforms`` uniform ones.
+    """Return the random numbers of episodes at measurements: ``normals`` standard normal ones, then ``uniforms``
+    uniform ones.
 
     Args:
-        identities: of the episodes, ``(2, N)`` uint64.
+        identities: identities of the episodes, ``(2, N)`` uint64.
         t: measurements, ``(..., N)`` integers from 0 to 2^32 - 1.
-        normals: how many.
-        uniforms: how many.
+        normals: number of normal numbers.
+        uniforms: number of uniform numbers.
 
     Returns:
         ``(..., normals + uniforms, N)``.

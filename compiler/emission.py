@@ -1,9 +1,9 @@
 """A program as text of LLVM: vector code for blocks of lanes.
 
-The entry ``@program(table, first, last)`` goes through the blocks between two lanes and calls for each one
-``@part0``, ``@part1``, ...: a long straight line is cut into parts, because the time that LLVM takes grows faster
-than the length of a function. What crosses a cut lies in a scratch array on the stack. ``table`` holds the address
-of the constants, then two integers for each argument, address and stride. Of a program in loops every loop is a part
+The entry ``@program(table, first, last)`` iterates over the blocks between two lanes and calls ``@part0``, ``@part1``,
+... for each block. A long straight line is cut into parts, because LLVM's time grows faster than the length of a
+function. Values that cross a cut are stored in a scratch array on the stack. ``table`` contains the address of the
+constants, then two integers for each argument, address and stride. In a program with loops every loop is a part
 (:mod:`.loop_emission`).
 """
 
@@ -20,22 +20,22 @@ from .program import BAND, FUNCTIONS, OPERATIONS, StraightLineProgram
 from .rolling import roll_where_shorter
 
 LONG = 5000
-"""Steps from which on loops take LLVM half the time of a straight line; shorter programs take it as long either way."""
+"""Steps from which on loops take LLVM half the time of a straight line; for shorter programs the times are equal."""
 
 
 class _Places(NamedTuple):
-    """What lies where in the scratch array."""
+    """Places in the scratch array."""
 
     slots: dict[int, int]
-    """Of steps that cross a cut."""
+    """Places of steps that cross a cut."""
     products: dict[int, int]
-    """Of what comes out of products."""
+    """Places of the results of products."""
     vector: int
-    """Of the vector that is multiplied."""
+    """Place of the vector of a product."""
 
 
 class _Part(Instructions):
-    """Text of one part; values are named by the steps that they come from."""
+    """Text of one part; values are named by their steps."""
 
     def __init__(
         self, program: StraightLineProgram, lane_first: Sequence[bool], places: "_Places", block: LaneBlock
@@ -45,7 +45,7 @@ class _Part(Instructions):
         self.known: set[int] = set()
 
     def value(self, step: int) -> str:
-        """Name of a step's value; what is free, or lies in the scratch array, is fetched where it is first needed."""
+        """Return the name of a step's value; free steps, and values in the scratch array, are read at first use."""
         operation, arguments, logical = self.steps[step]
         name = f"%v{step}"
         if step not in self.known:
@@ -68,7 +68,6 @@ class _Part(Instructions):
         return name
 
     def step(self, index: int) -> None:
-        """Compute a step."""
         step = self.steps[index]
         self.known.add(index)
         if step.operation == "product":
@@ -82,7 +81,7 @@ class _Part(Instructions):
         self.operate(step.operation, values, step.logical, known, f"%v{index}")
 
     def _product(self, index: int) -> None:
-        """Put the vector where the loop reads it, and let the loop write what comes out."""
+        """Store the vector in the scratch array, and call the loop that writes the product."""
         table, rows, *vector = self.steps[index].arguments
         for place, step in enumerate(vector):
             value = self.value(step)
@@ -96,16 +95,13 @@ class _Part(Instructions):
         )
 
     def store(self, argument: int, row: int, step: int) -> None:
-        """Write a result."""
         value = self.value(step)
         self.write(argument, row, self.as_number(value) if self.steps[step].logical else value)
 
     def scratch(self, place: int) -> str:
-        """Address of a place in the scratch array."""
         return self.new(f"getelementptr i8, ptr %scratch, i64 {place * self.block.alignment}")
 
-    def hand_on(self, step: int) -> None:
-        """Put a value into the scratch array."""
+    def store_scratch(self, step: int) -> None:
         kind = self.truths if self.steps[step].logical else self.numbers
         address = self.scratch(self.places.slots[step])
         self.lines.append(f"store {kind} {self.value(step)}, ptr {address}")
@@ -119,14 +115,14 @@ def emit(
     part: int,
     loops: bool = False,
 ) -> str:
-    """Text of a program.
+    """Return the text of a program.
 
     Args:
-        program: to emit.
-        lane_first: of every argument whether it is written lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
-        library: where functions come from; none takes more lanes than the block has.
+        program: the program.
+        lane_first: for every argument whether its layout is lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
+        library: library of the functions; no function takes more lanes than the block has.
         block: lanes that are computed at a time.
-        part: statements of a part: steps that are computed, results that are written.
+        part: statements of a part: computed steps and stored results.
         loops: whether a long program is computed in loops where they are shorter.
 
     Raises:
@@ -150,7 +146,7 @@ def emit(
 def _parts(
     program: StraightLineProgram, lane_first: Sequence[bool], block: LaneBlock, size: int
 ) -> tuple[list[list[str]], int]:
-    """Functions of a straight line, and the places of the scratch array that they use."""
+    """Return the functions of a straight line, and the length of their scratch array."""
     parts, _ = cut_parts(program, size)
     slots = scratch_slots(program, parts)
     places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
@@ -164,7 +160,7 @@ def _parts(
                 continue
             own.step(statement)
             if statement in slots:
-                own.hand_on(statement)
+                own.store_scratch(statement)
         functions.append([f"define internal void @part{number}({HEADER}) {{", *own.lines, "ret void", "}"])
     return functions, places.vector + max(vectors, default=0)
 
@@ -189,16 +185,16 @@ def _entry(block: LaneBlock, parts: int, slots: int) -> Iterator[str]:
 
 
 def product_symbol(block: LaneBlock) -> str:
-    """Name of the function that programs call for the product of a matrix."""
+    """Return the name of the function that programs call for the product of a matrix."""
     return f"filtergym_product_{block.lanes}"
 
 
 @functools.cache
 def product_text(block: LaneBlock) -> str:
-    """Text whose ``@program(matrix, vector, result, columns, bands)`` is the product of a matrix of constants with a
-    vector of lane values: bands of rows side by side, each row's terms added one after the other.
+    """Return the text of ``@program(matrix, vector, result, columns, bands)``, a product of a matrix and a vector.
 
-    It is code of its own, and always optimised: programs spend their time in it.
+    The matrix contains constants, the vector lane values. The rows of a band are computed in parallel; each row's terms
+    are added in order. The code is separate and always optimised, as programs spend most of their time in it.
 
     Args:
         block: lanes of the vector.
@@ -249,7 +245,7 @@ def _product_lines(block: LaneBlock) -> Iterator[str]:
 
 
 def _declarations(program: StraightLineProgram, library: Library, block: LaneBlock) -> Iterator[str]:
-    """Intrinsics, and functions of a block made of the library's."""
+    """Yield the declarations of intrinsics, and the functions of a block made from those of the library."""
     used = program.steps.operations
     if "product" in used:
         yield f"declare void @{product_symbol(block)}(ptr, ptr, ptr, i64, i64)"
@@ -261,11 +257,11 @@ def _declarations(program: StraightLineProgram, library: Library, block: LaneBlo
     for name in sorted(used & FUNCTIONS.keys() - OPERATIONS.keys()):
         if name not in library.functions:
             raise KeyError(f"{library.name} has no function {name}")
-        yield from _of_block(block, name, *library.functions[name][:2])
+        yield from _block_function(block, name, *library.functions[name][:2])
 
 
-def _of_block(block: LaneBlock, name: str, symbol: str, lanes: int) -> Iterator[str]:
-    """A function of a block, made of one of the library's that takes so many lanes."""
+def _block_function(block: LaneBlock, name: str, symbol: str, lanes: int) -> Iterator[str]:
+    """Yield the function of a block made from one of the library, which takes ``lanes`` lanes."""
     width, numbers = block.lanes, block.numbers
     kind = "double" if lanes == 1 else f"<{lanes} x double>"
     operands = ("%a", "%b") if name in BINARY else ("%a",)

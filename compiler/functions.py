@@ -18,27 +18,27 @@ from .program import Graph, ProgramResult, StraightLineProgram, program
 
 DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
 UNCOUNTED = 65_536
-"""Lanes that a call may run over before it asks for better code: each time would take a tenth of a short step."""
+"""Lanes between two checks for optimised code; a check at every call would take a tenth of a short step."""
 FEWEST = 512
-"""Lanes that are worth a thread."""
+"""Fewest lanes per thread."""
 
 
 class Leaf(NamedTuple):
-    """Array in a structure."""
+    """Shape and type of an array in a structure."""
 
     shape: tuple[int, ...]
-    """Without its last axis, the lanes."""
+    """Shape without the last axis, the lanes."""
     kind: str
-    """Its dtype's kind: ``f``, ``i`` or ``b``."""
+    """Kind of the dtype: ``f``, ``i`` or ``b``."""
 
     @property
     def rows(self) -> int:
-        """Numbers of one lane."""
+        """Number of entries of one lane."""
         return math.prod(self.shape)
 
 
 def leaves(part: Any) -> list[Any]:
-    """Arrays of nested tuples and dictionaries, in order; None holds none."""
+    """Return the arrays of nested tuples and dictionaries, in order; None contains no array."""
     if part is None:
         return []
     if isinstance(part, dict):
@@ -49,7 +49,7 @@ def leaves(part: Any) -> list[Any]:
 
 
 def map_arrays(function: Callable[[Any], Any], part: Any) -> Any:
-    """Nested tuples and dictionaries with a function applied to every array."""
+    """Return the nested tuples and dictionaries with a function applied to every array."""
     if part is None:
         return None
     if isinstance(part, dict):
@@ -68,25 +68,25 @@ def _leaf(array: Any) -> Leaf:
 
 
 class Specialised:
-    """A function for arguments of one structure.
+    """A function traced for arguments of one structure.
 
     Args:
-        function: of nested tuples of arrays.
-        graph: where the constants that the function refers to were made.
-        parts: arguments, or others like them.
-        turned: write the last array of the answer lane by lane, ``(N, rows)``.
+        function: function of nested tuples of arrays.
+        graph: graph of the constants that the function refers to.
+        parts: arguments, or others of the same structure.
+        turned: write the last array of the result lane by lane, ``(N, rows)``.
         given_turned: read the first argument lane by lane, ``(N, rows)``.
-        unchanged: an input that is handed on as it is stands for the output: any input for any output (None), or only
-            for the output of the same number among so many first ones.
+        unchanged: outputs that may be replaced by an unchanged input: all of them (None), or those with a number below
+            this one, by the input of the same number.
 
     Attributes:
-        inputs: arrays that it reads.
-        outputs: arrays of its answer.
-        same: for each output the input that stands for it, or None.
-        template: nested tuples of the answer, with the numbers of ``outputs`` in place of arrays.
+        inputs: arrays of the arguments.
+        outputs: arrays of the result.
+        same: for each output the number of the input that replaces it, or None.
+        template: nested tuples of the result, with the numbers of ``outputs`` in place of arrays.
 
     Raises:
-        NotTraceable: if the function is no straight line of arithmetic.
+        NotTraceable: if the function is not a straight line of arithmetic.
     """
 
     def __init__(
@@ -104,8 +104,8 @@ class Specialised:
             traced = [map_arrays(lambda _: _input(graph, next(places), self.inputs), part) for part in parts]
             answer = function(*traced)
             made = [namespace.asarray(array) for array in leaves(answer)]
-        if any(array.shape[-1:] not in ((), (1,)) for array in made):  # more than the code has memory for
-            raise namespace.NotTraceable("an array of the answer does not have the lanes as its last axis")
+        if any(array.shape[-1:] not in ((), (1,)) for array in made):  # larger than the memory of the code
+            raise namespace.NotTraceable("an array of the result does not have the lanes as its last axis")
         count = iter(range(len(made)))
         self.template: Any = map_arrays(lambda _: next(count), answer)
         self.outputs: list[Leaf] = [_leaf(array) for array in made]
@@ -138,7 +138,7 @@ class Specialised:
         return self.code
 
     def bound(self, inputs: Sequence[numpy.ndarray], outputs: Sequence[numpy.ndarray]) -> "Call":
-        """Return what runs the function on arrays ``(rows, N)``, or ``(..., N)``, from now on always the same."""
+        """Return a call of the function on fixed arrays, ``(rows, N)`` or ``(..., N)``."""
         arrays = [*inputs, *outputs]
         table = [address_of(self.program.constants)]
         for array, lane_first in zip(arrays, self.lane_first, strict=True):
@@ -146,7 +146,7 @@ class Specialised:
         return Call(self.compile(), numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
 
     def call(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
-        """Run on inputs of some width; returns new outputs, None where an input stands for one."""
+        """Run on inputs of some width; return new outputs, None where an input replaces one."""
         table = [address_of(self.program.constants)]
         for array in arrays:
             table += [address_of(array), _stride(array)]
@@ -172,7 +172,7 @@ class Specialised:
         return outputs
 
     def example(self) -> Any:
-        """Answer made of arrays that hold nothing in particular, for whoever traces what comes after."""
+        """Return a result of arrays of zeros, for tracing a function of it."""
         return map_arrays(
             lambda place: numpy.zeros(
                 (*self.outputs[place].shape, LANES), dtype=DTYPES[self.outputs[place].kind]
@@ -185,13 +185,13 @@ class Call:
     """A function bound to its arrays.
 
     Args:
-        code: of the function.
+        code: code of the function.
         table: addresses and strides; entry ``1 + 2 i`` is the address of array i.
         arrays: inputs, then outputs.
-        constants: that the table begins with.
+        constants: constants whose address is entry 0 of the table.
 
     Attributes:
-        native: the code of now, see :meth:`expect`; None: it has not been made.
+        native: the current code, see :meth:`expect`; None: not made yet.
     """
 
     def __init__(
@@ -205,12 +205,12 @@ class Call:
         self.address: int = address_of(table)
 
     def expect(self, lanes: int, in_sequence: bool = False) -> Native:
-        """Return the code for running over so many lanes in all, see :meth:`.native.Code.expect`."""
+        """Return the code for a run over some lanes in all, see :meth:`.native.Code.expect`."""
         self.native = self._code.expect(lanes, in_sequence)
         return self.native
 
     def replace(self, place: int, array: numpy.ndarray) -> None:
-        """Read or write another array of the same shape from now on."""
+        """Replace an array by another one of the same shape."""
         self.arrays[place] = array
         self.table[1 + 2 * place : 3 + 2 * place] = address_of(array), _stride(array)
 
@@ -219,7 +219,7 @@ class Call:
         return Call(self._code, self.table.copy(), list(self.arrays), self._constants)
 
     def __call__(self, first: int, last: int) -> None:
-        """Run from one lane to another."""
+        """Run over the lanes from ``first`` to before ``last``."""
         self._uncounted += last - first
         native = self.native
         if native is None or self._uncounted > UNCOUNTED:
@@ -231,14 +231,14 @@ class Call:
 def run_over(
     call: Callable[[int, int], None], width: int, threads: int, fewest: int = FEWEST, grain: int = LANES
 ) -> None:
-    """Run over all lanes, shared by some threads; the numbers do not depend on how many.
+    """Run over all lanes with some threads; the results do not depend on their number.
 
     Args:
-        call: runs from one lane to another.
-        width: lanes.
-        threads: how many share them, this one among them.
-        fewest: lanes that are worth a thread.
-        grain: lanes that one thread has together.
+        call: function of the first lane and the end of the lanes.
+        width: number of lanes.
+        threads: number of threads, including this one.
+        fewest: fewest lanes per thread.
+        grain: lanes that are not divided between threads.
     """
     threads = min(threads, width // fewest)
     if threads <= 1:
@@ -254,18 +254,18 @@ def run_over(
 
 @functools.cache
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Threads of this process; a forked one has its own."""
+    """Return the threads of a process; a forked process has its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix="lanes")
 
 
 def round_up_lanes(count: int) -> int:
-    """Lanes that so many take: the next multiple of ``LANES``."""
+    """Return the next multiple of ``LANES``."""
     return -(-count // LANES) * LANES
 
 
 def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
-    """Memory for ``(*shape, width)`` float64 numbers whose rows begin on cache lines."""
-    # An odd number of cache lines: rows a power of two apart would share the same few places of the cache.
+    """Return an uninitialised float64 array ``(*shape, width)`` whose rows begin on cache lines."""
+    # An odd number of cache lines, as rows a power of two apart would share few sets of the cache.
     stride = width + (LANES if width // LANES % 2 == 0 else 0)
     memory = numpy.empty(math.prod(shape) * stride + LANES)
     start = -address_of(memory) // memory.itemsize % LANES
@@ -273,12 +273,12 @@ def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
 
 
 def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
-    """Memory for the arrays that a program reads or writes."""
+    """Return uninitialised arrays for a program's inputs or outputs."""
     return [empty_lanes(leaf.shape, width) for leaf in arrays]
 
 
 def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
-    """Copies of arrays in their own types, in the places of a template of their numbers."""
+    """Return copies of arrays in their own types, in the structure of a template of their numbers."""
 
     def copied(i: int) -> numpy.ndarray:
         return memory[i].astype(DTYPES[kinds[i]], order="C")
@@ -296,16 +296,16 @@ def _input(graph: Graph, argument: int, inputs: Sequence[Leaf]) -> Any:
 
 
 class CompiledFunction:
-    """A function that is traced and compiled for every structure of arguments that it meets.
+    """A function that is traced and compiled for every structure of its arguments.
 
     Args:
-        function: of nested tuples of arrays ``(..., N)``; it returns the same.
-        graph: where the constants that the function refers to were made.
-        turned: as :class:`Specialised` has it.
-        unchanged: likewise.
+        function: function of nested tuples of arrays ``(..., N)``, which returns such tuples.
+        graph: graph of the constants that the function refers to.
+        turned: write the last array of the result lane by lane, ``(N, rows)``.
+        unchanged: outputs that may be replaced by an unchanged input, see :class:`Specialised`.
 
     Raises:
-        NotTraceable: when it is called, if it is no straight line of arithmetic.
+        NotTraceable: at a call, if the function is not a straight line of arithmetic.
     """
 
     def __init__(
@@ -327,17 +327,19 @@ class CompiledFunction:
         return self._specialised[key]
 
     def __call__(self, *parts: Any, threads: int = 1) -> Any:
-        """Run on arrays of one width; the answer is made of new arrays, or of the given ones where unchanged.
+        """Run on arrays of one width; return new arrays, or the given ones where unchanged.
 
         Args:
             *parts: nested tuples of arrays ``(..., N)``.
-            threads: how many share the lanes.
+            threads: number of threads.
         """
         given = [array for part in parts for array in leaves(part)]
         special = self.specialise(*parts)
         count = max(array.shape[-1] for array in given)
         if any(array.shape[-1] not in (1, count) for array in given):
-            raise ValueError(f"arrays have one width, got {sorted({array.shape[-1] for array in given})}")
+            raise ValueError(
+                f"arrays must have one width, got {sorted({array.shape[-1] for array in given})}"
+            )
         width = round_up_lanes(count)
         outputs = special.call([_ready(array, width) for array in given], width, threads)
         answer: list[Any] = []
@@ -351,7 +353,7 @@ class CompiledFunction:
 
 
 def _structure(part: Any) -> Any:
-    """What two arguments share that one program serves."""
+    """Return the structure of an argument; arguments with equal structure share one program."""
     if isinstance(part, tuple):
         return type(part), *(_structure(item) for item in part)
     if isinstance(part, dict):
@@ -360,7 +362,7 @@ def _structure(part: Any) -> Any:
 
 
 def _ready(array: Any, width: int) -> numpy.ndarray:
-    """Array as the code reads it: float64, rows one after the other, a multiple of eight lanes."""
+    """Return the array in the layout of the code: float64, contiguous rows, a multiple of eight lanes."""
     if array.__class__ is not numpy.ndarray or array.dtype != numpy.float64:
         array = numpy.asarray(array, dtype=numpy.float64)
     if array.shape[-1] != width:
@@ -376,17 +378,17 @@ def _ready(array: Any, width: int) -> numpy.ndarray:
 
 
 def address_of(array: numpy.ndarray) -> int:
-    """Address of an array's first number."""
+    """Return the address of an array's data."""
     return int(array.__array_interface__["data"][0])
 
 
 def _stride(array: numpy.ndarray) -> int:
-    """Numbers from one row to the next."""
+    """Return the distance from one row to the next, in numbers."""
     # An axis of one row may have any stride.
     apart = [stride for length, stride in zip(array.shape[:-1], array.strides, strict=False) if length > 1]
     return apart[-1] // array.itemsize if apart else 0
 
 
 def _lane_stride(array: numpy.ndarray) -> int:
-    """Numbers from one lane to the next of what is written lane by lane."""
+    """Return the distance from one lane to the next in a layout lane by lane, in numbers."""
     return array.strides[0] // array.itemsize

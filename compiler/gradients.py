@@ -1,7 +1,7 @@
 """Gradients of expressions, by reverse mode.
 
-Where a derivative is not unique it is torch's: half to each of two equal numbers of which the larger is chosen, all
-of it to a number that lies exactly on a constant limit, none to a place in a table.
+Where a derivative is not unique it is that of torch: the maximum of two equal numbers gives half to each, a number
+exactly on a constant limit receives all of it, an index of a table none.
 """
 
 import math
@@ -13,7 +13,7 @@ from .namespace import Traced
 from .program import LOGICAL, Graph
 
 FLAT = frozenset((*LOGICAL, "sign", "floor", "ceil", "trunc", "rint", "number", "take", "input", "constant"))
-"""Operations through which nothing flows back."""
+"""Operations without a gradient."""
 
 
 def _of_the_larger(a: Any, one: Any, other: Any) -> tuple[Any, Any]:
@@ -68,22 +68,22 @@ RULES: dict[str, Callable[..., tuple[Any, ...]]] = {
     "acosh": lambda a, y, x: (a / xp.sqrt(x * x - 1.0),),
     "atanh": lambda a, y, x: (a / (1.0 - x * x),),
 }
-"""What flows back to the arguments of ``y``, when ``a`` flows back to it; None where nothing does."""
+"""Adjoints of the arguments of ``y`` from its adjoint ``a``; None: no gradient."""
 
 
 def pullback(
     graph: Graph, outputs: Sequence[Traced], adjoints: Sequence[Traced], inputs: Sequence[Traced]
 ) -> list[Traced]:
-    """Gradients of ``sum(adjoint * output)`` with respect to some arrays; the graph must be open.
+    """Return the gradients of ``sum(adjoint * output)`` with respect to some arrays; the graph must be open.
 
     Args:
-        graph: that the arrays belong to.
+        graph: graph of the arrays.
         outputs: functions of the inputs.
         adjoints: one for each output, of its shape.
-        inputs: of any shapes.
+        inputs: arrays of any shapes.
 
     Returns:
-        For each input an array of its shape, float64.
+        For each input its gradient, an array of its shape, float64.
     """
     flowing: dict[int, Any] = {}
     roots: list[int] = []

@@ -1,4 +1,4 @@
-"""Instructions of LLVM for a block of lanes: operations, and what is read and written."""
+"""Instructions of LLVM for a block of lanes: operations, reads and writes."""
 
 from collections.abc import Iterator, Sequence
 
@@ -17,9 +17,9 @@ class Instructions:
     """Text of a part.
 
     Args:
-        lane_first: of every argument whether it is written lane by lane.
+        lane_first: for every argument whether its layout is lane by lane.
         block: lanes that are computed at a time.
-        head: where addresses of arguments are computed; default: where they are first needed.
+        head: lines for the addresses of arguments; default: the lines of their first use.
 
     Attributes:
         lines: the text.
@@ -38,7 +38,7 @@ class Instructions:
         self.constants: str = self._entry("ptr", 0)
 
     def new(self, expression: str, name: str | None = None, lines: list[str] | None = None) -> str:
-        """Name of a new value."""
+        """Write an instruction and return the name of its value."""
         if name is None:
             self._names += 1
             name = f"%t{self._names}"
@@ -48,7 +48,7 @@ class Instructions:
     # --- arguments
 
     def argument(self, argument: int) -> tuple[str, str]:
-        """Address and stride of an argument."""
+        """Return the address and stride of an argument."""
         if argument not in self._arguments:
             self._arguments[argument] = (
                 self._entry("ptr", 1 + 2 * argument),
@@ -61,7 +61,7 @@ class Instructions:
         return self.new(f"load {kind}, ptr {address}, !invariant.load !0", lines=self.head)
 
     def place(self, argument: int, row: int | str) -> str:
-        """Address of the block's numbers in a row of an argument."""
+        """Return the address of the block's numbers in a row of an argument."""
         address, stride = self.argument(argument)
         if argument not in self._first_rows:
             self._first_rows[argument] = self.new(
@@ -71,7 +71,7 @@ class Instructions:
         return self.new(f"getelementptr double, ptr {self._first_rows[argument]}, i64 {start}")
 
     def read(self, argument: int, row: int | str, name: str | None = None) -> str:
-        """Numbers in a row of an argument."""
+        """Write the code that reads a row of an argument; return the name of the value."""
         if not self.lane_first[argument]:
             return self.new(f"load {self.numbers}, ptr {self.place(argument, row)}, align 8", name)
         value = "poison"
@@ -82,7 +82,7 @@ class Instructions:
         return value
 
     def write(self, argument: int, row: int | str, value: str) -> None:
-        """Write numbers into a row of an argument."""
+        """Write the code that stores a value in a row of an argument."""
         if not self.lane_first[argument]:
             self.lines.append(f"store {self.numbers} {value}, ptr {self.place(argument, row)}, align 8")
             return
@@ -91,7 +91,7 @@ class Instructions:
             self.lines.append(f"store double {number}, ptr {address}, align 8")
 
     def _lane_places(self, argument: int, row: int | str) -> Iterator[str]:
-        """Addresses of the block's numbers in an argument that is written lane by lane."""
+        """Yield the addresses of the block's numbers in an argument with layout lane by lane."""
         start, stride = self.argument(argument)
         first = self.new(f"mul i64 %lane, {stride}")
         first = self.new(f"add i64 {first}, {row}")
@@ -101,7 +101,7 @@ class Instructions:
             yield self.new(f"getelementptr double, ptr {start}, i64 {offset}")
 
     def constant(self, address: str, name: str | None = None) -> str:
-        """Constant, in every lane."""
+        """Return the value of a constant in every lane."""
         value = self.new(f"load double, ptr {address}, !invariant.load !0")
         one = self.new(f"insertelement {self.numbers} poison, double {value}, i32 0")
         return self.new(self.block.repeat(one, self.numbers), name)
@@ -109,40 +109,40 @@ class Instructions:
     # --- operations
 
     def as_number(self, truth: str, name: str | None = None) -> str:
-        """One where it is true, else zero."""
+        """Return the value of one where a truth value is true, else zero."""
         return self.choice(truth, self.block.one, self.block.zero, name=name)
 
     def as_truth(self, number: str, name: str | None = None) -> str:
-        """Whether a number is not zero."""
+        """Return the truth value of a number: whether it is not zero."""
         return self.compare("une", number, self.block.zero, name)
 
     def choice(
         self, condition: str, one: str, other: str, kind: str | None = None, name: str | None = None
     ) -> str:
-        """One of two values in each lane."""
+        """Return the value of a choice between two values in each lane."""
         kind = kind or self.numbers
         return self.new(f"select {self.truths} {condition}, {kind} {one}, {kind} {other}", name)
 
     def compare(self, how: str, one: str, other: str, name: str | None = None) -> str:
-        """Truth of a comparison in each lane."""
+        """Return the truth value of a comparison in each lane."""
         return self.new(f"fcmp {how} {self.numbers} {one}, {other}", name)
 
     def call(self, function: str, *values: str, name: str | None = None) -> str:
-        """Answer of a function of numbers."""
+        """Return the value of a call of a function of numbers."""
         listed = ", ".join(f"{self.numbers} {value}" for value in values)
         return self.new(f"call {self.numbers} {function}({listed})", name)
 
     def operate(
         self, operation: str, values: Sequence[str], logical: bool, known: Sequence[bool], name: str
     ) -> None:
-        """Compute an operation.
+        """Write the code of an operation.
 
         Args:
-            operation: of a step, but ``take`` and ``product``.
-            values: its arguments.
+            operation: operation of a step, except ``take`` and ``product``.
+            values: names of its arguments.
             logical: whether its result is a truth value.
-            known: which arguments are constants.
-            name: of the result.
+            known: whether each argument is a constant.
+            name: name of the result.
         """
         a, *rest = values
         if operation in _INFIX:
@@ -159,14 +159,14 @@ class Instructions:
             self.choice(a, rest[0], rest[1], self.truths if logical else self.numbers, name)
         elif operation == "number":
             self.as_number(a, name)
-        elif operation == "sign":  # of what is no number: itself
+        elif operation == "sign":  # NaN for NaN
             low = self.choice(self.compare("olt", a, self.block.zero), self.block.minus_one, a)
             sign = self.choice(self.compare("ogt", a, self.block.zero), self.block.one, low)
             self.new(f"fadd {self.numbers} {sign}, {self.block.zero}", name)  # zero for minus zero
         elif operation == "remainder":
             self._remainder(a, rest[0], name)
         elif operation in ("maximum", "minimum") and any(known):
-            # One instruction: where the comparison is false, also for what is no number, the second is taken.
+            # One instruction: where the comparison is false, also for NaN, the second is chosen.
             how = "ogt" if operation == "maximum" else "olt"
             limited = (a, rest[0]) if known[0] else (rest[0], a)
             self.choice(self.compare(how, *limited), *limited, name=name)
@@ -177,22 +177,22 @@ class Instructions:
             self.call(callee, a, *rest, name=name)
 
     def _remainder(self, a: str, b: str, name: str) -> None:
-        """With the sign of the divisor, rounded once as long as the quotient is below ``2^53``."""
+        """Write the remainder with the sign of the divisor, rounded once if the quotient is below ``2^53``."""
         quotient = self.new(f"fdiv {self.numbers} {a}, {b}")
         whole = self.call(self.block.intrinsic("floor"), quotient)
         minus = self.new(f"fneg {self.numbers} {whole}")
         rest = self.call(self.block.intrinsic("fma"), b, minus, a)
-        # The quotient may have been rounded up to a whole number: then the rest is on the other side of zero.
+        # The quotient may have been rounded up to a whole number: then the remainder has the opposite sign.
         above = self.new(f"fadd {self.numbers} {rest}, {b}")
         opposite = self.compare("olt", self.new(f"fmul {self.numbers} {rest}, {b}"), self.block.zero)
         self.choice(opposite, above, rest, name=name)
 
     def take(self, start: int, length: int, place: str, name: str) -> None:
-        """Read a table of constants, that begins at a place of theirs."""
+        """Write the code that reads a table of constants from the index ``start`` on."""
         size, last = self.block.constant(f"{length}.0"), self.block.constant(f"{length - 1}.0")
         from_end = self.new(f"fadd {self.numbers} {place}, {size}")
         place = self.choice(self.compare("olt", place, self.block.zero), from_end, place)
-        # An index outside, or one that is no number, reads within the table all the same.
+        # An index outside the table, or NaN, is clipped to the table.
         place = self.choice(self.compare("ogt", place, self.block.zero), place, self.block.zero)
         place = self.choice(self.compare("olt", place, last), place, last)
         whole = self.new(f"fptosi {self.numbers} {place} to {self.block.words}")

@@ -1,4 +1,4 @@
-"""A program run step by step in NumPy, in any precision: slow, and what other languages are compared with."""
+"""Interpreter of programs in NumPy, in any precision: slow, and the reference for other languages."""
 
 import functools
 import operator
@@ -13,7 +13,7 @@ _COMPUTE: dict[str, Callable[..., Any]] = {**OPERATIONS, **FUNCTIONS, "where": n
 
 
 def first_steps(program: StraightLineProgram, results: int) -> int:
-    """Number of steps after which the first results are known."""
+    """Return the number of steps after which the first results are known."""
     return 1 + max((result.node for result in program.results[:results]), default=-1)
 
 
@@ -27,11 +27,11 @@ def interpret(
     """Compute the results of a program for N lanes.
 
     Args:
-        program: to run.
-        read: from argument and row to an input, ``(N,)`` or a number; read where it is needed.
-        dtype: in which everything is computed; a constant beyond its range becomes the nearest normal number.
+        program: the program.
+        read: function from argument and row to an input, ``(N,)`` or a number; called at first use.
+        dtype: type of all numbers; a constant beyond its range becomes the nearest normal number.
         between: called with the first results as soon as they are known, before any other input is read.
-        results: how many these are.
+        results: number of these results.
     """
     constants = in_range(program.constants, dtype)
     values: list[Any] = []
@@ -66,7 +66,7 @@ def interpret(
 
 
 def in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
-    """Numbers of a precision, in place of those beyond its range the nearest normal ones."""
+    """Return the constants in a precision; those beyond its range become the nearest normal numbers."""
     limits = numpy.finfo(dtype)
     size = numpy.clip(numpy.abs(constants), float(limits.tiny), float(limits.max))
     changed = numpy.isfinite(constants) & (constants != 0.0) & (limits.dtype != numpy.float64)
@@ -76,7 +76,7 @@ def in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
 
 
 def _places(index: Any, length: int) -> numpy.ndarray:
-    """Places in a table: negative ones from its end, those outside at the nearest one, what is no number at zero."""
+    """Return indices in a table: negative ones count from the end, others are clipped to the range, NaN is zero."""
     index = numpy.asarray(index, dtype=float)
     index = numpy.where(index < 0.0, index + length, index)
     inside = numpy.where(index > 0.0, numpy.minimum(index, length - 1.0), 0.0)

@@ -1,7 +1,7 @@
-"""Which library computes exponentials and their like, some lanes at a time or one by one.
+"""Libraries of exponentials and other functions, for several lanes at a time or one by one.
 
-On Linux glibc brings vector functions, with errors up to four units in the last place; where they are missing, the
-scalar functions of the C library stand in, and every platform has those.
+On Linux glibc has vector functions, with errors up to four units in the last place. Where they are missing, the scalar
+functions of the C library replace them, which every platform has.
 """
 
 import ctypes
@@ -14,9 +14,9 @@ from .program import FUNCTIONS
 
 BINARY = frozenset(("atan2", "pow", "hypot"))
 VARIANTS = {"avx512f": ("e", 8), "avx2": ("d", 4), "sse4.1": ("b", 2), "neon": ("n", 2)}
-"""Glibc's letter for the vectors of an instruction set, and how many numbers they hold."""
+"""Glibc's letter for the vectors of an instruction set, and their number of float64."""
 ROUNDING = ("floor", "ceil", "trunc", "rint", "fma")
-"""What LLVM asks the C library for where the processor has no instruction."""
+"""Functions that LLVM calls from the C library where the processor has no instruction."""
 
 
 class LibraryFunction(NamedTuple):
@@ -24,16 +24,16 @@ class LibraryFunction(NamedTuple):
 
     symbol: str
     lanes: int
-    """Numbers that one call takes."""
+    """Numbers per call."""
     address: int
 
 
 class Library(NamedTuple):
-    """Where functions come from."""
+    """A library with its functions."""
 
     name: str
     functions: dict[str, LibraryFunction]
-    """By the names of :data:`~.program.FUNCTIONS`, and those of ``ROUNDING``."""
+    """Functions by the names of :data:`~.program.FUNCTIONS` and of ``ROUNDING``."""
 
 
 def _address(library: ctypes.CDLL, symbol: str) -> int | None:
@@ -52,8 +52,8 @@ def _open(*names: str | None) -> ctypes.CDLL | None:
 
 
 @functools.cache
-def portable() -> Library:
-    """Scalar functions of the C library."""
+def portable_library() -> Library:
+    """Return the scalar functions of the C library."""
     library = _open("ucrtbase") if sys.platform == "win32" else _open("libm.so.6", None)
     functions = {}
     for name in (*FUNCTIONS, *ROUNDING):
@@ -64,11 +64,11 @@ def portable() -> Library:
 
 
 @functools.cache
-def fastest(features: str) -> Library:
-    """Library for a processor.
+def fastest_library(features: str) -> Library:
+    """Return the fastest library for a processor.
 
     Args:
-        features: as LLVM lists them, ``+avx2,-avx512f,...``.
+        features: features in LLVM's form, ``+avx2,-avx512f,...``.
     """
     there = features.split(",")
     vectors = _open("libmvec.so.1")
@@ -76,9 +76,9 @@ def fastest(features: str) -> Library:
         there.append("+neon")
     variant = next((VARIANTS[name] for name in VARIANTS if f"+{name}" in there), None)
     if vectors is None or variant is None:
-        return portable()
+        return portable_library()
     letter, lanes = variant
-    functions = dict(portable().functions)
+    functions = dict(portable_library().functions)
     for name in FUNCTIONS:
         symbol = f"_ZGV{letter}N{lanes}{'vv' if name in BINARY else 'v'}_{name}"
         address = _address(vectors, symbol)

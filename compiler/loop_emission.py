@@ -1,23 +1,24 @@
 """Loops of a program as text of LLVM: a function for each, whose turns compute the members of its statements.
 
-A member's number lies where the turn says: a multiple of its number away from the first, or as far as a table says.
+The place of a member's number depends on the turn: its distance from the first is a multiple of the turn's number, or
+an entry of a table.
 """
 
 from collections.abc import Sequence
 
 from .block import LaneBlock
 from .instructions import HEADER, Instructions
-from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Statement, steady
+from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Statement, common_difference
 
 
 class DistanceTables:
-    """Distances of members that are not always the same, as constants of the text."""
+    """Tables of irregular distances between members, as constants of the text."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[int, ...], int] = {}
 
     def find(self, distances: tuple[int, ...]) -> tuple[str, str]:
-        """Name of a table, and the type of its entries."""
+        """Return the name of a table, and the type of its entries."""
         number = self._found.setdefault(distances, len(self._found))
         return f"@places{number}", _kind(distances)
 
@@ -40,10 +41,10 @@ class LoopText(Instructions):
     """Text of a loop.
 
     Args:
-        loop: to write.
-        lane_first: of every argument whether it is written lane by lane.
+        loop: the loop.
+        lane_first: for every argument whether its layout is lane by lane.
         block: lanes that are computed at a time.
-        tables: of all loops.
+        tables: tables of all loops.
     """
 
     def __init__(
@@ -97,7 +98,6 @@ class LoopText(Instructions):
                 self.write(array, self._row(places), number)
 
     def _value(self, operand: Operand) -> str:
-        """Name of a member's number in this turn."""
         array, places, logical = operand
         if array == TURN:
             return f"%v{places[0]}"
@@ -115,7 +115,6 @@ class LoopText(Instructions):
         return self._address(self.numbers, "%scratch", places)
 
     def _address(self, kind: str, array: str, places: tuple[int, ...]) -> str:
-        """Address of a member in an array."""
         first, way = self._way(places)
         if way is not None:
             if (array, way) not in self._bases:
@@ -124,13 +123,12 @@ class LoopText(Instructions):
         return self.new(f"getelementptr {kind}, ptr {array}, i64 {first}")
 
     def _row(self, places: tuple[int, ...]) -> int | str:
-        """Row of a member."""
         first, way = self._way(places)
         return first if way is None else way if first == 0 else self.new(f"add i64 {way}, {first}")
 
     def _way(self, places: tuple[int, ...]) -> tuple[int, str | None]:
-        """A place, and how far from it the turn's one is; None: not at all."""
-        step = steady(places)
+        """Return the first place, and the name of the turn's distance from it; None: zero."""
+        step = common_difference(places)
         if step == 0:
             return places[0], None
         if step is not None:

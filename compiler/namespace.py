@@ -1,8 +1,8 @@
 """Arrays of expressions, and the functions of the array API standard on them.
 
-A :class:`Traced` stands where a function expects an array: shapes, indices and broadcasting are those of NumPy, which
-moves the numbers of the expressions around, and arithmetic makes new expressions in the :class:`~.program.Graph` that
-:func:`tracing` has opened. Numbers are float64 in a program, also those whose ``dtype`` says that they are whole.
+A :class:`Traced` replaces an array: shapes, indices and broadcasting are those of NumPy, which moves the numbers of the
+expressions, and arithmetic makes new expressions in the :class:`~.program.Graph` that :func:`tracing` has opened. All
+numbers in a program are float64, also those with an integer ``dtype``.
 """
 
 import builtins
@@ -25,16 +25,16 @@ pi, inf, nan, newaxis = numpy.pi, numpy.inf, numpy.nan, None
 _OPEN: ContextVar[Graph] = ContextVar("graph")
 
 
-class NotTraceable(TypeError):  # noqa: N818  (no error of whoever wrote the function)
-    """A function does what no straight line of arithmetic can do."""
+class NotTraceable(TypeError):  # noqa: N818  (not an error in the function)
+    """A function that cannot be expressed as a straight line of arithmetic."""
 
 
 @contextmanager
 def tracing(graph: Graph) -> Iterator[Graph]:
-    """Let the arithmetic inside make expressions of a graph; other threads wait with theirs.
+    """Make arithmetic inside create expressions of a graph; other threads wait.
 
     Raises:
-        NotTraceable: in place of whatever is raised inside: a function may stumble over symbols in any way.
+        NotTraceable: in place of any exception inside, as functions may fail on symbols in any way.
     """
     with without_collection():
         token = _OPEN.set(graph)
@@ -43,40 +43,40 @@ def tracing(graph: Graph) -> Iterator[Graph]:
         except NotTraceable:
             raise
         except Exception as error:
-            if isinstance(error.__cause__, NotTraceable):  # NumPy says less of what it came from
+            if isinstance(error.__cause__, NotTraceable):  # NumPy's message is less specific than its cause
                 raise error.__cause__ from error
             raise NotTraceable(f"{type(error).__name__}: {error}") from error
         finally:
             _OPEN.reset(token)
 
 
-def _settled(array: Any, use: str) -> Any:
-    """Plain value that the open graph has for an expression, see :meth:`.Graph.settle`."""
+def _plain_value(array: Any, use: str) -> Any:
+    """Return the plain value that the open graph has for an expression, see :meth:`.Graph.settle`."""
     graph = _OPEN.get(None)
     return None if graph is None or array.nodes.size != 1 else graph.settle(array.nodes.item(), use)
 
 
 def _decide(self: Any) -> builtins.bool:
-    known = _settled(self, "branch")
+    known = _plain_value(self, "branch")
     return _refuse(self) if known is None else builtins.bool(known)
 
 
 def _refuse(self: Any, *_: Any) -> Any:
     raise NotTraceable(
-        "a branch or a loop depends on the numbers of an array: numpy.where, numpy.maximum and numpy.minimum choose, "
-        "of numpy.stack in place of numpy.array"
+        "a branch or a loop depends on the numbers of an array: choose with numpy.where, numpy.maximum or "
+        "numpy.minimum, and use numpy.stack in place of numpy.array"
     )
 
 
 def _number(self: Any) -> float:
-    known = _settled(self, "number")
+    known = _plain_value(self, "number")
     return _refuse_number(self) if known is None else float(known)
 
 
 def _refuse_number(self: Any) -> Any:
     raise NotTraceable(
-        "a number that varies is made a float: take NumPy's functions in place of math's, and a list, or numpy.array "
-        "of one without dtype, in place of an array whose entries are set"
+        "a number that varies is converted to a float: use NumPy's functions in place of math's, and a list, or "
+        "numpy.array of one without dtype, in place of an array whose entries are set"
     )
 
 
@@ -85,7 +85,7 @@ def _round(self: Any, digits: Any = None) -> Any:
 
 
 def _format(self: Any, form: str) -> str:
-    known = _settled(self, "words")
+    known = _plain_value(self, "words")
     return str(self) if known is None else format(known, form)
 
 
@@ -98,7 +98,7 @@ class Traced:
 
     Attributes:
         nodes: the expressions, as numbers in the open graph.
-        dtype: of what they stand for.
+        dtype: type of the array that they replace.
     """
 
     __slots__ = ("dtype", "nodes")
@@ -117,8 +117,8 @@ class Traced:
         self.dtype: numpy.dtype = numpy.dtype(dtype)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
-        """Array of objects, on which NumPy's own arithmetic makes expressions, too."""
-        from . import numpy_functions  # noqa: F401  (gives the objects the methods that NumPy calls)
+        """Return an array of objects, for which NumPy's own arithmetic makes expressions, too."""
+        from . import numpy_functions  # noqa: F401  (adds the methods that NumPy calls)
 
         objects = numpy.empty(self.shape, dtype=object)
         for place in numpy.ndindex(self.shape):
@@ -162,7 +162,7 @@ class Traced:
             len(whole) != whole[-1] - whole[0] + 1  # NumPy puts the axis first then
         ):
             raise NotTraceable(
-                "one index may depend on numbers, whole ones stand beside it, the others be slices"
+                "only one index may depend on numbers: put integers next to it, and use slices elsewhere"
             )
         axis = place - builtins.sum(isinstance(k, int) for k in others[:place])
         if Ellipsis in others[:place]:  # counted from the last axis then
@@ -191,27 +191,27 @@ class Traced:
         return matmul(other, self)
 
     def sum(self, axis: int | None = None) -> "Traced":
-        """Sum over an axis, or all."""
+        """Return the sum along an axis, or of all."""
         return sum(self, axis=axis)
 
     def min(self, axis: int | None = None) -> "Traced":
-        """Smallest entry along an axis, or of all."""
+        """Return the smallest entry along an axis, or of all."""
         return min(self, axis=axis)
 
     def max(self, axis: int | None = None) -> "Traced":
-        """Largest entry along an axis, or of all."""
+        """Return the largest entry along an axis, or of all."""
         return max(self, axis=axis)
 
     def any(self, axis: int | None = None) -> "Traced":
-        """Whether an entry along an axis is true."""
+        """Return whether any entry along an axis is true."""
         return any(self, axis=axis)
 
     def all(self, axis: int | None = None) -> "Traced":
-        """Whether all entries along an axis are true."""
+        """Return whether all entries along an axis are true."""
         return all(self, axis=axis)
 
     def mean(self, axis: int | None = None) -> "Traced":
-        """Mean along an axis, or of all."""
+        """Return the mean along an axis, or of all."""
         from .numpy_functions import mean
 
         return mean(self, axis)
@@ -221,7 +221,7 @@ class Traced:
         return self.reshape(())
 
     def dot(self, other: Any) -> "Traced":
-        """Product with a vector or a matrix."""
+        """Return the product with a vector or a matrix."""
         return matmul(self, other)
 
     def ravel(self) -> "Traced":
@@ -241,12 +241,12 @@ class Traced:
         return astype(self, dtype)
 
     def copy(self) -> "Traced":
-        """Return the array itself, as nothing changes it."""
+        """Return the array itself, which is immutable."""
         return self
 
 
 def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None) -> Traced:
-    """Array of constants, or the traced array itself."""
+    """Return an array of constants as a traced array, or a traced array unchanged."""
     if isinstance(values, Traced):
         return values if dtype is None else astype(values, dtype)
     if isinstance(values, list | tuple) and builtins.any(isinstance(value, Traced) for value in values):
@@ -284,11 +284,11 @@ def _numbers(array: Traced) -> Traced:
 
 
 def _join(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
-    """Arrays as traced ones of one kind, numbers or truth values, and NumPy's common type of them."""
+    """Return the arrays as traced arrays of one kind, numbers or truth values, and NumPy's common type."""
     if builtins.all(isinstance(array, Traced) and array.dtype == float64 for array in arrays):
         return list(arrays), float64
     found = [asarray(array) for array in arrays]
-    # NumPy asks Python's own numbers only for their kind.
+    # For Python's own numbers NumPy uses only their kind.
     kinds = [
         a if isinstance(a, int | float) else traced.dtype for a, traced in zip(arrays, found, strict=True)
     ]
@@ -327,7 +327,7 @@ def _logical(name: str) -> Callable[..., Any]:
 
 
 def _floor_divide(one: Any, other: Any) -> Traced:
-    # The quotient itself may be rounded up to a whole number that it does not reach.
+    # The quotient itself may be rounded up to the next whole number.
     quotient = divide(subtract(one, remainder(one, other)), other)
     return Traced(round(quotient).nodes, _join([one, other])[1])
 
@@ -365,35 +365,35 @@ Traced.__hash__ = None  # type: ignore[assignment]
 
 
 def square(x: Any) -> Traced:
-    """Square."""
+    """Return the square."""
     return multiply(x, x)
 
 
 def isnan(x: Any) -> Traced:
-    """Whether an entry is no number."""
+    """Return whether an entry is NaN."""
     return not_equal(x, x)
 
 
 def isfinite(x: Any) -> Traced:
-    """Whether an entry is finite."""
+    """Return whether an entry is finite."""
     return less_equal(abs(x), float(numpy.finfo(float64).max))
 
 
 def where(condition: Any, one: Any, other: Any) -> Traced:
-    """Choose by a condition."""
+    """Choose between two arrays by a condition."""
     arrays, dtype = _join([one, other])
     return _elementwise("where", [astype(condition, bool), *arrays], dtype)
 
 
 def clip(x: Any, min: Any = None, max: Any = None) -> Traced:
-    """Limit."""
+    """Limit the entries to an interval."""
     if min is not None:
         x = maximum(x, min)
     return asarray(x) if max is None else minimum(x, max)
 
 
 def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
-    """Array of another type; from numbers to whole numbers the fraction is cut off."""
+    """Convert to another type; a conversion to integers truncates."""
     x, dtype = asarray(x), numpy.dtype(dtype)
     if dtype.kind not in "fiub":
         raise NotTraceable(f"arrays of {dtype} cannot be traced")
@@ -407,7 +407,7 @@ def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
 
 
 def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
-    """Function of one array that moves its entries, as NumPy's."""
+    """Return NumPy's function that moves the entries of one array, for traced arrays."""
 
     @functools.wraps(move)
     def function(x: Any, *arguments: Any, **keywords: Any) -> Traced:
@@ -418,7 +418,7 @@ def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
 
 
 def _gatherer(gather: Callable[..., Any]) -> Callable[..., Traced]:
-    """Function of several arrays that puts them together, as NumPy's."""
+    """Return NumPy's function that joins several arrays, for traced arrays."""
 
     @functools.wraps(gather)
     def function(arrays: Any, *, axis: int | None = 0) -> Traced:
@@ -439,7 +439,7 @@ concat, stack = _gatherer(numpy.concat), _gatherer(numpy.stack)
 
 
 def _maker(make: Callable[..., Any]) -> Callable[..., Traced]:
-    """Function that makes an array of constants, as NumPy's."""
+    """Return NumPy's function that makes an array of constants, for traced arrays."""
 
     @functools.wraps(make)
     def function(*arguments: Any, dtype: Any = None, device: Any = None) -> Traced:
@@ -452,12 +452,12 @@ zeros, ones, eye, arange = (_maker(make) for make in (numpy.zeros, numpy.ones, n
 
 
 def full(shape: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
-    """Array of one value, which may depend on numbers."""
+    """Return an array of one value, which may depend on inputs."""
     return broadcast_to(asarray(value, dtype), shape)
 
 
 def full_like(x: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
-    """Array of one value, shaped like another."""
+    """Return an array of one value with the shape of another."""
     x = asarray(x)
     return full(x.shape, value, dtype=dtype or x.dtype)
 
@@ -466,25 +466,26 @@ zeros_like, ones_like = functools.partial(full_like, value=0), functools.partial
 
 
 def tril(x: Any, /, *, k: int = 0) -> Traced:
-    """Lower triangle, zeros above it."""
+    """Return the lower triangle, with zeros above it."""
     x = asarray(x)
     return where(numpy.tril(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
 
 
 def triu(x: Any, /, *, k: int = 0) -> Traced:
-    """Upper triangle, zeros below it."""
+    """Return the upper triangle, with zeros below it."""
     x = asarray(x)
     return where(numpy.triu(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
 
 
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
-    """Entries by their place; places that depend on numbers choose from a table of constants, or one by one.
+    """Return the entries at indices along an axis.
 
-    A large table of constants had better stay an array of NumPy: its numbers do not become expressions then.
+    Indices that depend on inputs read a table of constants, or select among expressions one by one. A large table of
+    constants should be an array of NumPy, whose numbers do not become expressions.
     """
     indices = asarray(indices)
     if indices.dtype == bool:
-        raise NotTraceable("how many entries a mask chooses depends on numbers: use where")
+        raise NotTraceable("the number of entries that a mask selects depends on numbers: use where")
     graph, places = _OPEN.get(), indices.nodes.ravel().tolist()
     rows: Any
     taken: Any
@@ -503,7 +504,7 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
 
 
 def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) -> numpy.ndarray:
-    """Entries of each row ``(R, choices)`` at some places, ``(R, places)``."""
+    """Return the entries of each row ``(R, choices)`` at the indices, ``(R, places)``."""
     chosen = numpy.empty((len(rows), len(places)), dtype=numpy.int64)
     open_rows, open_places = [], []
     graph.begin_group()
@@ -523,12 +524,12 @@ def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) ->
                 open_places.append(p)
     if open_rows:
         choices = Traced(rows[open_rows].T, dtype)
-        asked = Traced(numpy.array(places)[open_places], float64)
-        # As a table is read: a negative index counts from the last, one outside is that of the nearest end.
-        asked = where(less(asked, 0.0), add(asked, float(rows.shape[-1])), asked)
+        requested = Traced(numpy.array(places)[open_places], float64)
+        # As for a table: a negative index counts from the end, one outside is clipped to the range.
+        requested = where(less(requested, 0.0), add(requested, float(rows.shape[-1])), requested)
         found = choices[0]
         for place, choice in enumerate(list(choices)[1:], 1):
-            found = where(greater_equal(asked, float(place)), choice, found)
+            found = where(greater_equal(requested, float(place)), choice, found)
         chosen[open_rows, open_places] = found.nodes
     return chosen
 
@@ -559,11 +560,11 @@ def sort(x: Any, /, *, axis: int = -1) -> Traced:
 
 
 LARGE = 256
-"""Numbers of a matrix of constants, not zero, whose product becomes a loop: fewer are a short straight line."""
+"""Nonzero constants of a matrix from which on its product becomes a loop; fewer are a short straight line."""
 
 
 def _is_loop(matrix: Any) -> builtins.bool:
-    """Whether the product with a matrix is a loop: many constants, few of them zero."""
+    """Return whether the product with a matrix is a loop: many constants, few of them zero."""
     if not isinstance(matrix, numpy.ndarray) or matrix.ndim != 2 or not _OPEN.get().loops:
         return False
     count = int(numpy.count_nonzero(matrix))
@@ -571,9 +572,9 @@ def _is_loop(matrix: Any) -> builtins.bool:
 
 
 def matmul(a: Any, b: Any, /) -> Traced:
-    """Product of matrices, the terms added one after the other; what is multiplied by a constant zero is left out.
+    """Return the product of matrices; terms are added in order, and terms with a constant zero are omitted.
 
-    Where the graph allows loops, the product with a large matrix of constants is one.
+    Where the graph allows loops, the product with a large matrix of constants is a loop.
     """
     if _is_loop(b):  # x^T B = (B^T x)^T
         return matmul(b.T, asarray(a).mT).mT if asarray(a).ndim > 1 else matmul(b.T, a)

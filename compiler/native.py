@@ -1,4 +1,4 @@
-"""Programs as code of the processor at hand."""
+"""Machine code of programs for the current processor."""
 
 import contextvars
 import ctypes
@@ -17,13 +17,13 @@ import numpy
 from . import cache, emission
 from .block import LANES, block_for, block_of
 from .emission import emit, product_symbol, product_text
-from .library import Library, fastest
+from .library import Library, fastest_library
 from .program import LOCK, StraightLineProgram
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
 """Whether programs can be compiled here."""
 _ENGINES: list[Any] = []
-"""What owns the code; it is never given back, as somebody may be about to call it."""
+"""Engines that own the code; they are never freed, as the code may be called at any time."""
 
 
 @functools.cache
@@ -41,19 +41,18 @@ def llvm() -> ModuleType:
 
 
 PROCESSOR = "FILTERGYM_COMPILER_PROCESSOR"
-"""Environment variable: an older processor whose instructions to keep to, as ``NAME,+FEATURE,...``; see
+"""Environment variable: an older processor to whose instructions the code is limited, as ``NAME,+FEATURE,...``; see
 :func:`processor`."""
 
 
 def processor() -> tuple[str, str]:
-    """Name and features of the processor that code is made for, as LLVM calls them: this one, or what
-    ``FILTERGYM_COMPILER_PROCESSOR`` names, such as ``haswell,+avx2`` or ``x86-64``.
+    """Return name and features of the target processor in LLVM's form.
 
-    LLVM knows the features of a processor that it has a name for; those that are written here too decide which vector
-    functions are called (:func:`~.library.fastest`).
+    It is this one, or the value of ``FILTERGYM_COMPILER_PROCESSOR``, such as ``haswell,+avx2`` or ``x86-64``. A name
+    implies its features for LLVM; further features select the vector functions (:func:`~.library.fastest_library`).
 
     Raises:
-        ValueError: for a feature that is neither switched on nor off.
+        ValueError: for a feature without ``+`` or ``-``.
     """
     chosen = os.environ.get(PROCESSOR)
     if not chosen:
@@ -67,7 +66,7 @@ def processor() -> tuple[str, str]:
 
 @functools.cache
 def _host() -> tuple[str, str]:
-    """Name and features of this processor, which LLVM finds out anew each time."""
+    """Return name and features of this processor, from a cache as LLVM detects them at every call."""
     return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
 
 
@@ -77,48 +76,50 @@ def _target(level: int = 1) -> Any:
 
 
 class Setting(NamedTuple):
-    """How a program becomes code; its results have the same bits in every setting."""
+    """Settings of code generation; the results have the same bits in every setting."""
 
     lanes: int
-    """Of a block."""
+    """Lanes of a block."""
     part: int
     """Statements of a part."""
     level: int
-    """Of LLVM's optimisation of code."""
+    """Level of LLVM's optimisation of code."""
     loops: bool = False
     """Whether a long program is computed in loops."""
 
 
 def quick_setting(features: str, has_products: bool) -> Setting:
-    """Return the setting that takes LLVM the least time: no optimisation, loops, blocks of one register; with products
-    of matrices those of the fastest code, as a product takes twice as long in half of a block.
+    """Return the setting with the shortest compilation: no optimisation, loops, blocks of one register.
+
+    With products of matrices the blocks are those of the fastest code, as a product takes twice as long in half of a
+    block.
 
     Args:
-        features: of the processor.
+        features: features of the processor.
         has_products: whether the program multiplies with matrices.
     """
     return Setting(LANES if has_products else block_for(features).lanes, 150, 0, loops=not has_products)
 
 
 OPTIMISED = Setting(LANES, 200, 1)
-"""The setting with the fastest code; where a register holds four lanes, two of them make a block."""
+"""The setting with the fastest code; where a register has four lanes, a block is two registers."""
 HOT = 2_000_000
-"""Lanes after which a program is worth the time that optimisation takes: three to five times that of the quick setting,
-for code that takes up to a third less. Both are in proportion to the program's length, so the lanes are not."""
+"""Lanes after which optimisation is worth its time: three to five times that of the quick setting, for code that takes
+up to a third less. Both times are proportional to the program's length, so this number does not depend on it."""
 IN_LOOPS = 10
-"""How many times sooner that is so where the quick code is loops, which take 1.4 to 2.2 times as long: by then they
-have lost about the time in which a straight line is compiled, and whoever stops or goes on loses no more."""
+"""Divisor of :data:`HOT` where the quick code is loops, which take 1.4 to 2.2 times as long: by then they have lost
+about the time in which a straight line is compiled, so neither choice loses more than that."""
 LONG, LONGEST = 20_000, 100_000
-"""Steps of a program from which on optimisation saves nothing, because its numbers do not fit into the nearest caches;
-and from which on a straight line saves nothing either, because its code does not."""
+"""Steps of a program from which on optimisation saves no time, as its numbers exceed the nearest caches; and from which
+on a straight line saves none either, as its code exceeds them."""
 
 
 def better_setting(quick: Setting, steps: int, in_loops: bool) -> Setting | None:
-    """Return the setting of the fastest code; None: it is the quick one.
+    """Return the setting of the fastest code; None: the quick setting.
 
     Args:
-        quick: the quick one.
-        steps: of the program.
+        quick: the quick setting.
+        steps: number of steps of the program.
         in_loops: whether the quick code is loops.
     """
     if steps < LONG:
@@ -127,26 +128,27 @@ def better_setting(quick: Setting, steps: int, in_loops: bool) -> Setting | None
 
 
 Native = Callable[[int, int, int], None]
-"""Called with the address of the table of arguments, and with the lanes from where to where."""
+"""Code of a program; arguments: address of the table of arguments, first lane, end of the lanes."""
 NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-"""The same for ctypes."""
+"""Signature of :data:`Native` for ctypes."""
 PRODUCT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, ctypes.c_int64)
-"""Of the product of a matrix, see :func:`~.emission.product_text`."""
+"""Signature of the product of a matrix, see :func:`~.emission.product_text`."""
 
 
 def address_of_code(code: Any) -> int:
-    """Address of a native function."""
+    """Return the address of a native function."""
     return ctypes.cast(code, ctypes.c_void_p).value or 0
 
 
 _EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=False)
-"""Whether programs are optimised before they have run long."""
+"""Whether programs are optimised at once."""
 
 
 @contextmanager
 def optimised_code() -> Iterator[None]:
-    """Let programs that run inside in a :class:`~.sequence.CallSequence` be optimised at once: times depend neither
-    on a cache nor on how long they have run then.
+    """Optimise programs that run inside in a :class:`~.sequence.CallSequence` at once.
+
+    Measured times then depend neither on the cache nor on the duration of earlier runs.
     """
     token = _EAGER.set(True)
     try:
@@ -156,13 +158,13 @@ def optimised_code() -> Iterator[None]:
 
 
 class Code:
-    """Code of a program, made when it is first to run.
+    """Code of a program, made before its first run.
 
-    A program is compiled quickly first, and better once it has run over many lanes, where that gains anything.
+    A program is first compiled quickly, and optimised once it has run over many lanes, where that saves time.
 
     Args:
         make: makes the code.
-        optimise: makes better code; None: there is none.
+        optimise: makes optimised code; None: there is none.
         hot: lanes after which it is made.
     """
 
@@ -173,11 +175,11 @@ class Code:
         self._run: Native | None = None
 
     def expect(self, lanes: int, in_sequence: bool = False) -> Native:
-        """Return the code for running over so many lanes: better code where it has become worth its time.
+        """Return the code for a run over some lanes, optimised where that has become worth its time.
 
         Args:
-            lanes: in all steps.
-            in_sequence: whether many steps are one native call, which is what :func:`optimised_code` is about.
+            lanes: number of lanes, in all steps.
+            in_sequence: whether many steps are one native call, to which :func:`optimised_code` applies.
         """
         self._lanes += lanes
         if self._optimise is not None and (self._lanes > self._hot or (in_sequence and _EAGER.get())):
@@ -189,16 +191,16 @@ class Code:
 
 
 def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Library | None = None) -> Code:
-    """Return the code of a program; one for all programs that differ in nothing but constants.
+    """Return the code of a program, shared by all programs that differ only in constants.
 
     Args:
-        program: what it computes.
-        lane_first: of every argument whether it is written as ``(N, rows)``.
-        library: where functions come from; default: the fastest for this processor.
+        program: the program.
+        lane_first: for every argument whether its layout is ``(N, rows)``.
+        library: library of the functions; default: the fastest for this processor.
     """
     with LOCK:
         binding, (_, features) = llvm(), processor()
-        library = library or fastest(features)
+        library = library or fastest_library(features)
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
         has_products = "product" in program.steps.operations
         quick = quick_setting(features, has_products)
@@ -224,19 +226,19 @@ def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Li
             make, optimise = functools.partial(code, quick, key), None
             if better is not None:
                 optimise = functools.partial(code, better, better_key)
-                if cache.holds(better_key):
+                if cache.contains(better_key):
                     make, optimise = optimise, None
             _CODES[key] = Code(make, optimise, HOT // IN_LOOPS if in_loops else HOT)
         return _CODES[key]
 
 
 def native_text(text: str, signature: Any = NATIVE, level: int = 1) -> Any:
-    """Return code of a text that calls no function by its name: only what every processor computes alike.
+    """Return code of a text that calls no library function, so that its results are the same on every processor.
 
     Args:
-        text: of LLVM, with an entry ``@program``.
-        signature: of the entry, as ctypes writes it; default: ``(table, first, last)``, as of :data:`Native`.
-        level: of LLVM's optimisation of code.
+        text: text of LLVM with an entry ``@program``.
+        signature: signature of the entry in ctypes; default: that of :data:`Native`, ``(table, first, last)``.
+        level: level of LLVM's optimisation of code.
 
     Raises:
         ImportError: without llvmlite.
@@ -249,14 +251,11 @@ def native_text(text: str, signature: Any = NATIVE, level: int = 1) -> Any:
 
 
 def _key(*texts: str) -> str:
-    """Name of the code that is made of some texts for this processor."""
     return cache.key(*texts, *processor(), repr(llvm().llvm_version_info))
 
 
 def _text_of(program: StraightLineProgram) -> str:
-    """Text that tells programs apart that have other steps or results: it takes less time than that which is emitted,
-    and other numbers leave it as it is.
-    """
+    """Return a text that is unique for steps and results and independent of constants; faster than emission."""
     steps, results = program.steps, numpy.array(program.results, dtype=numpy.int64)
     columns = (steps.kinds, steps.begins, steps.arguments, steps.logical, results)
     return " ".join(steps.names) + hashlib.sha256(b"".join(map(numpy.ndarray.tobytes, columns))).hexdigest()
@@ -264,18 +263,18 @@ def _text_of(program: StraightLineProgram) -> str:
 
 @functools.cache
 def _own_text() -> str:
-    """Text of this compiler, which decides what becomes of a program."""
+    """Return the source text of this compiler, on which the code of a program depends."""
     return "".join(path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py")))
 
 
 def _load(key: str, write: Callable[[], str], signature: Any, level: int = 1) -> Any:
-    """Load the code of a text, translated or found in the cache."""
+    """Load the code of a text, from the cache or after translation."""
     binding = llvm()
     code = cache.load(key)
     if code is None:
         module = binding.parse_assembly(write())
         code = _target(level).emit_object(module)
-        cache.keep(key, code)
+        cache.store(key, code)
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _target())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -284,6 +283,6 @@ def _load(key: str, write: Callable[[], str], signature: Any, level: int = 1) ->
 
 
 _CODES: dict[str, Code] = {}
-"""Code of programs that this process has loaded, by the key of the quick one."""
+"""Code of programs that this process has loaded, by the key of the quick code."""
 _TEXTS: dict[str, Any] = {}
 """Code of texts, by its key."""

@@ -1,9 +1,8 @@
-"""NumPy's own functions on traced arrays, so that what is written with NumPy can be traced, too.
+"""NumPy's own functions on traced arrays, so that functions written with NumPy can be traced, too.
 
-NumPy hands a function of its own over to the arrays that it is called with (its protocols ``__array_ufunc__`` and
-``__array_function__``). Those that the array API standard has are computed by :mod:`.namespace`, others here. What
-is left of the functions of arrays, such as ``cross`` and ``einsum``, NumPy computes itself on arrays of objects, whose
-arithmetic is traced.
+NumPy dispatches its functions to the arrays of a call (protocols ``__array_ufunc__`` and ``__array_function__``).
+Functions of the array API standard are computed by :mod:`.namespace`, others here. NumPy computes the remaining
+functions of arrays, such as ``cross`` and ``einsum``, itself on arrays of objects, whose arithmetic is traced.
 """
 
 import itertools
@@ -17,16 +16,16 @@ from .namespace import NotTraceable, Traced
 
 
 def log_add_exp(one: Any, other: Any) -> Traced:
-    """Logarithm of the sum of two exponentials, which do not overflow."""
+    """Return the logarithm of the sum of two exponentials, without overflow."""
     larger = namespace.maximum(one, other)
     apart = namespace.abs(namespace.subtract(one, other))
-    # Of two equal infinities the difference is no number.
+    # The difference of two equal infinities is NaN.
     sum_of = namespace.add(larger, namespace.log1p(namespace.exp(-apart)))
     return namespace.where(namespace.equal(one, other), namespace.add(larger, numpy.log(2.0)), sum_of)
 
 
 def arg_max(x: Any, axis: int) -> Traced:
-    """Place of the largest entry along an axis, of several the first."""
+    """Return the index of the largest entry along an axis, the first of several."""
     rows = namespace.moveaxis(x, axis, 0)
     place: Any = namespace.zeros_like(rows[0], dtype=namespace.float64)
     largest: Any = rows[0]
@@ -38,24 +37,24 @@ def arg_max(x: Any, axis: int) -> Traced:
 
 
 def mean(x: Any, axis: Any = None) -> Traced:
-    """Mean along an axis, or of all."""
+    """Return the mean along an axis, or of all."""
     axes = range(x.ndim) if axis is None else axis if isinstance(axis, tuple) else (axis,)
     return namespace.divide(namespace.sum(x, axis=axis), float(numpy.prod([x.shape[i] for i in axes])))
 
 
 def replace_not_finite(x: Any) -> Traced:
-    """Zero where an entry is no number, and the largest number in place of an infinite one."""
+    """Replace NaN by zero, and infinities by the largest number with the same sign."""
     largest = float(numpy.finfo(float).max)
     return namespace.clip(namespace.where(namespace.isnan(x), 0.0, x), -largest, largest)
 
 
 def copy_array(x: Any, order: str = "K") -> Traced:
-    """Return the array itself, as nothing changes it."""
+    """Return the array itself, which is immutable."""
     return namespace.asarray(x)
 
 
 def full_like(x: Any, value: Any, dtype: Any = None) -> Traced:
-    """Array of one value, shaped like another."""
+    """Return an array of one value with the shape of another."""
     return namespace.full_like(x, value, dtype=dtype)
 
 
@@ -77,7 +76,7 @@ def split(x: Any, sections: int, axis: int = 0) -> list[Traced]:
 def interpolate(
     x: Any, places: Any, values: Any, left: Any = None, right: Any = None, period: None = None
 ) -> Traced:
-    """Linear interpolation between places that increase, and the end values beyond."""
+    """Interpolate linearly between increasing places, with the end values outside."""
     if period is not None:
         raise _refusal(numpy.interp, {"period": period})
     places = numpy.asarray(places, dtype=float)
@@ -92,20 +91,20 @@ def interpolate(
 
 
 def norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Traced:
-    """Euclidean length, of all numbers or along an axis."""
+    """Return the Euclidean norm along an axis, or of all."""
     if ord not in (None, 2) or (ord == 2 and x.ndim > 1 and not isinstance(axis, int)):
         raise _refusal(numpy.linalg.norm, {"ord": ord})
     return namespace.sqrt(namespace.sum(namespace.square(x), axis=axis, keepdims=keepdims))
 
 
 def dot(one: Any, other: Any) -> Traced:
-    """Product of vectors, matrices or numbers."""
+    """Return the product of vectors, matrices or numbers."""
     one, other = namespace.asarray(one), namespace.asarray(other)
     return namespace.matmul(one, other) if one.ndim and other.ndim else namespace.multiply(one, other)
 
 
 def select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) -> Traced:
-    """Choose by the first condition that holds."""
+    """Choose by the first condition that is true."""
     found = default
     for condition, choice in reversed([*zip(conditions, choices, strict=True)]):
         found = namespace.where(condition, choice, found)
@@ -113,12 +112,12 @@ def select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) 
 
 
 def cube_root(x: Any) -> Traced:
-    """Cube root, of negative numbers, too."""
+    """Return the real cube root, also for negative numbers."""
     return namespace.multiply(namespace.sign(x), namespace.pow(namespace.abs(x), 1.0 / 3.0))
 
 
 def remainder_of_dividend(one: Any, other: Any) -> Traced:
-    """Remainder with the sign of the dividend."""
+    """Return the remainder with the sign of the dividend."""
     size = namespace.remainder(namespace.abs(one), namespace.abs(other))
     return namespace.multiply(namespace.where(namespace.less(one, 0.0), -1.0, 1.0), size)
 
@@ -191,7 +190,7 @@ UFUNCS: Mapping[Any, Callable[..., Any]] = {
     **dict.fromkeys((numpy.degrees, numpy.rad2deg), lambda x: namespace.multiply(x, 180.0 / numpy.pi)),
     **dict.fromkeys((numpy.radians, numpy.deg2rad), lambda x: namespace.multiply(x, numpy.pi / 180.0)),
 }
-"""Functions of entries, by NumPy's objects."""
+"""Elementwise functions by NumPy's objects."""
 REDUCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.add: namespace.sum,
     numpy.multiply: namespace.prod,
@@ -201,7 +200,7 @@ REDUCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.logical_or: namespace.any,
     numpy.logaddexp: namespace._reduction(log_add_exp),
 }
-"""What ``function.reduce`` computes."""
+"""Implementations of ``function.reduce`` by NumPy's objects."""
 FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
     **{
         getattr(numpy, name): getattr(namespace, name)
@@ -244,21 +243,21 @@ FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.linalg.norm: norm,
     numpy.dot: dot,
 }
-"""Functions of arrays, likewise."""
+"""Functions of arrays by NumPy's objects."""
 INVERSES = (numpy.linalg.inv, numpy.linalg.solve, numpy.linalg.det, numpy.linalg.pinv, numpy.linalg.lstsq)
 """Functions whose pivots depend on numbers."""
 OTHERWISE = "write it with arithmetic, numpy.sum and numpy.where"
-"""What to do in place of any other function."""
+"""Advice for all other functions."""
 for _function, _own in UFUNCS.items():
-    if not hasattr(Traced, _function.__name__):  # what NumPy calls on the entries of an array of objects
+    if not hasattr(Traced, _function.__name__):  # NumPy calls it on entries of arrays of objects
         setattr(Traced, _function.__name__, _own)
 
 
 def call_ufunc(function: Any, method: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> Traced:
-    """Compute a function of entries, or its reduction along an axis.
+    """Compute an elementwise function, or its reduction along an axis.
 
     Raises:
-        NotTraceable: for what cannot be traced.
+        NotTraceable: for a function that cannot be traced.
     """
     keywords = {name: value for name, value in keywords.items() if value is not None}
     if method == "__call__" and not keywords and function in UFUNCS:
@@ -274,7 +273,7 @@ def call_function(function: Any, arguments: Sequence[Any], keywords: Mapping[str
     """Compute a function of arrays.
 
     Raises:
-        NotTraceable: for what cannot be traced.
+        NotTraceable: for a function that cannot be traced.
     """
     found: Traced = (
         FUNCTIONS[function](*arguments, **keywords)
@@ -285,7 +284,7 @@ def call_function(function: Any, arguments: Sequence[Any], keywords: Mapping[str
 
 
 def _on_objects(function: Any, arguments: Any, keywords: Mapping[str, Any]) -> Any:
-    """Let NumPy compute a function on arrays of objects, whose arithmetic makes expressions."""
+    """Compute a function with NumPy on arrays of objects, whose arithmetic makes expressions."""
 
     def objects(given: Any) -> Any:
         if isinstance(given, list | tuple):

@@ -1,6 +1,6 @@
-"""A long straight line cut into parts, because the time that compilers take grows faster than a function's length.
+"""Division of a long straight line into parts, because compilers' time grows faster than a function's length.
 
-What crosses a cut lies in a scratch array; inputs and constants are read again in every part instead.
+Values that cross a cut are stored in a scratch array; inputs and constants are read again in every part.
 """
 
 import heapq
@@ -8,21 +8,21 @@ import heapq
 from .program import BAND, ProgramResult, StraightLineProgram
 
 FREE = ("input", "constant", "entry")
-"""Steps that every part makes again instead of fetching them from a slot of the scratch array."""
+"""Steps that every part reads again instead of using the scratch array."""
 Statement = int | ProgramResult
-"""What takes a compiler time: a step that is computed, or a result that is written."""
+"""A statement of a compiler's input: a computed step, or a stored result."""
 
 
 def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[list[list[Statement]], int]:
-    """Statements of each part: every step but those that are free, and every result right after its step.
+    """Return the statements of each part: all steps except free ones, and every result right after its step.
 
     Args:
-        program: to cut.
+        program: the program.
         size: statements of a part.
-        pause: a step with which a part begins.
+        pause: a step at which a new part begins.
 
     Returns:
-        Parts, at least one, and how many of them are before the pause.
+        Parts, at least one, and the number of parts before the pause.
     """
     results: dict[int, list[Statement]] = {}
     for result in program.results:
@@ -38,11 +38,11 @@ def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[
 
 
 def scratch_slots(program: StraightLineProgram, parts: list[list[Statement]]) -> dict[int, int]:
-    """Place in the scratch array of every step that crosses a cut; places are used again.
+    """Return the place in the scratch array of every step that crosses a cut; places are reused.
 
     Args:
-        program: that was cut.
-        parts: of :func:`cut_parts`.
+        program: the program.
+        parts: parts of :func:`cut_parts`.
     """
     steps = program.steps.all()
     part_of = {step: i for i, part in enumerate(parts) for step in part if isinstance(step, int)}
@@ -65,11 +65,11 @@ def scratch_slots(program: StraightLineProgram, parts: list[list[Statement]]) ->
 
 
 def product_places(program: StraightLineProgram, first: int) -> tuple[dict[int, int], int]:
-    """Place in the scratch array of what comes out of every product, and behind all of them that of a vector.
+    """Return the places of all products' results in the scratch array, and that of a vector after them.
 
     Args:
-        program: that was cut.
-        first: place behind the slots.
+        program: the program.
+        first: first place after the slots.
     """
     places = {}
     for index, (operation, arguments, _) in enumerate(program.steps):

@@ -1,7 +1,7 @@
-"""Expressions of one lane, each kept once, and the straight-line program that computes some of them.
+"""Expressions of one lane, each stored once, and the straight-line program that computes some of them.
 
-An expression is a number: its place in the :class:`Graph`. One that is made again is found again (common
-subexpressions), one of constants is computed at once, and what no result needs never enters a program.
+An expression is a number: its index in the :class:`Graph`. Equal expressions share one number (common subexpressions),
+expressions of constants are computed at once (constant folding), and a program contains only what its results need.
 """
 
 import functools
@@ -32,7 +32,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "where": lambda truth, one, other: one if truth else other,
     "number": lambda truth: numpy.float64(truth),
 }
-"""What each operation means, in NumPy's words; ``number`` is 1 for true and 0 for false."""
+"""NumPy's function for each operation; ``number`` is 1 for true and 0 for false."""
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "exp": numpy.exp,
     "expm1": numpy.expm1,
@@ -57,38 +57,39 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "pow": numpy.power,
     "hypot": numpy.hypot,
 }
-"""What a library computes, by the names of C's."""
+"""NumPy's function for each library function, by its name in C."""
 LOCK = threading.RLock()
-"""Held by whoever traces or compiles."""
+"""Lock of the thread that traces or compiles."""
 if hasattr(os, "register_at_fork"):
-    # A child has none of the other threads, and what one of them holds it would wait for without end.
+    # A child has none of the other threads, and would wait forever for a lock of one of them.
     os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release)
 _COMPUTE = OPERATIONS | FUNCTIONS
 _CONSTANTS: "weakref.WeakValueDictionary[tuple[bytes, ...], numpy.ndarray]" = weakref.WeakValueDictionary()
-"""Constants of programs with tables, by scalars and digests: programs of many competitors read one log."""
+"""Constants of programs with tables, by scalars and digests; programs of many competitors share one log."""
 _EXACT = frozenset(("add", "subtract", "multiply", "divide", "negative", "absolute", "sqrt"))
-"""Operations that have the same bits on arrays as on numbers, whatever NumPy does them with."""
+"""Operations whose results in NumPy have the same bits for arrays as for numbers, on every processor."""
 FEW = 16
-"""Members of an array operation that are quicker made one by one."""
+"""Members of an array operation below which it is faster to make them one by one."""
 BAND = 8
-"""Rows of a matrix of constants that a loop sums side by side."""
+"""Rows of a matrix of constants that a loop sums in parallel."""
 OTHERS = {"take": 1, "product": 2, "entry": 1}
-"""How many arguments of these expressions come before those that are expressions."""
+"""Number of leading arguments of these expressions that are not expressions."""
 BEFORE = {"input": 2, "constant": 1, "take": 2, "product": 2, "entry": 1}
-"""How many arguments of a step come before those that are steps."""
+"""Number of leading arguments of a step that are not steps."""
 
 
 def unband(table: numpy.ndarray, rows: int, columns: int) -> numpy.ndarray:
-    """Matrix ``(rows, columns)`` of the table of a product."""
+    """Return the matrix ``(rows, columns)`` of the table of a product."""
     return table.reshape(-1, columns, BAND).swapaxes(1, 2).reshape(-1, columns)[:rows]
 
 
 @contextmanager
 def without_collection() -> Iterator[None]:
-    """Let nobody look for garbage inside: of a hundred thousand new expressions none is, and looking through them again
-    and again takes a third of the time.
+    """Disable garbage collection inside.
+
+    None of a hundred thousand new expressions is garbage, and repeated searches would take a third of the time.
     """
-    with LOCK:  # else a process forked meanwhile would never collect
+    with LOCK:  # otherwise a process forked meanwhile would never collect
         enabled = gc.isenabled()
         gc.disable()
         try:
@@ -101,19 +102,18 @@ def without_collection() -> Iterator[None]:
 class Graph:
     """Expressions of one lane.
 
-    ``input`` (argument, row) reads a number that the program is given; ``constant`` has a value; ``take`` (table,
-    index) reads a table of constants; ``product`` (table, rows, *vector) multiplies a matrix of constants with a
-    vector, and ``entry`` (row, product) is a number of what comes out; everything else is an entry of ``OPERATIONS``
-    or ``FUNCTIONS``.
+    ``input`` (argument, row) reads an input of the program; ``constant`` has a value; ``take`` (table, index) reads a
+    table of constants; ``product`` (table, rows, *vector) multiplies a matrix of constants with a vector, and ``entry``
+    (row, product) is a number of the result; every other expression is an entry of ``OPERATIONS`` or ``FUNCTIONS``.
 
     Attributes:
-        operations: name of every expression.
-        arguments: expressions that it is made of (numbers, of inputs, and the table of ``take``).
-        values: value of a constant, None of what varies.
-        groups: number of the array operation that made an expression: those of one do not depend on one another.
-        tables: what ``take`` and ``product`` read, ``(length,)`` each.
-        loops: whether products with large matrices of constants may be kept whole, for code that has loops.
-        callers: functions that asked for each array operation, by its number; None: nobody wants to know.
+        operations: name of every expression's operation.
+        arguments: arguments of every expression: expressions; numbers of an input; first the table of ``take``.
+        values: value of every constant, None for other expressions.
+        groups: number of the array operation that made each expression; expressions of one are independent.
+        tables: tables of ``take`` and ``product``, ``(length,)`` each.
+        loops: whether products with large matrices of constants stay whole, for code with loops.
+        callers: functions that called each array operation, by its number; None: not recorded.
     """
 
     def __init__(self, loops: bool = False, callers: bool = False) -> None:
@@ -127,7 +127,7 @@ class Graph:
         self.group: int = 0
         self.tables: list[numpy.ndarray] = []
         self.digests: list[bytes] = []
-        """Of the tables."""
+        """Digests of the tables."""
         self._found: dict[Any, int] = {}
         self._numbers, self._known = numpy.empty(0), numpy.empty(0, dtype=bool)
         self._counted = 0
@@ -144,31 +144,34 @@ class Graph:
         return found
 
     def settle(self, node: int, use: str) -> Any:
-        """Plain value of an expression that decides a ``branch``, becomes a ``number`` or is put into ``words``; None:
-        there is none.
+        """Return the plain value of an expression; None: it has none.
+
+        Args:
+            node: the expression.
+            use: ``branch`` for a condition, ``number`` for a conversion to float, ``words`` for formatting.
         """
         return None
 
     def begin_group(self) -> None:
-        """Say that what is made from now on is another array operation."""
+        """Begin a new array operation."""
         self.group += 1
         if self.callers is not None:
             self.callers[self.group] = _callers()
 
     def input(self, argument: int, row: int) -> int:
-        """Number in a row of an argument."""
+        """Return the number in a row of an argument."""
         return self._intern(("input", argument, row), "input", (argument, row), None, False)
 
     def constant(self, value: Any) -> int:
-        """Number or truth value that is known."""
+        """Return the expression of a known number or truth value."""
         if isinstance(value, bool | numpy.bool_):
             return self._intern(("constant", bool(value)), "constant", (), bool(value), True)
         return self.constants(numpy.array([value], dtype=numpy.float64))[0]
 
     def constants(self, values: numpy.ndarray) -> list[int]:
-        """Numbers that are known, float64 ``(n,)``."""
+        """Return the expressions of known numbers, float64 ``(n,)``."""
         found, made = self._found, []
-        # By its bits: -0.0 is not 0.0, and NaN is itself.
+        # By bits, as -0.0 differs from 0.0, and NaN equals itself.
         for bits, value in zip(values.view(numpy.int64).tolist(), values.tolist(), strict=True):
             node = found.get(bits)
             if node is None:
@@ -177,20 +180,20 @@ class Graph:
         return made
 
     def take(self, table: numpy.ndarray, index: int) -> int:
-        """Entry of a table; an index outside is that of the nearest end, a negative one counts from the last."""
+        """Return the entry of a table; a negative index counts from the end, one outside is clipped to the range."""
         known = self.values[index]
         if known is not None:
             return self.constant(table[int(known)])
-        if table.view(numpy.int64).min() == table.view(numpy.int64).max():  # the same wherever it is read
+        if table.view(numpy.int64).min() == table.view(numpy.int64).max():  # all entries are equal
             return self.constant(table[0])
         place = self._table(table)
         return self._intern(("take", place, index), "take", (place, index), None, False)
 
     def product(self, matrix: numpy.ndarray, vector: Sequence[int]) -> list[int]:
-        """Entries of the product of a matrix ``(rows, columns)`` with a vector, summed from the first column on.
+        """Return the entries of the product of a matrix ``(rows, columns)`` with a vector, summed in order of columns.
 
-        The table holds the matrix as the loop reads it: bands of ``BAND`` rows, the last one filled up with zeros, and
-        in each the columns one after the other.
+        The table contains the matrix in the order of the loop: bands of ``BAND`` rows, the last one padded with zeros,
+        and in each band the columns one after the other.
         """
         rows, columns = matrix.shape
         bands = -(-rows // BAND)
@@ -209,7 +212,7 @@ class Graph:
         return unband(self.tables[table], rows, len(vector))
 
     def _table(self, table: numpy.ndarray) -> int:
-        # A digest: of a long recording there are tables of its length.
+        # A digest, because tables may have the length of a long recording.
         key = ("table", hashlib.blake2b(numpy.ascontiguousarray(table).data, digest_size=32).digest())
         if key not in self._found:
             self._found[key] = len(self.tables)
@@ -218,7 +221,7 @@ class Graph:
         return int(self._found[key])
 
     def node(self, name: str, *arguments: int) -> int:
-        """Expression of others."""
+        """Return the expression of an operation on other expressions."""
         known = self.values
         values = [known[argument] for argument in arguments]
         if None not in values:
@@ -227,17 +230,20 @@ class Graph:
         simpler = self._simpler(name, arguments, values)
         if simpler is not None:
             return simpler
-        # Found in either order, and kept in the order of the array operation, whose members are alike then.
+        # Found in either order, and stored in the order of the array operation, so that its members have one form.
         key = (name, *(sorted(arguments) if name in COMMUTATIVE else arguments))
         logical = name in LOGICAL or (name == "where" and self.logical[arguments[1]])
         return self._intern(key, name, arguments, None, logical)
 
     def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Expressions of others, member by member: what :meth:`node` makes of each, in a fraction of the time.
+        """Return the expressions of an array operation: the results of :meth:`node`, in a fraction of the time.
 
         Args:
-            name: of the operation.
+            name: name of the operation.
             columns: for each argument the expressions of all members, ``(n,)``.
+
+        Returns:
+            ``(n,)``.
         """
         if len(columns[0]) < FEW:
             rows = zip(*(column.tolist() for column in columns), strict=True)
@@ -271,7 +277,7 @@ class Graph:
         known: Sequence[numpy.ndarray],
         numbers: Sequence[Any],
     ) -> Any:
-        """Members for which :meth:`_simpler` may know something that :meth:`nodes` does not do by itself."""
+        """Return which members :meth:`_simpler` may simplify beyond the rules in :meth:`nodes`."""
         if name in ("maximum", "minimum"):
             return numpy.logical_or.reduce(
                 [there & (number != number) for there, number in zip(known, numbers, strict=True)]
@@ -286,7 +292,7 @@ class Graph:
         return name in ("negative", "logical_and", "logical_or")
 
     def _count(self) -> None:
-        """Put the values of new expressions into arrays."""
+        """Copy the values of new expressions into arrays."""
         first, count = self._counted, len(self.values)
         if count > len(self._numbers):
             for each in ("_numbers", "_known"):
@@ -299,11 +305,11 @@ class Graph:
         self._counted = count
 
     def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Expressions of others that have no simpler form."""
+        """Return the expressions of members that have no simpler form."""
         ordered = (numpy.minimum(*columns), numpy.maximum(*columns)) if name in COMMUTATIVE else columns
         keys = list(zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False))
         count = len(self.operations)
-        # As if all were new; where some are not, the new ones are numbered again.
+        # Numbered as if all were new; otherwise the new ones are numbered again.
         made = numpy.array(list(map(self._found.setdefault, keys, itertools.count(count))))
         fresh = numpy.flatnonzero(made == count + numpy.arange(len(keys)))
         if len(fresh) < len(keys):
@@ -323,11 +329,11 @@ class Graph:
         return made
 
     def _simpler(self, name: str, arguments: tuple[int, ...], values: list[Any]) -> int | None:
-        """The same with less work, for finite numbers."""
+        """Return an equivalent simpler expression, for finite numbers; None: there is none."""
         if name in ("logical_and", "logical_or"):
             for known, other in ((0, 1), (1, 0)):
                 if values[known] is not None:
-                    # true and x = x, false or x = x; else the known one decides
+                    # true and x = x, false or x = x; else the result is the known one
                     return arguments[other if values[known] == (name == "logical_and") else known]
             return arguments[0] if arguments[0] == arguments[1] else None
         if name == "where":
@@ -335,7 +341,7 @@ class Graph:
                 return arguments[1 if values[0] else 2]
             return arguments[1] if arguments[1] == arguments[2] else None
         if name in ("maximum", "minimum"):
-            # The code takes the other one where a comparison is false: of a constant it must be a number.
+            # The code takes the second one where a comparison is false, so a constant must not be NaN.
             return next((a for a, v in zip(arguments, values, strict=True) if v is not None and v != v), None)
         if name == "negative":
             inner = arguments[0]
@@ -360,8 +366,9 @@ class Graph:
         return a if y == 1.0 else None
 
     def live(self, wanted: Iterable[int]) -> list[int]:
-        """What the wanted expressions are made of, each after its own parts and as late as that allows: a sum of
-        products is finished before the next begins, and its terms need not be kept.
+        """Return all expressions that the wanted ones depend on, each after its own parts and as late as possible.
+
+        A sum of products is thus complete before the next begins, and its terms need no storage.
         """
         seen = bytearray(len(self.operations))
         order: list[int] = []
@@ -371,7 +378,7 @@ class Graph:
             pop, wait, wait_all = waiting.pop, waiting.append, waiting.extend
             while waiting:
                 node = pop()
-                if node < 0:  # its parts are there
+                if node < 0:  # its parts are done
                     finish(~node)
                 elif not seen[node]:
                     seen[node] = True
@@ -384,13 +391,13 @@ class Graph:
         return order
 
     def parts(self, node: int) -> tuple[int, ...]:
-        """Expressions that one is directly made of."""
+        """Return the expressions that one directly depends on."""
         name = self.operations[node]
         return () if name == "input" else self.arguments[node][OTHERS.get(name, 0) :]
 
 
 def _callers() -> str:
-    """The nearest function outside of this package, and the nearest of another file that has called it."""
+    """Return the nearest function on the stack outside this package, and the nearest one in another file."""
     found: dict[str, str] = {}
     frame: types.FrameType | None = sys._getframe(2)
     while frame is not None and len(found) < 2:
@@ -403,12 +410,12 @@ def _callers() -> str:
 
 @functools.cache
 def _stem_outside(path: str) -> str | None:
-    """Name of a file without its ending, None of one of this package."""
+    """Return the name of a file without its ending; None for a file of this package."""
     return None if Path(path).parent == Path(__file__).parent else Path(path).stem
 
 
 class ProgramResult(NamedTuple):
-    """Where a program writes an expression."""
+    """Destination of an expression: a row of an argument."""
 
     argument: int
     row: int
@@ -420,27 +427,27 @@ class ProgramStep(NamedTuple):
 
     operation: str
     arguments: tuple[int, ...]
-    """Steps before it; of an ``input`` argument and row, of a ``constant`` its place in ``constants``, of a
-    ``take`` the place of its table in ``constants``, its length and a step, of a ``product`` the place of its table,
-    its number of rows and the steps of the vector, of an ``entry`` a row and the step of the product."""
+    """Earlier steps. For ``input``: argument and row; for ``constant``: its index in ``constants``; for ``take``: the
+    index of its table in ``constants``, its length and a step; for ``product``: the index of its table, its number of
+    rows and the steps of the vector; for ``entry``: a row and the step of the product."""
 
     @property
     def parts(self) -> tuple[int, ...]:
-        """Steps that it is directly made of."""
+        """Steps that it directly depends on."""
         return self.arguments[BEFORE.get(self.operation, 0) :]
 
     logical: bool
 
 
 class ProgramSteps(Sequence[ProgramStep]):
-    """Operations one after the other, as columns of numbers: a step is made where somebody looks at it.
+    """Steps of a program as columns of numbers; a :class:`ProgramStep` is made on access.
 
     Args:
-        names: what the operations are called.
-        kinds: ``(n,)``: for each step which of them it is.
-        begins: ``(n + 1,)``: where the arguments of each step begin in ``arguments``.
-        arguments: those of :class:`ProgramStep`, one after the other.
-        logical: ``(n,)``.
+        names: names of the operations.
+        kinds: index in ``names`` of each step, ``(n,)``.
+        begins: offset of each step's arguments in ``arguments``, ``(n + 1,)``.
+        arguments: arguments of all :class:`ProgramStep`, one after the other.
+        logical: whether each step is a truth value, ``(n,)``.
     """
 
     def __init__(
@@ -464,7 +471,7 @@ class ProgramSteps(Sequence[ProgramStep]):
         return frozenset([self.names[int(kind)] for kind in numpy.unique(self.kinds)])
 
     def which(self, *operations: str) -> numpy.ndarray:
-        """For each step whether it is one of some operations, ``(n,)``."""
+        """Return for each step whether it is one of the operations, ``(n,)``."""
         return numpy.isin(self.kinds, [kind for kind, name in enumerate(self.names) if name in operations])
 
     def named(self, operation: str) -> list[ProgramStep]:
@@ -494,7 +501,7 @@ class ProgramSteps(Sequence[ProgramStep]):
         return iter(self.all())
 
     def all(self) -> list[ProgramStep]:
-        """Return all steps; from then on they are kept."""
+        """Return all steps, from a cache after the first call."""
         if self._made is None:
             numbers, names = self.arguments.tolist(), self.names
             given = [tuple(numbers[begin:end]) for begin, end in itertools.pairwise(self.begins.tolist())]
@@ -507,26 +514,26 @@ class ProgramSteps(Sequence[ProgramStep]):
 
 
 class StraightLineProgram(NamedTuple):
-    """Straight line that computes some expressions of a graph.
+    """Straight-line program for some expressions of a graph.
 
-    Constants are told apart from the steps, so that programs that differ only in numbers have the same code.
+    Constants are separate from the steps, so that programs that differ only in numbers have the same code.
     """
 
     steps: ProgramSteps
     constants: numpy.ndarray
-    """``(n,)``: scalars, then the tables one after the other."""
+    """Scalars, then the tables one after the other, ``(n,)``."""
     results: list[ProgramResult]
-    """``node`` is a step's place."""
+    """Results; ``node`` is the index of a step."""
     origins: numpy.ndarray
-    """``(n, 2)``: for each step the number of the array operation that made it, and one that grows from member to
-    member."""
+    """For each step the number of the array operation that made it, and a number that increases from member to
+    member, ``(n, 2)``."""
     callers: Mapping[int, str] = types.MappingProxyType({})
-    """Functions that asked for an array operation, where the graph knows them."""
+    """Functions that called an array operation, where the graph recorded them."""
 
 
 @without_collection()
 def program(graph: Graph, wanted: Sequence[ProgramResult]) -> StraightLineProgram:
-    """Program for some expressions of a graph."""
+    """Return the program for some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
     operations = list(map(graph.operations.__getitem__, order))
     given = list(map(graph.arguments.__getitem__, order))

@@ -1,10 +1,10 @@
-"""A straight line rolled up: what one array operation has made is one statement again, in a loop over its members.
+"""Loops over the members of array operations, recovered from a straight-line program.
 
-A trace leaves scalars behind, each with the number of the array operation that made it
-(:attr:`.StraightLineProgram.origins`). Members of one operation do not depend on one another: they become a
-:class:`Statement` of so many members. Statements of equal count stand in one loop, where a member may take what the
-same turn has computed; all else crosses loops through a scratch array. What is computed, of what, and in which order
-its operands stand is as in the straight line, so that every bit is.
+A trace consists of scalars, each with the number of the array operation that made it
+(:attr:`.StraightLineProgram.origins`). Members of one operation are independent: they become one :class:`Statement`.
+Statements with equal numbers of members share a loop, where a member may use results of the same turn; all other values
+pass from loop to loop through a scratch array. Operations, operands and their order are those of the straight line, so
+that the results have the same bits.
 """
 
 import heapq
@@ -19,46 +19,46 @@ from .parts import FREE
 from .program import StraightLineProgram, without_collection
 
 LEAST = 3
-"""Members of a statement: fewer are statements of their own."""
+"""Fewest members of a statement; members of smaller operations are separate statements."""
 MOST = 100
-"""Statements of a loop."""
+"""Most statements of a loop."""
 SHORTER = 1.5
-"""Straight statements that are as long, compiled, as a statement in a loop with its tables."""
+"""Length of the code of a statement in a loop with its tables, in statements of a straight line."""
 SCRATCH, CONSTANTS, TURN, COMPUTED = -1, -2, -3, -4
-"""In place of an argument: the scratch array, the constants, what a statement of the same loop has computed in the same
-turn, and what is computed at all."""
+"""Values in place of an argument: the scratch array, the constants, the result of a statement in the same turn of the
+same loop, and any computed value."""
 
 
 class Operand(NamedTuple):
-    """Where the members of a statement find a number, or leave one."""
+    """Places that the members of a statement read or write."""
 
     array: int
     """An argument, or one of ``SCRATCH``, ``CONSTANTS``, ``TURN``."""
     places: tuple[int, ...]
-    """For every member: a row of the argument, a place in the scratch array, or in the constants; of ``TURN`` the
-    number of the statement alone."""
+    """For every member a row of the argument, or an index in the scratch array or in the constants; for ``TURN`` only
+    the number of the statement."""
     logical: bool = False
-    """Whether it is a truth value: in the arrays one and zero."""
+    """Whether it is a truth value, stored as one or zero."""
 
 
 class Statement(NamedTuple):
-    """One operation for so many members."""
+    """One operation for several members."""
 
     number: int
     operation: str
-    """As of a step, or ``copy``."""
+    """Operation of a step, or ``copy``."""
     operands: tuple[Operand, ...]
     logical: bool
     table: tuple[int, int]
-    """Of ``take``: where its table begins in the constants, and its length."""
+    """For ``take``: the index of its table in the constants, and its length."""
     kept: tuple[Operand, ...]
-    """Where its members go beside the turn itself."""
+    """Places where its members are stored for later loops and results."""
     origin: int
-    """Number of the array operation that it is of; of what is copied none."""
+    """Number of its array operation; that of no operation for a copy."""
 
 
 class Loop(NamedTuple):
-    """Statements that are computed together, turn by turn."""
+    """Statements of one loop."""
 
     turns: int
     body: list[Statement]
@@ -69,24 +69,24 @@ class Rolled(NamedTuple):
 
     loops: list[Loop]
     before: int
-    """Loops that stand before the pause."""
+    """Number of loops before the pause."""
     scratch: int
-    """Numbers in the scratch array."""
+    """Length of the scratch array."""
 
 
 class _Read(NamedTuple):
-    """Where a whole operand comes from."""
+    """Source of a whole operand."""
 
     source: int | None
     """The argument, or the constants; None: the scratch array, or the turn."""
     turn: int | None
-    """The statement whose members it is, one by one."""
+    """The statement whose members it equals, one by one; None: there is none."""
     statements: set[int]
-    """Those whose members it has."""
+    """Statements whose members it contains."""
 
 
 class _Draft:
-    """A statement whose places are not known yet: members and operands are steps."""
+    """A statement before places are assigned: members and operands are steps."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class _Draft:
 
 
 class _Roller:
-    """What :func:`roll` is made with."""
+    """State of :func:`roll`."""
 
     def __init__(self, program: StraightLineProgram, results: int) -> None:
         self.program, self.steps = program, program.steps
@@ -115,13 +115,13 @@ class _Roller:
         self.drafts: list[_Draft] = []
         self.group, self.order = program.origins.T
         self.logical = self.steps.logical
-        # Where a free step's number is found, and at which place there; what others are made of, -1 where of less.
+        # Source of a free step's number, and its place there; parts of other steps, -1 where there are fewer.
         self.source, self.place = numpy.full((2, len(self.steps)), COMPUTED)
         self.parts = numpy.full((len(self.steps), 3), -1)
         self._read_steps()
-        # Statement of a step, and which member it is there.
+        # Statement of a step, and its index among the members.
         self.statement, self.member = numpy.full((2, len(self.steps)), -1)
-        self._compute(list(self._alike()))
+        self._compute(list(self._group_steps()))
         early = program.results[:results]
         for late, some in ((False, early), (True, program.results[results:])):
             rows: dict[int, dict[int, int]] = {}
@@ -129,13 +129,13 @@ class _Roller:
                 rows.setdefault(result.argument, {})[result.row] = result.node
             for argument, nodes in rows.items():
                 self._write(argument, nodes, late)
-        self._copy_what_is_mixed()
+        self._copy_mixed_operands()
         reads = self._find_sources()
         for draft in self.drafts:
             draft.reads = [next(reads) for _ in draft.columns]
 
     def _read_steps(self) -> None:
-        """Put what steps are made of into arrays, operation by operation."""
+        """Copy the parts of steps into arrays, operation by operation."""
         steps = self.steps
         self.tables = numpy.zeros(len(steps), dtype=numpy.int64)
         for kind, name in enumerate(steps.names):
@@ -157,10 +157,10 @@ class _Roller:
             self.member[draft.members] = numpy.arange(draft.count)
         self.drafts.append(draft)
 
-    # --- what becomes a statement
+    # --- statements
 
-    def _alike(self) -> Iterator[numpy.ndarray]:
-        """Steps of one array operation with one form, in the order of that operation."""
+    def _group_steps(self) -> Iterator[numpy.ndarray]:
+        """Yield the steps of one array operation with one form, in the order of that operation."""
         parts = self.parts
         computed = numpy.flatnonzero(self.source == COMPUTED)
         if not len(computed):
@@ -191,7 +191,7 @@ class _Roller:
                 yield steps[start:end]
 
     def _levels(self) -> numpy.ndarray:
-        """Of what one operation makes in several steps: how many come before."""
+        """Return the depth of each step among those of its array operation."""
         inside = (self.parts >= 0) & (self.group[self.parts] == self.group[:, None])
         inside &= self.source[self.parts] == COMPUTED
         levels = numpy.zeros(len(self.steps), dtype=numpy.int64)
@@ -200,7 +200,7 @@ class _Roller:
         return levels
 
     def _compute(self, groups: Sequence[numpy.ndarray]) -> None:
-        """Statements of steps that are alike."""
+        """Add the statements of steps that have one form."""
         heads = numpy.array([members[0] for members in groups], dtype=numpy.int64)
         kinds, logical, number = (
             column[heads].tolist() for column in (self.steps.kinds, self.logical, self.group)
@@ -217,7 +217,7 @@ class _Roller:
             self._add(draft)
 
     def _write(self, argument: int, nodes: dict[int, int], late: bool) -> None:
-        """Statements that write results: those of a whole statement with it, the others together."""
+        """Add the statements that write results: one for the results of a whole statement, one for all others."""
         by_draft: dict[int, list[tuple[int, int]]] = {}
         rest = []
         for row, step in sorted(nodes.items()):
@@ -241,8 +241,8 @@ class _Roller:
         self._add(draft)
 
     def _sources(self, columns: Sequence[numpy.ndarray]) -> list[int | None]:
-        """For each operand the argument or the constants that all of it is read from; None: the scratch array."""
-        steps, starts, lengths = _joined(columns)
+        """Return for each operand the argument or the constants that contain all of it; None: the scratch array."""
+        steps, starts, lengths = _join_columns(columns)
         sources = self.source[steps]
         own = sources[starts]
         alike = numpy.logical_and.reduceat(sources == numpy.repeat(own, lengths), starts)
@@ -251,8 +251,8 @@ class _Roller:
             for source, same in zip(own.tolist(), alike.tolist(), strict=True)
         ]
 
-    def _copy_what_is_mixed(self) -> None:
-        """Inputs and constants that stand beside other values in an operand are copied to the scratch array, once."""
+    def _copy_mixed_operands(self) -> None:
+        """Copy inputs and constants that share an operand with other values to the scratch array, once."""
         for late in (False, True):
             columns = [column for draft in self.drafts if draft.late == late for column in draft.columns]
             pairs = zip(columns, self._sources(columns), strict=True)
@@ -265,13 +265,13 @@ class _Roller:
                 draft.group = -1 - len(self.drafts)
                 self._add(draft)
 
-    # --- in which order
+    # --- order
 
     def _find_sources(self) -> Iterator[_Read]:
-        """Where all operands of all statements come from."""
+        """Yield the sources of all operands of all statements."""
         columns = [column for draft in self.drafts for column in draft.columns]
         counts = numpy.array([draft.count for draft in self.drafts])
-        steps, starts, lengths = _joined(columns)
+        steps, starts, lengths = _join_columns(columns)
         first = numpy.repeat(steps[starts], lengths)
         members = numpy.arange(len(steps)) - numpy.repeat(starts, lengths)
         numbers = self.statement[steps]
@@ -287,7 +287,7 @@ class _Roller:
                 yield _Read(None, number[i] if of_all[i] else None, statements)
 
     def _needs(self, draft: _Draft) -> dict[int, bool]:
-        """Statements that one takes members of, and whether the same turn of a loop will do."""
+        """Return the statements whose members a draft reads, and whether the same turn of a loop suffices."""
         needs: dict[int, bool] = {}
         for _, turn, statements in draft.reads:
             for number in statements:
@@ -295,7 +295,7 @@ class _Roller:
         return needs
 
     def schedule(self) -> list[list[int]]:
-        """Put every statement into a loop with others of its count, as early as what it takes allows."""
+        """Assign every statement to a loop of equal count, as early as its operands allow."""
         drafts = self.drafts
         waits = [0] * len(drafts)
         users: list[list[tuple[int, bool]]] = [[] for _ in drafts]
@@ -333,10 +333,10 @@ class _Roller:
             loops.append(body)
         return loops
 
-    # --- where
+    # --- places
 
     def finish(self) -> Rolled:
-        """Loops with the places of all that crosses them."""
+        """Return the loops with the places of all values that pass between them."""
         loops = self.schedule()
         drafts = self.drafts
         turns: dict[tuple[int, int], int] = {}
@@ -379,8 +379,9 @@ class _Roller:
         return Rolled(made, before, scratch)
 
     def _slots(self, kept: Iterable[int], last: dict[int, int]) -> tuple[dict[int, int], int]:
-        """Place in the scratch array of the first member of every statement that is kept, and its length; what one
-        array operation made lies together as long as any of it is needed.
+        """Return the place of every kept statement's first member in the scratch array, and the length of that array.
+
+        Results of one array operation are adjacent, and are stored as long as any of them is needed.
         """
         inside: dict[int, int] = {}
         sizes: dict[int, int] = {}
@@ -405,8 +406,8 @@ class _Roller:
         return {number: base[self.drafts[number].group] + k for number, k in inside.items()}, top
 
 
-def _joined(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
-    """Columns one after the other, where each begins, and how long it is."""
+def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
+    """Return the columns one after the other, and the start and length of each."""
     lengths = numpy.array([len(column) for column in columns], dtype=numpy.int64)
     steps = numpy.concatenate([*columns, numpy.zeros(0, dtype=numpy.int64)])
     return steps, numpy.cumsum(lengths) - lengths, lengths
@@ -414,21 +415,21 @@ def _joined(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndar
 
 @without_collection()
 def roll(program: StraightLineProgram, results: int = 0) -> Rolled:
-    """Roll a program up.
+    """Return a program as loops.
 
     Args:
-        program: with origins, and without products that are loops.
-        results: first results that are written before any other input than theirs is read.
+        program: program with origins, and without products that are loops.
+        results: number of first results that are written before any other input than theirs is read.
     """
     return _Roller(program, results).finish()
 
 
 def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled | None:
-    """Roll a program up where that makes less code; None: it stays a straight line.
+    """Return a program as loops where that makes less code; None: it stays a straight line.
 
     Args:
-        program: with origins.
-        results: as :func:`roll` has it.
+        program: program with origins.
+        results: number of first results, see :func:`roll`.
     """
     if "product" in program.steps.operations:
         return None
@@ -438,8 +439,8 @@ def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled
     return rolled if SHORTER * statements < operations + len(program.results) else None
 
 
-def steady(places: Sequence[int]) -> int | None:
-    """Distance from each place to the next, where it is always the same."""
+def common_difference(places: Sequence[int]) -> int | None:
+    """Return the distance from each place to the next if it is constant, else None."""
     count, first = len(places), places[0]
     step = places[1] - first if count > 1 else 0
     regular = range(first, first + step * count, step) if step else (first,) * count

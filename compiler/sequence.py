@@ -1,10 +1,10 @@
-"""Calls of native functions one after another, over many steps, without going back to Python between them.
+"""Sequences of native calls over many steps, without a return to Python in between.
 
-A step is a list of calls, each a function and its table of addresses. What is written by one step and read by the next
-goes to and fro between two memories, so there are two lists, for even and odd steps. Some entries of the tables move on
-with every step: the address of a row of noise or of a report, or a counter.
+A step is a list of calls, each a function and its table of addresses. Two memories alternate between steps: one step
+writes what the next one reads. So there are two lists, for even and odd steps. Some entries of the tables advance with
+every step: the address of a row of noise or of a report, or a counter.
 
-A tile of lanes goes through all steps before the next one begins, and stays in the processor's cache meanwhile.
+A tile of lanes passes through all steps before the next tile begins, so that it stays in the processor's cache.
 """
 
 import functools
@@ -20,8 +20,8 @@ from .functions import UNCOUNTED, Call, address_of, empty_lanes, run_over
 from .native import Native, address_of_code, native_text
 
 TILE = 64
-"""Lanes that go through all steps together: enough that a call costs little beside its numbers, few enough for the
-cache. Of programs of 300 to 80,000 operations all run within a tenth of their fastest tile, from 32 to 512 lanes."""
+"""Lanes of a tile: enough that a call costs little compared with its arithmetic, few enough for the cache. Programs of
+300 to 80,000 operations all run within a tenth of the time of their fastest tile, from 32 to 512 lanes."""
 
 TRIES = 12
 """Runs in which one thread and several are compared."""
@@ -151,29 +151,29 @@ exit:
   ret void
 }
 """
-"""The driver, in LLVM's words; it is given what :class:`CallSequence` puts together."""
+"""The driver as text of LLVM; :class:`CallSequence` makes its argument."""
 
 
 @functools.cache
 def _driver() -> Native:
-    driver: Native = native_text(TEXT, level=0)  # nearly all the time passes in what it calls
+    driver: Native = native_text(TEXT, level=0)  # nearly all the time is spent in its calls
     return driver
 
 
 class Moving(NamedTuple):
-    """An entry of a call's table that moves on with every step."""
+    """An entry of a call's table that advances with every step."""
 
     call: Call
     entry: int
     amount: int
-    """Added after every step: bytes of an address, or whatever a counter counts."""
+    """Increment after every step: bytes of an address, or that of a counter."""
 
 
 def moving_array(call: Call, place: int, arrays: numpy.ndarray) -> Moving:
-    """Let an argument of a call be the next of several arrays at every step.
+    """Make an argument of a call the next of several arrays at every step.
 
     Args:
-        call: whose argument it is; it begins with the first.
+        call: the call; its argument is set to the first array.
         place: number of the argument.
         arrays: ``(steps, ..., N)``.
     """
@@ -182,17 +182,16 @@ def moving_array(call: Call, place: int, arrays: numpy.ndarray) -> Moving:
 
 
 class CallSequence:
-    """Calls that are run over one step or many, as one native call.
+    """Calls over one or many steps as one native call.
 
     Args:
-        even: those of an even step, in their order.
-        odd: those of an odd step, as many; needed where there is more than one step.
-        moving: what moves on with every step, in tables of these calls; after the last step it is where it was.
-        steps: how many; the first is an even one.
-        passing: places of arrays ``(..., tile)`` of these calls, those of the first tile of lanes, and how many bytes
-            further on those of the next one lie. Zero: every tile has them after the other, and what lies in them
-            when a tile ends is lost.
-        tile: lanes that go through all steps together.
+        even: calls of an even step, in order.
+        odd: calls of an odd step, of the same number; needed for more than one step.
+        moving: entries of these calls' tables that advance with every step; after the last step they are restored.
+        steps: number of steps; the first is even.
+        passing: arrays ``(..., tile)`` of these calls: call, number of the array of the first tile, and distance in
+            bytes to that of the next tile. Zero: all tiles share the array, and its content is lost when a tile ends.
+        tile: lanes that pass through all steps together.
     """
 
     def __init__(
@@ -208,8 +207,8 @@ class CallSequence:
         self._codes = numpy.zeros(len(self._calls), dtype=numpy.int64)
         self._natives: list[Native] = []
         self._count, self._asked = [0, 0], 0
-        """Lanes run over since better code was last asked for, and how often it was, by all sequences that count
-        together; and how often it was at the last run of this one.
+        """Lanes since the last check for optimised code and number of checks, shared by sequences that count together;
+        and the number of checks at the last run of this sequence.
         """
         self._tries, self._seconds = 0, [math.inf, math.inf]
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
@@ -219,16 +218,15 @@ class CallSequence:
         )
         self._passing = passing
         self._lasting = numpy.array([call.address + 8 + 16 * i for call, i, _ in passing], dtype=numpy.int64)
-        # Calls count lanes from the first of all.
+        # Calls count lanes from the first lane of all tiles.
         self._hops = numpy.array([apart - 8 * tile for *_, apart in passing], dtype=numpy.int64)
-        self._given = self._put_together(self._tables, self._entries, self._lasting)
+        self._given = self._driver_argument(self._tables, self._entries, self._lasting)
         self._run = functools.partial(_driver(), address_of(self._given))
         self._shares: dict[tuple[int, int], _Share] = {}
 
-    def _put_together(
+    def _driver_argument(
         self, tables: numpy.ndarray, entries: numpy.ndarray, lasting: numpy.ndarray
     ) -> numpy.ndarray:
-        """What the driver is given."""
         count, steps, tile = self._form
         addresses = address_of(self._codes), address_of(tables), count, address_of(entries)
         return numpy.array(
@@ -240,14 +238,14 @@ class CallSequence:
         )
 
     def expect(self, lanes: int, in_sequence: bool = False) -> None:
-        """Let every call use the code for running over so many lanes in all, see :meth:`.functions.Call.expect`."""
+        """Select the code of every call for a run over some lanes in all, see :meth:`.functions.Call.expect`."""
         natives = [call.expect(lanes, in_sequence) for call in self._calls]
         if natives != self._natives:
             self._natives, self._tries, self._seconds = natives, 0, [math.inf, math.inf]
             self._codes[:] = list(map(address_of_code, natives))
 
     def run(self, width: int, threads: int = 1) -> None:
-        """Run over all lanes, shared by so many threads where that has turned out to be faster."""
+        """Run over all lanes, with several threads where that was measured to be faster."""
         count = self._count
         count[0] += width * self._form[1]
         if count[0] > UNCOUNTED:
@@ -260,7 +258,7 @@ class CallSequence:
         if threads == 1 or width < 2 * LANES:
             self._run(0, width)
             return
-        # The first runs show it, one way and the other in turn; the shortest of each is least disturbed.
+        # The first runs alternate between both ways; the shortest time of each is least disturbed.
         trial = self._tries < TRIES
         alone = self._tries % 2 == 0 if trial else self._seconds[0] < self._seconds[1]
         begin = time.perf_counter() if trial else 0.0
@@ -275,16 +273,16 @@ class CallSequence:
             self._tries += 1
 
     def count_with(self, other: "CallSequence") -> None:
-        """Ask for better code together with another sequence, of the same code bound to other memory."""
+        """Share the count of lanes with another sequence of the same code on other memory."""
         self._count = other._count
 
     def run_once(self, width: int, threads: int = 1) -> None:
-        """Run over all lanes what is not run again, with better code at once where so many steps are worth it."""
+        """Run over all lanes once, with optimised code at once where the number of steps is worth it."""
         self.expect(self._form[1] * width // 2, in_sequence=True)
         self.run(width, threads)
 
     def _run_share(self, first: int, last: int) -> None:
-        """Run from one lane to another with tables and passing arrays of its own."""
+        """Run over the lanes from ``first`` to before ``last`` with own tables and passing arrays."""
         share = self._shares.get((first, last))
         if share is None:
             share = self._shares[first, last] = self._make_share()
@@ -300,7 +298,7 @@ class CallSequence:
         ends = self._tables + 8 * numpy.array([len(table) for table in tables])
 
         def moved(entries: numpy.ndarray) -> tuple[numpy.ndarray, list[int]]:
-            """The same entries in these tables, and which tables they are in."""
+            """Return the same entries in these tables, and the numbers of their tables."""
             owners = [int(numpy.flatnonzero((e >= self._tables) & (e < ends))[0]) for e in entries]
             return addresses[owners] + entries - self._tables[owners], owners
 
@@ -312,18 +310,18 @@ class CallSequence:
             if not apart:
                 own = arrays.setdefault(id(known), empty_lanes(known.shape[:-1], known.shape[-1]))
             passing.append((tables[owner], place, own, apart))
-        given = self._put_together(addresses, entries, lasting)
+        given = self._driver_argument(addresses, entries, lasting)
         return _Share(tables, addresses, entries, lasting, passing, given, address_of(given))
 
 
 class _Share(NamedTuple):
-    """What a thread runs its lanes with."""
+    """Tables and arrays of one thread."""
 
     tables: list[numpy.ndarray]
     addresses: numpy.ndarray
     entries: numpy.ndarray
     lasting: numpy.ndarray
     passing: list[tuple[numpy.ndarray, int, numpy.ndarray, int]]
-    """Tables, places in them, arrays that are there, and bytes to those of the next tile."""
+    """Table, number of the array, the array, and distance to that of the next tile in bytes."""
     given: numpy.ndarray
     address: int

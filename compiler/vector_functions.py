@@ -1,8 +1,8 @@
 """Functions of a vector with their exact Jacobians, for every kind of array.
 
-A function that somebody has written with NumPy is traced once, on a vector of symbols, and its Jacobian follows by
-reverse mode, one row for each entry of the answer (:mod:`.gradients`). Both are straight lines of arithmetic on one
-lane, which are then computed with the functions of any array namespace: NumPy's, torch's, or on traced arrays again.
+A user's function in NumPy is traced once, on a vector of symbols, and its Jacobian is derived by reverse mode, one row
+for each entry of the result (:mod:`.gradients`). Both are straight lines of arithmetic on one lane, which can be
+computed with the functions of any array namespace: NumPy's, torch's, or on traced arrays again.
 """
 
 import functools
@@ -24,9 +24,9 @@ _OPERATORS: dict[str, Callable[..., Any]] = {
     "divide": operator.truediv,
     "negative": operator.neg,
 }
-"""Operations that take numbers of Python beside arrays."""
+"""Operations that accept numbers of Python as well as arrays."""
 _NAMES = {"absolute": "abs", "rint": "round"}
-"""What the array API standard calls otherwise."""
+"""Operations with other names in the array API standard."""
 
 
 class VectorFunction:
@@ -34,19 +34,19 @@ class VectorFunction:
 
     Args:
         function: takes an array ``(n + g,)`` and returns a sequence or an array of m numbers; or a matrix ``(m, n)``.
-        size: n; of a function without a derivative 0.
-        given: further numbers that the function takes after these, without a derivative, g; at first there are none.
+        size: n; 0 for a function without a derivative.
+        given: number g of further arguments after these n numbers, without a derivative; default: 0.
 
     Attributes:
         size: m.
         inputs: n.
         given: g.
-        matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None, and with further numbers.
-        offset: value at zero where that is so, ``(m,)``; else None.
+        matrix: the Jacobian if it is constant and g is 0, ``(m, n)``; else None.
+        offset: value at zero if the Jacobian is constant and g is 0, ``(m,)``; else None.
 
     Raises:
-        NotTraceable: if the function is no straight line of arithmetic.
-        ValueError: if the answer is no vector.
+        NotTraceable: if the function is not a straight line of arithmetic.
+        ValueError: if the result is not a vector.
     """
 
     def __init__(self, function: Callable[[Any], Any] | numpy.ndarray, size: int, given: int = 0) -> None:
@@ -79,8 +79,9 @@ class VectorFunction:
 
     @functools.cached_property
     def linear(self) -> numpy.ndarray:
-        """Entries of the Jacobian that are the same everywhere, ``(m, n)``; of an angle that is wrapped, too: the
-        derivative of ``arctan2(sin(a), cos(a))`` is one. They are found by random states of four magnitudes.
+        """Whether each entry of the Jacobian is constant, ``(m, n)``, tested at random states of four magnitudes.
+
+        Entries of a wrapped angle are, too: the derivative of ``arctan2(sin(a), cos(a))`` is one.
         """
         rng, count = numpy.random.default_rng(0), 8
         x = rng.normal(size=(self.inputs, 4 * count)) * numpy.repeat(10.0 ** numpy.arange(4), count)
@@ -92,7 +93,7 @@ class VectorFunction:
 
     @property
     def reads(self) -> tuple[frozenset[int], ...]:
-        """Of every number of the value the places of the numbers that it depends on."""
+        """For every number of the value the indices of the inputs that it depends on."""
         found: list[frozenset[int]] = []
         for name, arguments, _ in self._value.steps:
             if name == "input":
@@ -103,7 +104,7 @@ class VectorFunction:
         return tuple(found[result.node] for result in self._value.results)
 
     def value(self, x: Any, xp: Any) -> Any:
-        """Value at vectors.
+        """Return the value at N vectors.
 
         Args:
             x: ``(n + g, N)``.
@@ -115,9 +116,14 @@ class VectorFunction:
         return xp.stack(_compute(self._value, x, xp))
 
     def jacobian(self, x: Any, xp: Any) -> Any:
-        """Jacobian at vectors, ``(m, n, N)``: rows of the value, columns of the first n of x.
+        """Return the Jacobian at N vectors with respect to the first n numbers of x.
 
-        Arguments are those of :meth:`value`.
+        Args:
+            x: ``(n + g, N)``.
+            xp: array namespace of x.
+
+        Returns:
+            ``(m, n, N)``.
         """
         entries, n = _compute(self._jacobian, x, xp), self.inputs
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
@@ -128,7 +134,7 @@ def _program(graph: Graph, nodes: Sequence[int]) -> StraightLineProgram:
 
 
 def _compute(program: StraightLineProgram, x: Any, xp: Any) -> list[Any]:
-    """Results of a program on lanes ``(n, N)``, each ``(N,)``."""
+    """Return the results of a program on lanes ``(n, N)``, each ``(N,)``."""
     values: list[Any] = []
 
     def array(place: int) -> Any:

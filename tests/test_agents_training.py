@@ -132,7 +132,7 @@ def test_curves_are_written_at_once_and_what_a_logger_gathers_stays():
 
     logger = Logger(None, [Kept()])
     logger.record("loss", 1.0)
-    training_session.curves_beside(logger)(40, {"cost": 2.0})
+    training_session.curve_writer(logger)(40, {"cost": 2.0})
     assert written == [({"cost": 2.0, "time/total_timesteps": 40}, 40)]
     assert dict(logger.name_to_value) == {"loss": 1.0}
 
@@ -198,7 +198,7 @@ def test_a_network_that_arrays_cannot_hold_is_validated_as_a_model(tmp_path):
     model = str(tmp_path / "best" / "model.zip")
     costs = evaluate(ID, [model], episodes=16, split="validation", trust=True)["cost"].values[0]
     assert entry["cost"] == validation.Bootstrap(16).means(costs.mean(axis=1))[0]
-    with pytest.raises(ValueError, match=r"cannot export LSTM\(.*num_layers=2.*holds one layer"):
+    with pytest.raises(ValueError, match=r"cannot export LSTM\(.*num_layers=2.*has one layer"):
         export_run(tmp_path, tmp_path / "agent.safetensors", trust=True)
 
 
@@ -321,12 +321,12 @@ def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
     with pytest.raises(ValueError, match=r"it has no run\.json"):
         resume_run(tmp_path, run)
     train(run, tmp_path)
-    with pytest.raises(ValueError, match="holds a run with control 'gain', not 'weights'"):
+    with pytest.raises(ValueError, match="contains a run with control 'gain', not 'weights'"):
         resume_run(tmp_path, small_run(algorithm, 400, control="weights"))
-    with pytest.raises(ValueError, match="holds a run with seed 0, not 3"):
+    with pytest.raises(ValueError, match="contains a run with seed 0, not 3"):
         resume_run(tmp_path, small_run(algorithm, 400, seed=3))
     later = dataclasses.replace(small_run(algorithm, 400), interface=7)
-    with pytest.raises(ValueError, match="holds a run with interface 2, not 7"):
+    with pytest.raises(ValueError, match="contains a run with interface 2, not 7"):
         resume_run(tmp_path, later)
     for file in (tmp_path / "checkpoint").iterdir():
         file.write_bytes(b"\x80garbage" * 20)
@@ -402,7 +402,7 @@ def test_seeds_are_trained_skipped_and_resumed(command, tmp_path):
     for more, message in (
         (("--seeds", "0", "--seed", 3), "--seeds names every seed"),
         (("--seeds", "2-1"), "--seeds needs whole numbers such as 0-4"),
-        (("--seeds", "0-3", "--envs", 3), "holds a run with envs 2, not 3"),
+        (("--seeds", "0-3", "--envs", 3), "contains a run with envs 2, not 3"),
     ):
         code, _, errors = command(*words, *more)
         assert (code, errors.count("\n")) == (2, 1)
@@ -476,11 +476,11 @@ def test_a_run_is_validated_anew_and_can_be_stopped_by_what_it_tells(algorithm, 
     """What is compiled of an agent is kept by what makes it, and the network has learned since."""
     told = []
 
-    def validated(entry):
+    def on_validation(entry):
         told.append(entry)
         return len(told) == 2
 
-    run = train(small_run(algorithm, 4000), tmp_path, validate_every=400, validated=validated)
+    run = train(small_run(algorithm, 4000), tmp_path, validate_every=400, on_validation=on_validation)
     assert run.steps_done == load_run(tmp_path).steps_done == told[1]["steps"] < 1200
     assert not run.is_complete
     assert told[0]["cost"] != told[1]["cost"]

@@ -34,7 +34,7 @@ def loaded(monkeypatch):
     """Load a small program as a new process would; returns how often it was compiled."""
     compiled = []
     monkeypatch.setattr(
-        cache, "keep", lambda name, code, keep=cache.keep: (compiled.append(name), keep(name, code))
+        cache, "store", lambda name, code, store=cache.store: (compiled.append(name), store(name, code))
     )
 
     def load():
@@ -208,16 +208,16 @@ def test_the_folder_stays_below_its_limit_and_what_was_used_stays(place, monkeyp
     monkeypatch.setattr(cache, "LIMIT", 1000)
     monkeypatch.setattr(cache, "SLACK", 0)  # look after every entry
     for age, name in enumerate(("c", "b", "a")):
-        cache.keep(name, b"." * 268)  # 300 with its checksum
+        cache.store(name, b"." * 268)  # 300 with its checksum
         os.utime(place / f"{name}{cache.SUFFIX}", (TIME - age, TIME - age))
     assert cache.load("a") == b"." * 268  # the oldest, but used: now the youngest
     (place / "mine.txt").write_bytes(b"." * 5000)
     os.utime(place / "mine.txt", (0, 0))
-    cache.keep("d", b"." * 268)
+    cache.store("d", b"." * 268)
     assert [name for name in "abcd" if cache.load(name) is not None] == ["a", "c", "d"]
     # What is not the cache's own does not count and does not go.
     assert (place / "mine.txt").exists()
-    cache.keep("e", b"." * 2000)
+    cache.store("e", b"." * 2000)
     assert files(place) == ["mine.txt"]
 
 
@@ -235,8 +235,8 @@ from filtergym.compiler import cache, namespace
 from filtergym.compiler.functions import CompiledFunction
 from filtergym.compiler.program import Graph
 compiled = []
-keep = cache.keep
-cache.keep = lambda *entry: (compiled.append(entry), keep(*entry))
+store = cache.store
+cache.store = lambda *entry: (compiled.append(entry), store(*entry))
 result = CompiledFunction(lambda x: namespace.exp(x) * namespace.sin(x) / 3.0 + x, Graph())(numpy.arange(16.0))
 print(len(compiled), result.tobytes().hex())
 """

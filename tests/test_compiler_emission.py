@@ -9,7 +9,7 @@ from contract import assert_properties
 
 from filtergym.compiler import cache, native
 from filtergym.compiler.functions import Specialised
-from filtergym.compiler.library import BINARY, VARIANTS, fastest, portable
+from filtergym.compiler.library import BINARY, VARIANTS, fastest_library, portable_library
 from filtergym.compiler.program import COMPARISONS, FUNCTIONS, OPERATIONS, Graph, ProgramResult, program
 
 pytest.importorskip("llvmlite")
@@ -18,9 +18,9 @@ HERE = native.processor()
 INTEL = platform.machine() in ("x86_64", "AMD64")
 PROCESSORS = [HERE, ("x86-64", "")] if INTEL else [HERE]
 """This one, and the least of its kind: it has no instruction that rounds, and two numbers a register."""
-LIBRARIES = [fastest(HERE[1]), portable()]
+LIBRARIES = [fastest_library(HERE[1]), portable_library()]
 """The fastest one, the slowest, and what processors with narrower vectors take."""
-LIBRARIES += [fastest(f"+{name}") for name in VARIANTS if INTEL and f"+{name}" in HERE[1].split(",")]
+LIBRARIES += [fastest_library(f"+{name}") for name in VARIANTS if INTEL and f"+{name}" in HERE[1].split(",")]
 LIBRARIES = list({library.name: library for library in LIBRARIES}.values())
 UNITS = 4.0
 """Units in the last place that a function may be wrong by: what glibc promises of its vectors. Measured there: 3.2 of

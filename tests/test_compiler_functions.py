@@ -183,7 +183,7 @@ def test_one_lane_stands_for_all_but_other_widths_are_refused():
     add = CompiledFunction(lambda x, y: x + y, Graph())
     x, y = numbers(2, 11), numbers(2, 1)
     np.testing.assert_array_equal(add(x, y), x + y)
-    with pytest.raises(ValueError, match=r"arrays have one width, got \[3, 11\]"):
+    with pytest.raises(ValueError, match=r"arrays must have one width, got \[3, 11\]"):
         add(x, x[:, :3])
 
 

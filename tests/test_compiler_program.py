@@ -9,7 +9,7 @@ from filtergym.compiler import cache, emission, functions, namespace, native
 from filtergym.compiler.block import block_for, block_of
 from filtergym.compiler.emission import emit
 from filtergym.compiler.functions import CompiledFunction, Specialised
-from filtergym.compiler.library import VARIANTS, portable
+from filtergym.compiler.library import VARIANTS, portable_library
 from filtergym.compiler.native import OPTIMISED, Setting, quick_setting
 from filtergym.compiler.parts import cut_parts
 from filtergym.compiler.program import COMPARISONS, Graph
@@ -266,7 +266,7 @@ def test_functions_that_differ_only_in_numbers_have_the_same_text():
 
         special = Specialised(function, Graph(), [np.zeros(8)])
         return emit(
-            special.program, special.lane_first, portable(), block_of(8), 10
+            special.program, special.lane_first, portable_library(), block_of(8), 10
         ), special.program.constants
 
     (one, values), (other, others) = text(0.3, [1.5, 2.5]), text(0.7, [3.5, np.nan])
@@ -282,7 +282,7 @@ def test_places_of_what_crosses_cuts_are_used_again():
         return x
 
     special = Specialised(function, Graph(), [np.zeros(8)])
-    text = emit(special.program, special.lane_first, portable(), block_of(8), 10)
+    text = emit(special.program, special.lane_first, portable_library(), block_of(8), 10)
     assert "@part39" in text
     assert "%scratch = alloca <8 x double>, i64 2," in text
 
@@ -309,7 +309,7 @@ def test_code_has_the_same_bits_in_every_setting(monkeypatch, setting):
         monkeypatch.setattr(native, "_CODES", {})
         special = Specialised(all_functions, Graph(loops=True), [x], turned=True)
         assert "product" in [step.operation for step in special.program.steps]
-        special.compile(portable())
+        special.compile(portable_library())
         return [answer.tobytes() for answer in special.call([x], 24, 1)]
 
     assert run(setting) == run(OPTIMISED)

@@ -127,7 +127,7 @@ def opened(name, control, scenario, episodes, keywords):
     class Listening(Gated):
         def act(self, observation, state, start):
             action, state = super().act(observation, state, start)
-            seen.append(state[1].trust.heeded > 0.0)
+            seen.append(state[1].trust.active > 0.0)
             return action, state
 
     def make(task):
@@ -283,7 +283,7 @@ def naive_factors(nis, degrees):
     [
         ("fixed-low", r"fallback 'fixed-low' costs [\d.]+ % more than the paper's algorithm 'imm'"),
         ("imm-smoother", "'imm-smoother' is of kind smoother and nothing that a gate can fall"),
-        ("imm-tuned", "'imm-tuned' has parameters of the task of its own"),
+        ("imm-tuned", "'imm-tuned' has task parameters of its own"),
     ],
 )
 def test_what_a_gate_cannot_fall_back_on_is_refused(fallback, message):
@@ -317,8 +317,8 @@ def test_who_has_no_gate_is_refused(name, message):
 @pytest.mark.parametrize(
     ("make", "control", "message"),
     [
-        (Gate, "mode", "has no constant action that is the paper's: give the gate a fallback"),
-        (Gate, "weights", "has no constant action that is the paper's"),
+        (Gate, "mode", "has no constant action of the paper's algorithm: give the gate a fallback"),
+        (Gate, "weights", "has no constant action of the paper's algorithm"),
         (lambda model: Gate(model, fallback=Constant), "gains", "fallback is made for control 'gain', but"),
         (lambda model: Gated(model, Constant), "gains", "policy is made for control 'gain', but the task"),
         (lambda model: Gate(model, window=0), "gain", "window must be at least one decision, got 0"),
@@ -411,11 +411,11 @@ def test_what_was_around_an_agent_is_around_it_again(monkeypatch, tmp_path):
         (
             "ppo",
             {"residual_to": "kalman-imm"},
-            "of kind estimator and has no actions that could be corrected",
+            "of kind estimator and has no actions to correct",
         ),
         ("ppo", {"residual_to": "adaptive", "control": "gains"}, "made for control 'gain', but the environ"),
-        ("ppo", {"residual_to": "imm-tuned"}, "acts under parameters of its own"),
-        ("ppo", {"gated": True, "control": "mode"}, "has no constant action that is the paper's"),
+        ("ppo", {"residual_to": "imm-tuned"}, "has task parameters of its own"),
+        ("ppo", {"gated": True, "control": "mode"}, "has no constant action of the paper's algorithm"),
     ],
 )
 def test_training_around_what_cannot_be(algorithm, around, message):
@@ -431,7 +431,7 @@ def test_a_policy_that_chooses_a_hypothesis_has_no_residual():
     from filtergym.agents.training_run import RunOptions, new_run
 
     problem = problem_of("filtergym/UavAutopilot-v0")
-    with pytest.raises(ValueError, match="a residual action is added: control 'mode' has Discrete"):
+    with pytest.raises(ValueError, match="a residual action needs a continuous control: 'mode' has Discrete"):
         new_run(problem, RunOptions("ppo", residual_to="over-smoothed"))
 
 

@@ -310,7 +310,7 @@ def test_training_of_an_environment_without_one(command, tmp_path, monkeypatch):
     code, _, error = command("train", ESM, "--algo", NAME, "--out", tmp_path / "run")
     assert code == 2
     assert (
-        f"{ESM} has no filter for '{NAME}' to steer: choose another algorithm, or {FUSION}, {RADAR}" in error
+        f"{ESM} has no filter for algorithm '{NAME}': choose another algorithm, or {FUSION}, {RADAR}" in error
     )
     code, _, error = command("train", RADAR, "--algo", NAME, "--control", "gain", "--out", tmp_path / "run")
     assert code == 2

@@ -341,7 +341,7 @@ def test_an_agent_says_when_what_comes_is_unlike_its_training():
     assert said == ""
     for _ in range(40):
         said = filter.update(x=x, y=y, sigma_x=0.5, sigma_y=0.5).departure
-    assert "lie outside of all that it saw in training" in said
+    assert "lie outside the range of its training" in said
     filter.start(STATE, COVARIANCE)
     assert filter.update(x=9e3, y=2e4).departure == ""
 

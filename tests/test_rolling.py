@@ -16,7 +16,7 @@ from filtergym.compiler.c_source import helper_functions, write_program
 from filtergym.compiler.c_text import Parameter, function_text
 from filtergym.compiler.emission import emit
 from filtergym.compiler.interpretation import interpret
-from filtergym.compiler.library import portable
+from filtergym.compiler.library import portable_library
 from filtergym.compiler.namespace import Traced
 from filtergym.compiler.program import FUNCTIONS, OPERATIONS, Graph, ProgramResult, program
 from filtergym.compiler.rolling import CONSTANTS, SCRATCH, TURN, roll
@@ -254,7 +254,7 @@ def assert_loops_are_the_straight_line(code, lane_first, lanes=16):
     """In LLVM, of both widths of a block; the results lie in the last arrays."""
     found = []
     for width, loops in ((8, False), (8, True), (4, True)):
-        text = emit(code, lane_first, portable(), block_of(width), 150, loops)
+        text = emit(code, lane_first, portable_library(), block_of(width), 150, loops)
         assert ("%turn" in text) <= loops
         run = native._load("", lambda text=text: text, native.NATIVE, 0)
         arrays, table = addresses(code, lane_first, lanes)
@@ -270,7 +270,7 @@ def _everything_in_loops(monkeypatch):
     monkeypatch.setenv(cache.SWITCH, "off")
     monkeypatch.setattr(emission, "LONG", 0)
     monkeypatch.setattr(rolling, "SHORTER", 0.0)
-    for function in portable().functions.values():
+    for function in portable_library().functions.values():
         native.llvm().add_symbol(function.symbol, function.address)
 
 

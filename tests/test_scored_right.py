@@ -211,7 +211,7 @@ class TestRunFolder:
             own, run = costs({"model": model, "run": str(folder)}, trust=True)
         assert own == run
         with pytest.raises(
-            ValueError, match=r"holds a run of filtergym/ManeuveringTarget-v0, not of .*UavAutopilot"
+            ValueError, match=r"contains a run of filtergym/ManeuveringTarget-v0, not of .*UavAutopilot"
         ):
             competitor("filtergym/UavAutopilot-v0", str(folder), trust=True)
 

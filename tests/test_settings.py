@@ -318,7 +318,7 @@ def test_options_of_a_reset_reach_the_environments_of_an_adapter():
     env.set_options({"scenario": "paper"})
     np.testing.assert_array_equal(env.reset(), paper.reset())
     env.set_options([{"scenario": "paper"}, {}])
-    with pytest.raises(ValueError, match="are the same for all environments"):
+    with pytest.raises(ValueError, match="must be the same for all environments"):
         env.reset()
 
 

@@ -209,7 +209,7 @@ def test_the_gradient_of_a_student_with_a_teacher_is_that_of_its_cost():
         (
             AIRCRAFT,
             {"teacher": "level-bank"},
-            "cannot teach in .*: what is measured follows its own estimates",
+            "cannot teach in .*: the measurements depend on its own estimates",
         ),
     ],
 )

@@ -82,7 +82,7 @@ def open_runs(
     found = []
     for seed in seeds:
         folder = session.folder.with_name(f"{session.folder.name}-{seed}")
-        begun = training_run.holds_run(folder)
+        begun = training_run.has_run(folder)
         asked = training_run.new_run(problem, replace(options, seed=seed))
         run = training_run.open_run(folder, asked, begun)
         if begun and not run.is_complete and options.algorithm not in THROUGH_THE_FILTER:
@@ -150,7 +150,7 @@ def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[P
         line = bar.add_task("training", total=sum(sizes))
         for i, lines in workers.run(_train, waiting, sizes, lambda done: bar.update(line, advance=done)):
             folder, _, session = waiting[i]
-            if not training_run.holds_run(folder):
+            if not training_run.has_run(folder):
                 raise ValueError(
                     f"{folder} is not here: the machines of a cluster must share the folder of a run"
                 )

@@ -11,7 +11,7 @@ import numpy
 
 from ..compiler.functions import address_of, empty_lanes, leaves, round_up_lanes
 from ..compiler.interpretation import first_steps, in_range, interpret
-from ..compiler.library import portable
+from ..compiler.library import portable_library
 from ..compiler.native import AVAILABLE, native
 from ..compiler.program import StraightLineProgram
 from ..envs.contract.model import Episode, Model
@@ -243,7 +243,7 @@ class _Code:
         self._arrays.append(empty_lanes((max(len(results), 1),), width))
         self._constants, self._width = code.constants, width
         program = code._replace(results=results)
-        self._run = native(program, [False] * len(self._arrays), portable()).expect(width)
+        self._run = native(program, [False] * len(self._arrays), portable_library()).expect(width)
 
     def __call__(self, given: dict[int, Any]) -> list[numpy.ndarray]:
         for argument, row in self._inputs:

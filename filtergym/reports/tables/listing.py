@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Iterator, Mapping
 
 from ...baselines.problem import Problem
-from ...compiler.library import fastest
+from ...compiler.library import fastest_library
 from ...compiler.native import processor
 from ...envs.contract.companions import Paper, find_companion
 from ...envs.contract.task import Task
@@ -22,7 +22,7 @@ def _backend(cls: type[Task]) -> str:
     compiled = AVAILABLE
     if cls.id in USER_TASKS:  # those of this package can all be traced
         compiled = make_model(cls, backend="auto").backend == "compiled"
-    return f"compiled (functions of {fastest(processor()[1]).name})" if compiled else "numpy"
+    return f"compiled (functions of {fastest_library(processor()[1]).name})" if compiled else "numpy"
 
 
 def summary_of(cls: type[Task]) -> str:
