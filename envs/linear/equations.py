@@ -122,14 +122,14 @@ class StateSpaceDefinition:
         return f"{words}; inputs, which acted since the one before, are {inputs}." if inputs else f"{words}."
 
     def usual_noise(self, interval: float) -> numpy.ndarray:
-        """Q of the filters' first model in an interval, s, at the initial mean, ``(n, n)``."""
+        """Return the Q of the filters' first model in an interval, s, at the initial mean, ``(n, n)``."""
         return process_noise(self.filters[0], self.mean, interval, self.usual_inputs)
 
 
 def process_noise(
     model: StateSpaceModel, x: numpy.ndarray, interval: float, inputs: numpy.ndarray
 ) -> numpy.ndarray:
-    """Q of a model, ``(n, n)``; without time the same for all.
+    """Return the Q of a model, ``(n, n)``; without time the same for all.
 
     Args:
         model: the equations.
@@ -147,7 +147,7 @@ def process_noise(
 def sensor_noise(
     model: StateSpaceModel, x: numpy.ndarray, interval: numpy.ndarray, inputs: numpy.ndarray
 ) -> numpy.ndarray:
-    """R of a model at K measurements, ``(m, m, K)``.
+    """Return the R of a model at K measurements, ``(m, m, K)``.
 
     Args:
         model: the equations.
@@ -165,7 +165,7 @@ def sensor_noise(
 def usual_sensor_noise(
     model: StateSpaceModel, mean: numpy.ndarray, interval: float, inputs: Mapping[str, Input]
 ) -> numpy.ndarray:
-    """R of a model at the initial mean, averaged over the inputs of a simulation, ``(m, m)``.
+    """Return the R of a model at the initial mean, averaged over the inputs of a simulation, ``(m, m)``.
 
     The average is that of 2 p sigma points, which is exact where R is quadratic in the inputs: the R of a deviation
     that is an input is the sum of its squared mean and its variance.
@@ -316,14 +316,14 @@ class Equations:
         return self._value("f", self.model.f, self._with_passed(x, passed))
 
     def _with_passed(self, x: Array, passed: Passed) -> Array:
-        """State with the interval and the inputs as its last rows, ``(n + 1 + p, ...)``."""
+        """Return the state with the interval and the inputs as its last rows, ``(n + 1 + p, ...)``."""
         rows = [] if passed.interval is None else [passed.interval]
         if passed.inputs is not None:
             rows += [passed.inputs[j] for j in range(passed.inputs.shape[0])]
         return self.xp.concat([x, *((0.0 * x[0] + row)[None] for row in rows)]) if rows else x
 
     def process_noise(self, x: Array, passed: Passed, of_sources: Mapping[str, Any] | None = None) -> Array:
-        """Q, ``(n, n, N)``, without time ``(n, n, 1)``.
+        """Return the Q, ``(n, n, N)``, without time ``(n, n, 1)``.
 
         Args:
             x: predicted state, ``(n, N)``.
@@ -341,7 +341,7 @@ class Equations:
     def _noise(
         self, noise: numpy.ndarray | VectorFunction, constant: Array | None, x: Array, passed: Passed
     ) -> Array:
-        """Covariance of a noise, a square matrix for each lane."""
+        """Return the covariance of a noise, a square matrix for each lane."""
         if constant is not None:
             return constant[:, :, None]
         assert isinstance(noise, VectorFunction)
@@ -360,11 +360,13 @@ class Equations:
         return self._through(self.model.G, self._with_passed(x, Passage(passed.interval, None)), passed)
 
     def measured_noise(self, R: Array, x: Array, passed: Passed) -> Array:
-        """R with what noise of the inputs adds to it, ``(m, m, N)``; the state at the measurement."""
+        """Return the R with what noise of the inputs adds to it, ``(m, m, N)``; the state at the measurement."""
         return R if self.model.D is None else R + self._through(self.model.D, x, passed)
 
     def _through(self, function: VectorFunction | None, given: Array, passed: Passed) -> Array | float:
-        """Covariance that noise of the inputs has behind a function of them, and of what else is given to it."""
+        """Return the covariance that noise of the inputs has behind a function of them, and of what else is given
+        to it.
+        """
         if function is None:
             return 0.0
         assert passed.inputs is not None
@@ -378,7 +380,7 @@ class Equations:
     def sensor_noise(
         self, x: Array, passed: Passed, factor: Any = 1.0, of_sensors: Mapping[str, Any] | None = None
     ) -> Array:
-        """R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
+        """Return the R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
 
         Args:
             x: state at the measurement, ``(n, N)``.
@@ -396,7 +398,7 @@ class Equations:
         return self.xp.stack(rows)
 
     def measure(self, x: Array, passed: Passed) -> Array:
-        """Measurement without noise, ``(m, ...)``.
+        """Return the measurement without noise, ``(m, ...)``.
 
         Args:
             x: ``(n, ...)``.
@@ -409,13 +411,13 @@ class Equations:
         return self._with_passed(x, Passage(None, passed.inputs)) if self.model.h.given else x
 
     def subtract(self, z: Array, predicted: Array) -> Array:
-        """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
+        """Return the measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
         return shorten(z - predicted, self.periods)
 
     def continuous_measurement(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Measurement function and sigma points of a transform in which angles are continuous.
+        """Return the measurement function and sigma points of a transform in which angles are continuous.
 
         An angle changes by its slope along a state in which it is linear, over any number of turns, and otherwise by
         less than half a turn: the points lie close enough for that.
@@ -435,7 +437,8 @@ class Equations:
     def continuous_motion(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Motion and sigma points of a transform in which angles of the state keep the turn nearest to the mean's.
+        """Return the motion and sigma points of a transform in which angles of the state keep the turn nearest to the
+        mean's.
 
         Args:
             mean: state, ``(n, N)``.
@@ -493,7 +496,9 @@ class Equations:
         return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
 
     def gain(self, covariance: Array, received: Received) -> Array:
-        """Kalman gain for a predicted covariance ``(n, n, N)``, zero for sensors beyond their gates, ``(n, m, N)``."""
+        """Return the Kalman gain for a predicted covariance ``(n, n, N)``, zero for sensors beyond their gates,
+        ``(n, m, N)``.
+        """
         if self.gated:
             S = product(product(received.H, covariance), transpose(received.H)) + received.R
             kept = self.within_gates(received.innovation, S)
@@ -521,7 +526,9 @@ class Equations:
         return self.xp.reshape(values, (function.size, *x.shape[1:]))
 
     def _warn(self, name: str, compute: Callable[[Array, Any], Array], x: Array) -> Array:
-        """Values at vectors ``(n, N)``; in place of NumPy's warning, unless it is off, one that names the function."""
+        """Return the values at vectors ``(n, N)``; in place of NumPy's warning, unless it is off, one that names
+        the function.
+        """
         if self.xp is not numpy:
             return compute(x, self.xp)
         with numpy.errstate(all="ignore"):
@@ -580,19 +587,21 @@ class Equations:
             return self._describe("h", self.model.h.value(given, numpy), given)
 
     def transition_matrix(self, x: Array, passed: Passed) -> Array:
-        """Jacobian of f, ``(n, n, N)``; the last axis is 1 where it is the same everywhere."""
+        """Return the Jacobian of f, ``(n, n, N)``; the last axis is 1 where it is the same everywhere."""
         if self._F is not None:
             return self._F[:, :, None]
         return self._warn("the derivative of f", self.model.f.jacobian, self._with_passed(x, passed))
 
     def measurement_matrix(self, x: Array, passed: Passed) -> Array:
-        """Jacobian of h, ``(m, n, N)``; the last axis is 1 where it is the same everywhere."""
+        """Return the Jacobian of h, ``(m, n, N)``; the last axis is 1 where it is the same everywhere."""
         if self._H is not None:
             return self._H[:, :, None]
         return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))
 
     def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
-        """Mean and covariance at the next measurement, without process noise; ``passed`` as of :meth:`move`."""
+        """Return the mean and covariance at the next measurement, without process noise; ``passed`` as of
+        :meth:`move`.
+        """
         F = self.transition_matrix(mean, passed)
         carried = product(product(F, covariance), transpose(F))
         if self.model.G is not None:

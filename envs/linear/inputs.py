@@ -64,14 +64,16 @@ class InputCourses:
         self.normals: int = len(inputs) + len(self.noisy)
 
     def begin(self, normals: Array) -> Array | None:
-        """Inputs before the first measurement, ``(p, N)``, of standard normal numbers likewise; None without any."""
+        """Return the inputs before the first measurement, ``(p, N)``, of standard normal numbers likewise; None
+        without any.
+        """
         if not self.inputs:
             return None
         each = zip(self.inputs, normals, strict=True)
         return self.xp.stack([one.mean + one.deviation * number for one, number in each])
 
     def advance(self, inputs: Array, interval: Array, normals: Array) -> Array:
-        """Inputs that act until the next measurement, ``(p, N)``.
+        """Return the inputs that act until the next measurement, ``(p, N)``.
 
         Args:
             inputs: that acted until the one before, ``(p, N)``.

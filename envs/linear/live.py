@@ -81,7 +81,7 @@ class StateSpaceInput(LiveInput):
         return made
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values with what the sensors say in one array, ``(m, N)``, of one track ``(m,)``.
+        """Return the values with what the sensors say in one array, ``(m, N)``, of one track ``(m,)``.
 
         Raises:
             ValueError: where it is said twice.
@@ -102,7 +102,7 @@ class StateSpaceInput(LiveInput):
         return {**values, "values": rows}
 
     def _hold(self, before: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Inputs, ``(p, N)``, of one track ``(p,)``: what came, and else what came before.
+        """Return the inputs, ``(p, N)``, of one track ``(p,)``: what came, and else what came before.
 
         Raises:
             ValueError: where nothing has come so far.

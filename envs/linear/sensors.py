@@ -146,7 +146,7 @@ class Receptions:
         self.row_uniforms: int = len(self.losing) + len(self.channels) * self.pauses
 
     def begin(self, draws: Draws, zero: Array) -> SensorStates | None:
-        """State at the start of the track, of zeros ``(N,)``; None where nothing has to be remembered."""
+        """Return the state at the start of the track, of zeros ``(N,)``; None where nothing has to be remembered."""
         states = SensorStates(
             self.xp.stack([zero] * len(self.due)) if self.due else None,
             self.xp.stack([zero] * len(self.channels)) if self.pauses else None,
@@ -155,7 +155,7 @@ class Receptions:
         return None if all(part is None for part in states) else states
 
     def _bias(self, draws: Draws, zero: Array) -> Array:
-        """Offset of one sensor, up or down, ``(m, N)``."""
+        """Return the offset of one sensor, up or down, ``(m, N)``."""
         biased = draws.integer("biased_sensor", (0, len(self.channels) - 1))
         sign = 2.0 * draws.integer("sign", (0, 1)) - 1.0
         size, rows = (self.parameters.bias * self.deviations).tolist(), []
@@ -167,7 +167,7 @@ class Receptions:
     def advance(
         self, states: SensorStates | None, interval: Array, uniforms: Array
     ) -> tuple[SensorStates | None, Array | None]:
-        """State at a measurement, and what is received of it, ``(m, N)``; None where all is.
+        """Return the state at a measurement, and what is received of it, ``(m, N)``; None where all is.
 
         Args:
             states: at the one before.

@@ -104,7 +104,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.places: list[int | None] = [None if j in turning else j for j in components_measured(first.h)]
 
     def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
-        """Root of a covariance that is the same for all measurements; None of any other."""
+        """Return the root of a covariance that is the same for all measurements; None of any other."""
         if isinstance(covariance, VectorFunction):
             return None
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
@@ -207,21 +207,23 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return values, available
 
     def _seconds(self, truth: StateSpaceTruth, interval: Array | None) -> Array:
-        """Time that passes until the next measurement, s, ``(N,)``, also of a model that is not timed."""
+        """Return the time that passes until the next measurement, s, ``(N,)``, also of a model that is not timed."""
         usual: Array = self.parameters.sampling_interval + 0.0 * truth.process_noise
         return usual if interval is None else interval
 
     def _inputs(
         self, truth: StateSpaceTruth, interval: Array | None, normals: Array
     ) -> tuple[Array | None, Array | None]:
-        """Inputs that act until the next measurement, and what is told of them, ``(p, N)``; None without inputs."""
+        """Return the inputs that act until the next measurement, and what is told of them, ``(p, N)``; None without
+        inputs.
+        """
         if truth.inputs is None:
             return None, None
         inputs = self.courses.advance(truth.inputs, self._seconds(truth, interval), normals)
         return inputs, self.courses.report(inputs, normals)
 
     def _interval(self, truth: StateSpaceTruth, uniform: Array | None) -> Array | None:
-        """Time that passes until the next measurement, s, ``(N,)``; None where the model is not timed."""
+        """Return the time that passes until the next measurement, s, ``(N,)``; None where the model is not timed."""
         if not self.timed:
             return None
         interval = self.parameters.sampling_interval + 0.0 * truth.process_noise
@@ -238,7 +240,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return chosen
 
     def _switch(self, hypothesis: Array, uniform: Array) -> Array:
-        """Number of the model that follows, ``(N,)``."""
+        """Return the number of the model that follows, ``(N,)``."""
         rows = numpy.cumsum(self.task.definition.transition, axis=1)[:, :-1]
         thresholds = [
             self._chosen([0.0 * uniform + value for value in column], hypothesis)
@@ -247,7 +249,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.xp.astype(category(uniform, thresholds, self.xp), self.xp.float64)
 
     def error_cost(self, error: Array) -> Array:
-        """Weighted sum of squared errors; a component without weight need not be known."""
+        """Return the weighted sum of squared errors; a component without weight need not be known."""
         weights = self.task.definition.weights.tolist()
         terms = [weight * error[i] ** 2 for i, weight in enumerate(weights) if weight]
         return sum(terms[1:], terms[0])
@@ -261,11 +263,11 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.xp.stack([self.xp.sqrt(R[j, j]) + 0.0 * values[j] for j in range(values.shape[0])])
 
     def component_readings(self, measurement: StateSpaceMeasurement) -> Array | None:
-        """Readings of components that are measured as they are; None where none is."""
+        """Return the readings of components that are measured as they are; None where none is."""
         return self._of_components(measurement.values, measurement.available)
 
     def component_deviations(self, measurement: StateSpaceMeasurement) -> Array | None:
-        """Deviations that the model states for them."""
+        """Return the deviations that the model states for them."""
         return self._of_components(self.reading_deviations(measurement), measurement.available)
 
     def _of_components(self, values: Array, available: Array) -> Array | None:
@@ -351,7 +353,7 @@ def state_space_attributes(
     components: tuple[Component, ...],
     defaults: dict[str, Any],
 ) -> dict[str, Any]:
-    """Attributes of a task's class that follow from what its author gives.
+    """Return the attributes of a task's class that follow from what its author gives.
 
     Args:
         definition: the models.

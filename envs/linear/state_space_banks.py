@@ -123,11 +123,15 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         )
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Covariance of the process noise at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
+        """Return the covariance of the process noise at a predicted mean under an action, ``(n, n, N)`` or ``(n, n,
+        1)``.
+        """
         return self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Covariance of the measurement noise at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
+        """Return the covariance of the measurement noise at a predicted mean under an action, ``(m, m, N)`` or
+        ``(m, m, 1)``.
+        """
         return self.equations.sensor_noise(mean, measurement)
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
@@ -180,11 +184,11 @@ class StateSpaceNoiseBank(StateSpaceBank):
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Scaled Q."""
+        """Return the scaled Q."""
         return self._scale(action, 0) * self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Scaled R."""
+        """Return the scaled R."""
         return self.equations.sensor_noise(mean, measurement, self._scale(action, 1))
 
     def act(
@@ -279,18 +283,18 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         return super().start(initial)._replace(correction=0.0 * initial.mean)
 
     def _part(self, action: Array, place: int) -> Array:
-        """Entries of an action: process, sensor, agility, caution, offset."""
+        """Return the entries of an action: process, sensor, agility, caution, offset."""
         n, m = self.states, self.sensors
         ends = numpy.cumsum([0, n, m, n, m, n]).tolist()
         return action[ends[place] : ends[place + 1]]
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Q under the action."""
+        """Return the Q under the action."""
         Q = self.equations.process_noise(mean, measurement)
         return self._scaled(Q, NOISE_RANGE, self._part(action, 0))
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """R under the action."""
+        """Return the R under the action."""
         R = self.equations.sensor_noise(mean, measurement)
         return self._scaled(R, NOISE_RANGE, self._part(action, 1))
 
@@ -443,7 +447,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def _align(self, means: Array) -> Array:
-        """Means of the hypotheses, ``(n, M, N)``, with angles on the turn of the first."""
+        """Return the means of the hypotheses, ``(n, M, N)``, with angles on the turn of the first."""
         return unwrap(means, means[:, :1], self.task.periods)
 
     def act(self, state: Mixture, measurement: StateSpaceMeasurement, action: Array) -> Mixture:
@@ -471,7 +475,9 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
 
 def bank_tables(count: int) -> tuple[Mapping[str, Any], Mapping[str, str]]:
-    """Banks of a task with so many hypotheses by their controls, the default first, and what their actions mean."""
+    """Return the banks of a task with so many hypotheses by their controls, the default first, and what their
+    actions mean.
+    """
     banks: dict[str, Any] = {"noise": StateSpaceNoiseBank, "gain": StateSpaceGainBank}
     actions = {
         "noise": "times `noise_decades` decades: factors on Q and R; **0 is the filter as written**",

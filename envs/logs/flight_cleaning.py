@@ -133,7 +133,7 @@ FEWEST_IN_WINDOW = 5
 def fit_parabolas(
     time: numpy.ndarray, position: numpy.ndarray, half_width: float
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Position and velocity of the parabolas that fit best around each time.
+    """Return the position and velocity of the parabolas that fit best around each time.
 
     Args:
         time: s, ``(n,)``, n >= ``FEWEST_IN_WINDOW``.

@@ -142,7 +142,7 @@ def _csv(file: Path, known: ColumnNames) -> FlightTable:
 
 
 def _bounded_lines(text: TextIO) -> Iterator[str]:
-    """Lines of a text.
+    """Return the lines of a text.
 
     Raises:
         ValueError: for one that no row is as long as.
@@ -325,7 +325,7 @@ _COLUMN_OF_ALIAS = {alias: name for name, aliases in COLUMNS.items() for alias i
 
 
 def suffix_of(file: Path) -> str:
-    """Last part of a file's name, ``.json.gz`` for one; empty if it is not of a file of flights."""
+    """Return the last part of a file's name, ``.json.gz`` for one; empty if it is not of a file of flights."""
     return next((suffix for suffix in FLIGHT_SUFFIXES if file.name.endswith(suffix)), "")
 
 
@@ -427,7 +427,7 @@ def _rewrite_date(date: Any) -> str:
 
 
 def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
-    """Times of day in seconds, on through midnight.
+    """Return the times of day in seconds, on through midnight.
 
     Raises:
         ValueError: for what is none.
@@ -443,8 +443,8 @@ def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
 
 
 def clock_seconds(values: "pandas.Series") -> tuple[str, numpy.ndarray]:
-    """Times in seconds by a clock that other files have, too, and which: ``dates``, since 1970, ``times of day``, since
-    midnight, or ``seconds`` as they are; of dates to a microsecond.
+    """Return the times in seconds by a clock that other files have, too, and which: ``dates``, since 1970, ``times of
+    day``, since midnight, or ``seconds`` as they are; of dates to a microsecond.
 
     Args:
         values: times as of :func:`seconds`, numbers from 1e8 on are since 1970.
@@ -530,7 +530,7 @@ def sort_by_time(
 
 
 def seconds(values: "pandas.Series") -> "pandas.Series":
-    """Times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
+    """Return the times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
 
     Times of day that come back by more than half a day are those of the next one. Dates are ISO 8601, with an offset
     from UTC or without, or year/month/day or day.month.year and a time of day. Numbers too large for seconds since 1970

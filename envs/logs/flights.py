@@ -133,7 +133,7 @@ class Flights(FlightData):
 
 
 def flight_of(trajectory: Trajectory) -> str:
-    """Name of the flight that a trajectory is, or is a piece of."""
+    """Return the name of the flight that a trajectory is, or is a piece of."""
     return trajectory.flight or trajectory.name
 
 
@@ -197,7 +197,7 @@ TRAFFIC = "traffic:"
 
 
 def traffic_samples() -> dict[str, Path]:
-    """Files of the samples in the package ``traffic`` by their names; none where it is not installed.
+    """Return the files of the samples in the package ``traffic`` by their names; none where it is not installed.
 
     It is not imported: that would bring a long chain of libraries, and the samples are JSON.
     """
@@ -211,7 +211,7 @@ def traffic_samples() -> dict[str, Path]:
 
 
 def _traffic_sample(name: str) -> Path:
-    """File of a sample in the package ``traffic``.
+    """Return the file of a sample in the package ``traffic``.
 
     Raises:
         ValueError: if there is no such sample, or no such package.
@@ -230,7 +230,7 @@ def _traffic_sample(name: str) -> Path:
 
 
 def files_of(source: str | Path) -> list[Path]:
-    """Files that a path or a pattern stands for, in the order of their names.
+    """Return the files that a path or a pattern stands for, in the order of their names.
 
     Raises:
         ValueError: for what is no path, and where there are none.
@@ -428,14 +428,14 @@ def _flights_of(
 
 
 def _median_site(rows: "pandas.DataFrame") -> tuple[float, float]:
-    """Latitude and longitude in the middle of all positions, to a hundredth of a degree."""
+    """Return the latitude and longitude in the middle of all positions, to a hundredth of a degree."""
     latitude, longitude = (round(float(rows[name].median()), 2) for name in ("latitude", "longitude"))
     return latitude, longitude
 
 
 def _by_flight(rows: "pandas.DataFrame", flight: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
-    """Rows of every flight of a file, by its name, in the order of their times; one without a name, and as they stand,
-    where the file names none.
+    """Return the rows of every flight of a file, by its name, in the order of their times; one without a name, and
+    as they stand, where the file names none.
     """
     if flight is None:
         return {"": rows}

@@ -32,7 +32,7 @@ OF_EPISODES = (
 
 
 def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping[str, Any]) -> LogFormat:
-    """Tables of a state-space model.
+    """Return the tables of a state-space model.
 
     Args:
         definition: the models.
@@ -139,7 +139,8 @@ def _hold(name: str, given: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray
 
 
 def _fill_gaps(time: numpy.ndarray, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Row of every measurement of a model that moves by one interval, -1 where there is none, and the times, s.
+    """Return the row of every measurement of a model that moves by one interval, -1 where there is none, and the
+    times, s.
 
     Raises:
         ValueError: for rows that are not whole intervals apart.
@@ -170,8 +171,8 @@ def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, pa
 def _predict(
     definition: "StateSpaceDefinition", mean: numpy.ndarray, measurement: Any, parameters: Any
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Measurement that the filters' model predicts from an estimate, and what was received, ``(m, ...)`` each; angles
-    by whole turns near what was predicted.
+    """Return the measurement that the filters' model predicts from an estimate, and what was received, ``(m, ...)``
+    each; angles by whole turns near what was predicted.
     """
     model = definition.filters[0]
     rows = [mean]

@@ -60,7 +60,7 @@ WIDE_BEARINGS = 0.5
 
 
 def speeds_of(time: numpy.ndarray, position: numpy.ndarray) -> numpy.ndarray:
-    """Speed from each position ``(n, k)`` to the next, m/s, ``(n - 1,)``."""
+    """Return the speed from each position ``(n, k)`` to the next, m/s, ``(n - 1,)``."""
     return numpy.asarray(_length(numpy.diff(position, axis=0)) / numpy.diff(time))
 
 
@@ -235,8 +235,8 @@ def find_outliers(
 
 
 def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
-    """Deviation of values ``(n, k)`` from the line through their neighbours, each as large as their noise,
-    ``(n - 2, k)``.
+    """Return the deviation of values ``(n, k)`` from the line through their neighbours, each as large as their
+    noise, ``(n - 2, k)``.
     """
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, None]
     line = before * values[:-2] + (1.0 - before) * values[2:]
@@ -244,8 +244,8 @@ def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
-    """Deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3, from the median distance to the line
-    through their neighbours; at least what 64-bit numbers of their size can tell.
+    """Return the deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3, from the median
+    distance to the line through their neighbours; at least what 64-bit numbers of their size can tell.
     """
     scatter = 1.4826 * float(numpy.median(numpy.abs(_deviations(time, values))))
     return max(scatter, 1e-9 * float(numpy.abs(values).max(initial=0.0)), 1e-6)
@@ -288,7 +288,7 @@ def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint:
 
 
 def _words(name: str) -> list[str]:
-    """Words of the name of a column."""
+    """Return the words of the name of a column."""
     return re.split(r"[^a-z0-9]+", name)
 
 

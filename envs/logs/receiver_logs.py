@@ -131,14 +131,14 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _rtklib_time(cells: Sequence[str]) -> tuple[str, float]:
-    """Date and time as they are written; or of a week and its seconds, seconds since 1980 and no date."""
+    """Return the date and time as they are written; or of a week and its seconds, seconds since 1980 and no date."""
     if "/" in cells[0]:
         return f"{cells[0]} {cells[1]}", 0.0
     return "", WEEK * int(cells[0]) + float(cells[1])
 
 
 def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Positions and deviations, and what is to be told of them."""
+    """Return the positions and deviations, and what is to be told of them."""
     if {"latitude", "longitude"} <= {*found}:
         columns = {"latitude": found["latitude"], "longitude": found["longitude"]}
         if "height" in found:
@@ -171,7 +171,7 @@ def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any
 
 
 def _rotate_sigmas(sigmas: numpy.ndarray, latitude: float, longitude: float) -> dict[str, numpy.ndarray]:
-    """Deviations east and north of Earth-fixed ones.
+    """Return the deviations east and north of Earth-fixed ones.
 
     Args:
         sigmas: of x, y, z, and roots of their covariances xy, yz, zx with the signs of these, ``(6, n)``.
@@ -282,7 +282,7 @@ def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
 
 
 def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
-    """Date of every epoch, of which some say it; None if none does."""
+    """Return the date of every epoch, of which some say it; None if none does."""
     known = next((i for i, epoch in enumerate(epochs) if epoch.date), None)
     if known is None:
         return [None] * len(epochs)
@@ -299,13 +299,13 @@ def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
 
 
 def _format_time(time: float, day: datetime.date | None) -> str:
-    """Time of day, with its date where it is known."""
+    """Return the time of day, with its date where it is known."""
     clock = (datetime.datetime.min + datetime.timedelta(seconds=time)).time().isoformat()
     return clock if day is None else f"{day.isoformat()}T{clock}Z"
 
 
 def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, numpy.ndarray]:
-    """Deviations east and north; where none are said, those said before, and at first those said next."""
+    """Return the deviations east and north; where none are said, those said before, and at first those said next."""
     import pandas
 
     said = pandas.DataFrame([pair or (math.nan, math.nan) for pair in sigmas], columns=["sigma_x", "sigma_y"])
@@ -409,7 +409,7 @@ def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Columns of messages, of which there are ``values`` as :func:`.parse_bag` returns them, ``(8, n)``."""
+    """Return the columns of messages, of which there are ``values`` as :func:`.parse_bag` returns them, ``(8, n)``."""
     time, status, latitude, longitude, altitude, east, north, covariance_type = values
     fixed = status != NO_FIX
     columns = {"time": time, "altitude": altitude}
@@ -427,7 +427,7 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Columns of messages, of which there are ``values`` as :func:`.parse_bag` returns them, ``(5, n)``."""
+    """Return the columns of messages, of which there are ``values`` as :func:`.parse_bag` returns them, ``(5, n)``."""
     time, x, y, *variances = values
     columns = {"time": time, "x": x, "y": y}
     notes = (f"positions are of the topic {topic}, metres in its own frame",)

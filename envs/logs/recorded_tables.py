@@ -91,11 +91,11 @@ class Columns:
         return [name for name in self.table if name.startswith(TRUTH)]
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Column, NaN where a cell is empty."""
+        """Return the column, NaN where a cell is empty."""
         return self.table[name].to_numpy()
 
     def place(self, number: int) -> str:
-        """Row of the file that one of these rows is."""
+        """Return the row of the file that one of these rows is."""
         return f"row {self.table.index[number]}"
 
     def only(self, rows: numpy.ndarray) -> "Columns":
@@ -239,13 +239,13 @@ class Columns:
             self.notes += [found] * bool(found)
 
     def _usual_height(self, name: str) -> float:
-        """Median of a column of heights, m; zero where there is none."""
+        """Return the median of a column of heights, m; zero where there is none."""
         height = self[name] if self.has(name) else numpy.zeros(0)
         there = numpy.isfinite(height)
         return float(numpy.median(height[there])) if there.any() else 0.0
 
     def whole(self, *names: str) -> numpy.ndarray:
-        """Columns without an empty cell, ``(rows, columns)``.
+        """Return the columns without an empty cell, ``(rows, columns)``.
 
         Raises:
             ValueError: if there is one.
@@ -259,7 +259,7 @@ class Columns:
         return numpy.ascontiguousarray(self.table[[*names]].to_numpy())
 
     def sigmas(self, *names: str) -> numpy.ndarray:
-        """Standard deviations without an empty cell, ``(rows, columns)``.
+        """Return the standard deviations without an empty cell, ``(rows, columns)``.
 
         Raises:
             ValueError: if one is not above zero.
@@ -270,14 +270,14 @@ class Columns:
         return found
 
     def interval(self) -> float:
-        """Sampling interval, s: the one that the user has named, or the median of those in the table."""
+        """Return the sampling interval, s: the one that the user has named, or the median of those in the table."""
         if "sampling_interval" in self.given:
             return float(self.given["sampling_interval"])
         # Rounded as times are: files of one sensor have the same then.
         return float(f"{numpy.median(numpy.diff(self.time)):.6g}")
 
     def regular(self, why: str) -> float:
-        """Sampling interval of measurements that must be regular, s.
+        """Return the sampling interval of measurements that must be regular, s.
 
         Args:
             why: who needs that, at the end of the sentence.
@@ -509,14 +509,14 @@ def _times_as_written(values: "pandas.Series") -> numpy.ndarray:
 
 
 def _by_recording(table: "pandas.DataFrame", names: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
-    """Rows of every recording of a table, in their order."""
+    """Return the rows of every recording of a table, in their order."""
     if names is None:
         return {"": table}
     return {str(name): rows for name, rows in table.groupby(_names_of_rows(names), sort=False)}
 
 
 def _names_of_rows(names: "pandas.Series") -> "pandas.Series":
-    """Name of the recording of each row; empty where none is given."""
+    """Return the name of the recording of each row; empty where none is given."""
     return names.astype(object).where(names.notna(), "").astype(str)
 
 
@@ -591,7 +591,7 @@ def _side_by_side(
 
 
 def _true_columns(task: Task, columns: Columns) -> list[str]:
-    """Names of the columns with the truth of every component; empty where it has none.
+    """Return the names of the columns with the truth of every component; empty where it has none.
 
     Raises:
         ValueError: if a table has a part of a position only, say, or nothing that is a component.
@@ -618,6 +618,6 @@ def _take_rows(values: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
 
 
 def _truth_of_rows(columns: Columns, rows: numpy.ndarray, names: list[str]) -> numpy.ndarray:
-    """Truth of every component, ``(T, C)``; NaN where it is not known."""
+    """Return the truth of every component, ``(T, C)``; NaN where it is not known."""
     unknown = numpy.full(len(columns.time), numpy.nan)
     return _take_rows(numpy.stack([columns[name] if name else unknown for name in names], axis=1), rows)

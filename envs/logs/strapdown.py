@@ -218,8 +218,8 @@ def check_motion(alignment: Alignment, fixes: Any, moving: float, interval: floa
 
 
 def slope_of(x: numpy.ndarray, y: numpy.ndarray) -> tuple[float, float]:
-    """Slope of the straight line through points ``(n,)`` by least squares, and its standard deviation; infinite where
-    they have none.
+    """Return the slope of the straight line through points ``(n,)`` by least squares, and its standard deviation;
+    infinite where they have none.
     """
     if len(x) < 3 or numpy.ptp(x) == 0.0:
         return 1.0, numpy.inf
@@ -319,7 +319,7 @@ def free_windows(
     site: tuple[float, float],
     lever: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> numpy.ndarray:
-    """Positions of the INS that runs free in windows of K times, ``(E, K, 2)``, m east and north of a site.
+    """Return the positions of the INS that runs free in windows of K times, ``(E, K, 2)``, m east and north of a site.
 
     Args:
         navigation: the aided INS.
@@ -337,6 +337,8 @@ def free_windows(
 
 
 def tangent_plane(positions: Any, site: tuple[float, float]) -> numpy.ndarray:
-    """Coordinates east and north of a site (rad) of a table of latitudes, longitudes and altitudes, ``(2, n)``, m."""
+    """Return the coordinates east and north of a site (rad) of a table of latitudes, longitudes and altitudes,
+    ``(2, n)``, m.
+    """
     latitude, longitude = numpy.radians(positions[["lat", "lon"]].to_numpy().T)
     return east_north(latitude, longitude, positions["alt"].to_numpy(), site)

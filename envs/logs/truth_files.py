@@ -169,7 +169,7 @@ def offset_note(time: numpy.ndarray, position: numpy.ndarray, truth: numpy.ndarr
         return ""
 
     def distances(rows: slice) -> numpy.ndarray:
-        """Median distance at each offset, m; infinite where few times are common."""
+        """Return the median distance at each offset, m; infinite where few times are common."""
         found = []
         for offset in OFFSETS:
             at = [

@@ -79,7 +79,7 @@ class Filters(NamedTuple):
 
 @functools.lru_cache(8)  # an evaluation makes the same bank for every competitor, on numbers and on symbols
 def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: int) -> class_fusion.Channels:
-    """Gains and innovation statistics of the classes' filters for every scan of an episode.
+    """Return the gains and innovation statistics of the classes' filters for every scan of an episode.
 
     Args:
         content: shape and numbers of the arrays of the models, and of the covariances at the start.
@@ -270,7 +270,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         )
 
     def _average(self, old: Array, new: Array) -> Array:
-        """Exponential average with a new value taken in."""
+        """Return the exponential average with a new value taken in."""
         return self.forgetting * old + (1.0 - self.forgetting) * new
 
     def _count_decisions(
@@ -284,7 +284,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         return used, used_counts + accepted, refused_counts + (decided - accepted)
 
     def _esm_log_likelihood(self, used: Array, measurement: Measurement) -> Array:
-        """Logarithm of pi(rho | s) of a decision that may be used, otherwise 0, ``(M, N)``."""
+        """Return the logarithm of pi(rho | s) of a decision that may be used, otherwise 0, ``(M, N)``."""
         usable = self.xp.where(used, measurement.decision, self.task.types)
         return self.xp.take(self.log_esm, usable, axis=1)
 
@@ -299,15 +299,15 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     # --- what comes out
 
     def mean(self, state: Filters) -> Array:
-        """Combination of the filters (11), ``(3, N)``."""
+        """Return the combination of the filters (11), ``(3, N)``."""
         return weighted_sum(state.probabilities, state.mean)
 
     def covariance(self, state: Filters) -> Array:
-        """Covariance (12), with the spread of the filters."""
+        """Return the covariance (12), with the spread of the filters."""
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Weights, NIS, and the log-density of the radar measurement as the filters predict it.
+        """Return the weights, NIS, and the log-density of the radar measurement as the filters predict it.
 
         The NIS of the bank is the mean over the classes by their probability given the radar; where these are
         calibrated its expectation is 2, that of the true class's filter.
@@ -324,5 +324,5 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
 
 
 def one_hot(index: Array, count: int, xp: ModuleType) -> Array:
-    """Rows of which the one with the index is 1, ``(count, N)``."""
+    """Return the rows of which the one with the index is 1, ``(count, N)``."""
     return xp.astype(xp.arange(count, device=index.device)[:, None] == index, xp.float64)

@@ -202,7 +202,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return ClassState(initial.mean, initial.covariance, self.start_tracks(initial), unknown)
 
     def start_tracks(self, initial: Start) -> ClassTracks:
-        """Hypotheses at the start."""
+        """Return the hypotheses at the start."""
         xp, p, M = self.xp, self.prior, self.prior.onsets + 2
         none = 0.0 * initial.mean[0]
         state = xp.concat([initial.mean, xp.zeros((self.states - 3, 1)) + none])
@@ -220,7 +220,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
 
     def look(self, measurement: Measurement) -> Array:
-        """Likelihood of this scan's look, ``(J, 2, V, N)``."""
+        """Return the likelihood of this scan's look, ``(J, 2, V, N)``."""
         look = emitters.Look(measurement.looked, measurement.decision, measurement.bearing_difference)
         return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
 
@@ -422,7 +422,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return ClassTracks(everything[:n], everything[n:], m.weights, m.unchanged, changed, first, later)
 
     def change_tables(self, m: ClassTracks, hazard: Array, again: Array, born: Array) -> tuple[Array, Array]:
-        """T0 without what has left, T1 with it."""
+        """Return the T0 without what has left, T1 with it."""
         xp, J, grid = self.xp, m.first.shape[0], self.grid
         classes, types = range(self.classes), self.others.shape[1]
         joint = [

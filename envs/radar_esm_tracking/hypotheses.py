@@ -122,12 +122,14 @@ class HypothesesBank(SettingsBank):
         )
 
     def group(self, weights: Array) -> Array:
-        """Probabilities of unchanged and of changed classes, ``(2 S, N)``, of those of hypotheses, ``(S, M, N)``."""
+        """Return the probabilities of unchanged and of changed classes, ``(2 S, N)``, of those of hypotheses, ``(S,
+        M, N)``.
+        """
         changed = ordered_sum(weights[:, h] for h in range(1, weights.shape[1]))
         return self.xp.concat([weights[:, 0], changed])
 
     def class_estimates(self, own: ClassState) -> dict[str, Array]:
-        """Mean and probability of each class."""
+        """Return the mean and probability of each class."""
         tracks, hypotheses = own.tracks, range(own.tracks.weights.shape[1])
         probabilities = ordered_sum(tracks.weights[:, h] for h in hypotheses)
         total = ordered_sum(tracks.weights[:, h] * tracks.mean[:3, :, h] for h in hypotheses)

@@ -114,7 +114,7 @@ class KalmanNetBank(ClassBank):
         return NetFilters(**fields, gain_covariance=covariance, action=action)
 
     def noises(self, action: Array) -> tuple[Array, list[Array]]:
-        """Factor on the process noise, ``(N,)``, and variances of the radar, each ``(N,)``."""
+        """Return the factor on the process noise, ``(N,)``, and variances of the radar, each ``(N,)``."""
         classes = self.task.classes
         scale = self.xp.exp(2.0 * math.log(NOISE_RANGE) * action[classes : classes + len(NOISES)])
         return scale[0], [scale[1 + i] * variance for i, variance in enumerate(self.radar_variances)]
@@ -195,6 +195,6 @@ class KalmanNetBank(ClassBank):
         )
 
     def covariance(self, state: Any) -> Array:
-        """Covariance (12), with the spread of the filters."""
+        """Return the covariance (12), with the spread of the filters."""
         each = packed_covariance.unpack(state.covariance, 3)
         return imm.combine(state.mean, each, state.probabilities)[1]

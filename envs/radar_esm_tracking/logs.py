@@ -90,7 +90,7 @@ def _start_variances(p: Any) -> list[float]:
 
 
 def _numbers(p: Any) -> dict[str, float]:
-    """Numbers that the reading of a row needs."""
+    """Return the numbers that the reading of a row needs."""
     variances = {f"variance_{i}": variance for i, variance in enumerate(_start_variances(p))}
     return {"types": len(p.recognition), "esm_period": p.esm_period, "horizon": p.horizon, **variances}
 
@@ -137,7 +137,9 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
 
 
 def predict_radar(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Range and range rate that an estimate predicts by its acceleration, and those of the radar, ``(2, N)`` each."""
+    """Return the range and range rate that an estimate predicts by its acceleration, and those of the radar, ``(2,
+    N)`` each.
+    """
     T = parameters.sampling_interval
     distance, rate, acceleration = mean
     predicted = numpy.stack([distance + T * rate + 0.5 * T**2 * acceleration, rate + T * acceleration])

@@ -54,7 +54,7 @@ class RadarEsmTrackingPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Accelerations, weights, true class and type, and the decision of this scan."""
+        """Return the accelerations, weights, true class and type, and the decision of this scan."""
         filters, truth, decision = state.filter, state.truth, state.measurement.decision[0]
         decided, used = decision < self.task.types, filters.used[0]
         nothing = float("nan")
@@ -84,7 +84,7 @@ class RadarEsmTrackingPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Weights and the three errors."""
+        """Return the weights and the three errors."""
         weights = {mode: f"weight.{s}" for s, mode in enumerate(self.task.modes)}
         limits = {"range": 2000.0, "range_rate": 30.0, "acceleration": 20.0}
         return [
@@ -104,7 +104,7 @@ class RadarEsmTrackingPicture(Picture):
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Scans after the class has changed."""
+        """Return the scans after the class has changed."""
         return [] if self.change is None else [(self.change, self.task.horizon + 0.5)]
 
     # --- panels

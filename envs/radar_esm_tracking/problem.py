@@ -23,7 +23,7 @@ class RadarEsmProblem(Task):
 
     @staticmethod
     def design_models(p: RadarEsmTrackingParameters) -> tuple[class_fusion.Models, numpy.ndarray]:
-        """Models of the classes and the covariances that the track starts with, ``(3, 3, M)``."""
+        """Return the models of the classes and the covariances that the track starts with, ``(3, 3, M)``."""
         T = p.sampling_interval
         Q = []
         for alpha, sigma in zip(p.manoeuvrability, p.acceleration_sigma, strict=True):

@@ -197,7 +197,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return truth, Start(mean, self.start_covariance + zero, first)
 
     def _types_of(self, target_class: Array) -> Array:
-        """Thresholds of the emitter types of a class."""
+        """Return the thresholds of the emitter types of a class."""
         return self.xp.take(self.type_thresholds, target_class, axis=1)
 
     def _another_class(self, draws: Draws, name: str, target_class: Array) -> Array:
@@ -299,11 +299,13 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     # --- how good an estimate is
 
     def error_factor(self, truth: Truth) -> Array:
-        """Deviation of this scan's white radar errors over the nominal one, ``(N,)``: not 1 where there is glint."""
+        """Return the deviation of this scan's white radar errors over the nominal one, ``(N,)``: not 1 where there
+        is glint.
+        """
         return truth.disturbances.get("glint", self.xp.ones_like(truth.separation))
 
     def state(self, truth: Truth) -> Array:
-        """Range, range rate and acceleration, ``(3, N)``."""
+        """Return the range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
 
     def reading_deviations(self, measurement: Measurement) -> Array:
@@ -312,13 +314,13 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return self.task.constant([[p.range_sigma], [p.range_rate_sigma]]) + 0.0 * measurement.radar
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
-        """Difference of bearings NaN where the ESM decided nothing."""
+        """Return the difference of bearings NaN where the ESM decided nothing."""
         decided = measurement.decision < self.task.types
         difference = self.xp.where(decided, measurement.bearing_difference, math.nan)
         return measurement._replace(bearing_difference=difference)
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """Range and range rate; nothing of the acceleration."""
+        """Return the range and range rate; nothing of the acceleration."""
         return self.xp.concat([measurement.radar, measurement.radar[:1] * math.nan])
 
     def component_deviations(self, measurement: Measurement) -> Array:
@@ -327,12 +329,12 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return self.xp.stack([p.range_sigma * once, p.range_rate_sigma * once, math.nan * once])
 
     def error_cost(self, error: Array) -> Array:
-        """Mean of the three squared errors over their scales."""
+        """Return the mean of the three squared errors over their scales."""
         scaled = error * self.cost_factors
         return ordered_sum(scaled * scaled) * (1.0 / 3.0)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """True class and type, and the time."""
+        """Return the true class and type, and the time."""
         xp = self.xp
         return {
             **self.disturbances.records(truth.disturbances),
@@ -342,8 +344,8 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Class and type of the target now, when they change (scan) and to what, the second emitter, the radar's errors
-        beside the white ones, and whether the target is silent now.
+        """Return the class and type of the target now, when they change (scan) and to what, the second emitter, the
+        radar's errors beside the white ones, and whether the target is silent now.
         """
         p, xp = self.parameters, self.xp
         never = 0 * truth.change_scan - 1
@@ -371,5 +373,5 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
 
 
 def _thresholds(rows: object) -> numpy.ndarray:
-    """Cumulative probabilities that a uniform number is compared with, ``(columns - 1, rows)``."""
+    """Return the cumulative probabilities that a uniform number is compared with, ``(columns - 1, rows)``."""
     return numpy.cumsum(numpy.array(rows), axis=1)[:, :-1].T

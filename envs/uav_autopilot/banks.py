@@ -160,7 +160,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def log_trace(self, state: Any) -> Array:
-        """Log of the predicted covariance's trace."""
+        """Return the log of the predicted covariance's trace."""
         raise NotImplementedError
 
     def compare(self, state: Any, measurement: Measurement, readings: Array, S: Array) -> Any:
@@ -191,8 +191,8 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
-        """NIS with the number of its readings, their log-density (both NaN in a dropout of all sensors), and the
-        innovation over its sigma of the output's sensor (of the first where the output is not measured).
+        """Return the NIS with the number of its readings, their log-density (both NaN in a dropout of all sensors),
+        and the innovation over its sigma of the output's sensor (of the first where the output is not measured).
         """
         task, xp = self.task, self.xp
         count = ordered_sum(measurement.available)
@@ -227,7 +227,7 @@ class _KalmanBank(AutopilotBank):
         return scale * self.process_noise[entries]
 
     def log_trace(self, state: KalmanState) -> Array:
-        """Log of the predicted covariance's trace, with the process noise of the last action."""
+        """Return the log of the predicted covariance's trace, with the process noise of the last action."""
         variances = state.covariance[self.diagonal] + self.scaled_noise(state.scale, self.diagonal)
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
@@ -267,7 +267,7 @@ class _KalmanBank(AutopilotBank):
         raise NotImplementedError
 
     def sensor_variances(self, shown: Array) -> Any:
-        """Variances of the readings that the update takes, of each sensor, numbers or ``(m, N)``."""
+        """Return the variances of the readings that the update takes, of each sensor, numbers or ``(m, N)``."""
         return self.task.sensor_variances
 
     def autopilot_estimate(
@@ -302,7 +302,7 @@ class _KalmanBank(AutopilotBank):
         return state.estimate
 
     def covariance(self, state: KalmanState) -> Array:
-        """Covariance reported for it, ``(n, n, N)``."""
+        """Return the covariance reported for it, ``(n, n, N)``."""
         return packed_covariance.unpack(state.estimate_covariance, len(self.task.components))
 
 
@@ -314,13 +314,14 @@ class GainBank(_KalmanBank):
     no_action: tuple[float, ...] = (0.0,)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Scale by ``10 ** (gain_decades a)``."""
+        """Return the scale by ``10 ** (gain_decades a)``."""
         xp = self.xp
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
 
     def covariance(self, state: KalmanState) -> Array:
-        """Covariance of the filter, when it is steered times the short average of the NIS where that is above one.
+        """Return the covariance of the filter, when it is steered times the short average of the NIS where that is
+        above one.
 
         Whether the action is right about the noise, only the innovations tell. Left alone, it is the paper's filter
         with the paper's covariance.
@@ -354,7 +355,7 @@ class NoiseBank(_KalmanBank):
         return shown, xp.exp(shown[0] * (p.noise_reach * p.process_decades * math.log(10.0)))
 
     def sensor_variances(self, shown: Array) -> Array:
-        """Nominal ones times ``10 ** (2 noise_reach sensor_decades a)``."""
+        """Return the nominal ones times ``10 ** (2 noise_reach sensor_decades a)``."""
         p = self.parameters
         scale = self.xp.exp(shown[1:] * (2.0 * p.noise_reach * p.sensor_decades * math.log(10.0)))
         return self.nominal_variances * scale
@@ -377,7 +378,9 @@ class ModeBank(_KalmanBank):
         self.raw_covariance: Array = task.constant(packed_covariance.pack(raw)[:, None])
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Scale by ``wide_band_scale`` in mode "wide-band", by ``over_smoothed_scale`` in "over-smoothed"."""
+        """Return the scale by ``wide_band_scale`` in mode "wide-band", by ``over_smoothed_scale`` in
+        "over-smoothed".
+        """
         xp, p = self.xp, self.parameters
         shown = xp.stack([xp.astype(action == i, xp.float64) for i in range(len(MODES))])
         wide, smooth = (p.wide_band_scale - 1.0) * shown[1], (p.over_smoothed_scale - 1.0) * shown[3]
@@ -386,7 +389,7 @@ class ModeBank(_KalmanBank):
     def autopilot_estimate(
         self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
     ) -> tuple[Array, Array]:
-        """Readings in place of the measured coordinates and zero for the others in mode "raw-sensors"."""
+        """Return the readings in place of the measured coordinates and zero for the others in mode "raw-sensors"."""
         xp, reading, measured = self.xp, measurement.reading, self.task.measured
         zero = xp.zeros_like(reading[0])
         rows = [

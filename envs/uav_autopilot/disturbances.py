@@ -77,7 +77,7 @@ class NoisySensors(_OfSensors):
         return SensorLevels(levels, levels.values[0])
 
     def quiet(self, state: SensorLevels, calm: Array) -> SensorLevels:
-        """Nominal noise."""
+        """Return the nominal noise."""
         values = self.xp.where(calm, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
 

@@ -108,7 +108,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         )
 
     def log_trace(self, state: HypothesesState) -> Array:
-        """Log of the predicted covariance's trace, the spread of the hypotheses included."""
+        """Return the log of the predicted covariance's trace, the spread of the hypotheses included."""
         return state.log_trace
 
     def start(self, initial: Start) -> HypothesesState:
@@ -136,12 +136,14 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         )
 
     def group(self, probability: Array) -> Array:
-        """Probabilities of the gusts' levels, ``(G, N)``, of those of hypotheses of every kind, ``(H, N)``."""
+        """Return the probabilities of the gusts' levels, ``(G, N)``, of those of hypotheses of every kind, ``(H,
+        N)``.
+        """
         each = len(self.names)
         return ordered_sum(probability[each * i : each * (i + 1)] for i in range(self.own.groups))
 
     def expect_levels(self, h: LevelHypotheses) -> Array:
-        """Expected logarithm of the factor on the deviation of each sensor, ``(m, N)``."""
+        """Return the expected logarithm of the factor on the deviation of each sensor, ``(m, N)``."""
         of_each = [ordered_sum(q * level) for q, level in zip(h.sensors, self.log_levels, strict=True)]
         return self.xp.stack([ordered_sum(h.probability * levels) for levels in of_each])
 

@@ -97,7 +97,7 @@ that has a bias, and an actuator that is slower than designed; one of ten each."
 
 
 def grid(limits: tuple[float, float], points: int) -> numpy.ndarray:
-    """Middles of equal intervals of the logarithm."""
+    """Return the middles of equal intervals of the logarithm."""
     low, high = limits
     return numpy.asarray(low * (high / low) ** ((numpy.arange(points) + 0.5) / points))
 

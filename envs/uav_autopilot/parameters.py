@@ -238,7 +238,7 @@ class UavAutopilotParameters(TaskParameters):
             )
 
     def value(self, name: str) -> Any:
-        """Value of a constant that may have been left to the plant."""
+        """Return the value of a constant that may have been left to the plant."""
         given = getattr(self, name)
         if given is not None:
             return given

@@ -34,7 +34,7 @@ class UavAutopilotPicture(Picture):
         self.actions: Any = model.filter.action_block.parts
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Signals of the loop, NIS, and the levels of the noise."""
+        """Return the signals of the loop, NIS, and the levels of the noise."""
         task, truth, estimator = self.task, state.truth, state.filter
         assert isinstance(estimator, KalmanState | HypothesesState)
         answered = state.measurement.available[self.shown, 0] > 0.0
@@ -60,7 +60,7 @@ class UavAutopilotPicture(Picture):
         return values | {f"sensor_level.{s}": truth.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
 
     def beliefs(self, estimator: HypothesesState) -> dict[str, float]:
-        """Probabilities of hypotheses about the gusts, by what is drawn as one."""
+        """Return the probabilities of hypotheses about the gusts, by what is drawn as one."""
         assert isinstance(self.model.filter, HypothesesBank)
         designed, *others = estimator.probabilities[:, 0]
         stronger = sum(
@@ -70,7 +70,7 @@ class UavAutopilotPicture(Picture):
         return {f"gusts.{name}": float(value) for name, value in zip(GUSTS, values, strict=True)}
 
     def strips(self) -> Sequence[Strip]:
-        """Left column the loop, right column the filter."""
+        """Return the left column the loop, right column the filter."""
         task = self.task
         output = task.components[task.output]
         name, unit = CONTROL[task.parameters.plant]

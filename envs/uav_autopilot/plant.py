@@ -24,7 +24,7 @@ class Plant(NamedTuple):
 
 
 def constant_rate(parameters: UavAutopilotParameters) -> Plant:
-    """Plant P: ``F = [[1, T], [0, 1]]``, "with the first derivative of the useful signal" (paper).
+    """Return the plant P: ``F = [[1, T], [0, 1]]``, "with the first derivative of the useful signal" (paper).
 
     Reading: the scan has "1 0,25 / F = 0 =1"; the "=" is a stray sign. ``B = [T^2/2, T]`` and noise that
     enters with the control are ours.
@@ -36,7 +36,7 @@ def constant_rate(parameters: UavAutopilotParameters) -> Plant:
 
 
 def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0) -> Plant:
-    """Plant U: short period, pitch, actuator and gust of a small aircraft, in degrees and deg/s.
+    """Return the plant U: short period, pitch, actuator and gust of a small aircraft, in degrees and deg/s.
 
     With the aerodynamic angle ``a = incidence + gust``:
     ``incidence' = rate - Z_a a - Z_d elevator``, ``rate' = M_a a + M_q rate + M_d elevator + w_q``,

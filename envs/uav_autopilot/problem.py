@@ -36,9 +36,11 @@ class AutopilotProblem(Task):
         return float(self.parameters.value("sampling_interval"))
 
     def autopilot(self, estimate: Array, command: Array) -> Array:
-        """Control that follows from estimate ``(n, N)`` and command ``(N,)``, ``u = N r - L x(k|k)``, ``(N,)``."""
+        """Return the control that follows from estimate ``(n, N)`` and command ``(N,)``, ``u = N r - L x(k|k)``,
+        ``(N,)``.
+        """
         return self.design.feedforward * command - self.xp.matmul(self._L, estimate)[0]
 
     def readings_of(self, state: Array) -> Array:
-        """Measured coordinates of ``(n, N)``, ``(m, N)``."""
+        """Return the measured coordinates of ``(n, N)``, ``(m, N)``."""
         return self.xp.stack([state[i] for i in self.measured])

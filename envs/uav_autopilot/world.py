@@ -210,7 +210,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return self.xp.stack(rows)
 
     def cost(self, truth: Truth, mean: Array) -> Array:
-        """Weighted squares of deviation from the command's equilibrium and of the control, ``(N,)``."""
+        """Return the weighted squares of deviation from the command's equilibrium and of the control, ``(N,)``."""
         task = self.task
         control = task.autopilot(mean, truth.command)
         total = task.design.control_weight * control * control
@@ -237,7 +237,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return (float(self.optimal.regret[0, 0]) / task.cost_unit) * lost * lost
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Output and command, in the unit of the output."""
+        """Return the output and command, in the unit of the output."""
         return {
             **self.disturbances.records(truth.disturbances),
             "output": truth.state[self.task.output],
@@ -245,8 +245,9 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Levels of the disturbance and of each sensor's noise, commands and dropouts, with the numbers of the
-        measurements at which they step, the levels now, and what the sensors' errors have beside white noise.
+        """Return the levels of the disturbance and of each sensor's noise, commands and dropouts, with the numbers
+        of the measurements at which they step, the levels now, and what the sensors' errors have beside white
+        noise.
         """
         return {
             "levels": truth.levels.values,
