@@ -1,13 +1,13 @@
-r"""A task made of a state-space model that somebody gives: what is declared, the world, and the task.
+r"""A task made of a user's state-space model: its world and its class.
 
     x(k) = f(x(k-1)) + w,  w ~ N(0, Q)          z(k) = h(x(k)) + v,  v ~ N(0, R)          x(0) ~ N(mean, covariance)
 
-A model may know the time, then f and Q are of the interval dt since the measurement before, and known inputs u, which
-are drawn with the episode and acted in this interval: ``x(k) = f(x(k-1), dt, u) + w``, ``w ~ N(0, Q(dt))``. A
-measurement then says both (:mod:`.equations`, :mod:`.inputs`).
+f and Q of a timed model are functions of the interval dt since the previous measurement. A model may also have known
+inputs u, drawn with the episode, that acted in this interval: ``x(k) = f(x(k-1), dt, u) + w``, ``w ~ N(0, Q(dt))``. A
+measurement then contains both (:mod:`.equations`, :mod:`.inputs`).
 
-The world obeys one model, or several between which it switches as a Markov chain from measurement to measurement. The
-filters may believe others. Functions are traced once, on vectors of symbols, and differentiated exactly
+The world has one model, or switches between several as a Markov chain from measurement to measurement. The filters may
+use other models. The functions are traced once, on vectors of symbols, and differentiated exactly
 (:mod:`..compiler.vector_functions`).
 """
 
@@ -44,23 +44,23 @@ from .state_space_banks import StateSpaceKalmanNetBank, bank_tables
 
 
 class StateSpaceTruth(NamedTuple):
-    """What is."""
+    """True state, model, noise factors and inputs."""
 
     state: Array
     """``(n, N)``."""
     hypothesis: Array
-    """Number of the model that led here, ``(N,)``."""
+    """Index of the model in force since the previous measurement, ``(N,)``."""
     process_noise: Array
-    """True Q over the model's, ``(N,)``."""
+    """Ratio of the true Q to the model's, ``(N,)``."""
     measurement_noise: Array
-    """True R over the model's, ``(N,)``."""
+    """Ratio of the true R to the model's, ``(N,)``."""
     inputs: Array | None = None
-    """Inputs that acted since the measurement before, ``(p, N)``; None where the model has none."""
+    """Inputs that acted since the previous measurement, ``(p, N)``; None where the model has none."""
     sensors: SensorStates | None = None
-    """Where the sensors stand; None where nothing is to be remembered."""
+    """State of the sensors; None where they have none."""
     waiting: Array | None = None
-    """What is under way, values and where there are any, the oldest first, ``(lateness, 2, m, N)``; None where nothing
-    comes late."""
+    """Delayed values and their availability, the oldest first, ``(lateness, 2, m, N)``; None in a task without
+    delays."""
 
 
 class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasurement]):
@@ -81,7 +81,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.jitters: bool = self.parameters.jitter > 0.0
         if self.jitters and not self.timed:
             raise ValueError(
-                f"{task.id} knows no time, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) and Q(dt)"
+                f"the model of {task.id} is not timed, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) and Q(dt)"
             )
         self.initial_root: Array = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
         first = own.world[0]
@@ -104,13 +104,13 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.places: list[int | None] = [None if j in turning else j for j in components_measured(first.h)]
 
     def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
-        """Return the root of a covariance that is the same for all measurements; None of any other."""
+        """Return the root of a constant covariance; None for a function."""
         if isinstance(covariance, VectorFunction):
             return None
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
     def begin(self, draws: Draws, normals: Array) -> tuple[StateSpaceTruth, Initial]:
-        """Draw the start and the noise of the episode; everyone starts with the same mean and covariance."""
+        """Draw the initial state and the noise of the episode; every filter starts with the same mean and covariance."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
         process, measurement = (
             draw_between(draws.log_uniform, name, limits) + zero
@@ -135,7 +135,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def advance(
         self, truth: StateSpaceTruth, noise: Array, feedback: Any
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Switch, move, measure."""
+        """Switch the model, move the state and measure it."""
         xp, n = self.xp, self.states
         uniforms = noise[self.normals :]
         hypothesis = truth.hypothesis
@@ -144,7 +144,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         interval = self._interval(truth, uniforms[int(self.switches)] if self.jitters else None)
         process = xp.sqrt(truth.process_noise) * noise[:n]
         sensors = xp.sqrt(truth.measurement_noise) * noise[n : self.noises]
-        inputs, told = self._inputs(truth, interval, noise[self.noises : self.normals])
+        inputs, reported = self._inputs(truth, interval, noise[self.noises : self.normals])
         passed = Passage(interval, inputs)
         moved, measured = [], []
         for equations, q, r in zip(self.equations, self.process_roots, self.sensor_roots, strict=True):
@@ -162,38 +162,38 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
             truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :]
         )
         truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs, sensors=sensors)
-        received = StateSpaceMeasurement(*self._receive(truth, values, (here, due)), interval, told)
+        received = StateSpaceMeasurement(*self._receive(truth, values, (here, due)), interval, reported)
         return self._delay(truth, received, uniforms[self.delayed :]) if self.delays else (truth, received)
 
     def _delay(
         self, truth: StateSpaceTruth, received: StateSpaceMeasurement, uniforms: Array
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Hold back what comes late, and hand over what was held back.
+        """Delay the values of some sensors, and add the delayed values that arrive now.
 
         Args:
-            truth: at this measurement, with what is under way from those before.
-            received: all that the sensors say of it.
-            uniforms: of each sensor, ``(sensors, N)``.
+            truth: truth at this measurement, with the delayed values of earlier ones.
+            received: values of all sensors.
+            uniforms: a uniform number for each sensor, ``(sensors, N)``.
         """
         xp, rows = self.xp, []
         for place, channel in enumerate(self.task.definition.channels):
             rows += [xp.where(uniforms[place] < self.parameters.late, 1.0, 0.0)] * channel.size
-        held, waiting = xp.stack(rows), truth.waiting
+        delayed, waiting = xp.stack(rows), truth.waiting
         assert waiting is not None
-        kept = xp.stack([held * received.values, held * received.available])
-        truth = truth._replace(waiting=xp.concat([waiting[1:], kept[None]]))
-        in_time = (1.0 - held) * received.values, (1.0 - held) * received.available
+        later = xp.stack([delayed * received.values, delayed * received.available])
+        truth = truth._replace(waiting=xp.concat([waiting[1:], later[None]]))
+        in_time = (1.0 - delayed) * received.values, (1.0 - delayed) * received.available
         return truth, StateSpaceMeasurement(*in_time, received.interval, received.inputs, *waiting[0])
 
     def _receive(
         self, truth: StateSpaceTruth, values: Array, here: Sequence[Array | None]
     ) -> tuple[Array, Array]:
-        """What is received of the values of all sensors, zero elsewhere, and where it is, ``(m, N)`` both.
+        """Return the received values of all sensors, zero elsewhere, and their availability, both ``(m, N)``.
 
         Args:
-            truth: at this measurement.
-            values: ``(m, N)``.
-            here: where something is received, ``(N,)`` or ``(m, N)`` each.
+            truth: truth at this measurement.
+            values: measured values, ``(m, N)``.
+            here: masks of 1 where values are received and 0 elsewhere, ``(N,)`` or ``(m, N)`` each.
         """
         available = 1.0 + 0.0 * values
         if truth.sensors is not None and truth.sensors.bias is not None:
@@ -207,23 +207,21 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return values, available
 
     def _seconds(self, truth: StateSpaceTruth, interval: Array | None) -> Array:
-        """Return the time that passes until the next measurement, s, ``(N,)``, also of a model that is not timed."""
+        """Return the time until the next measurement, s, ``(N,)``, also for a model that is not timed."""
         usual: Array = self.parameters.sampling_interval + 0.0 * truth.process_noise
         return usual if interval is None else interval
 
     def _inputs(
         self, truth: StateSpaceTruth, interval: Array | None, normals: Array
     ) -> tuple[Array | None, Array | None]:
-        """Return the inputs that act until the next measurement, and what is told of them, ``(p, N)``; None without
-        inputs.
-        """
+        """Return the inputs that act until the next measurement, and those that filters receive, ``(p, N)``."""
         if truth.inputs is None:
             return None, None
         inputs = self.courses.advance(truth.inputs, self._seconds(truth, interval), normals)
         return inputs, self.courses.report(inputs, normals)
 
     def _interval(self, truth: StateSpaceTruth, uniform: Array | None) -> Array | None:
-        """Return the time that passes until the next measurement, s, ``(N,)``; None where the model is not timed."""
+        """Return the time until the next measurement, s, ``(N,)``; None where the model is not timed."""
         if not self.timed:
             return None
         interval = self.parameters.sampling_interval + 0.0 * truth.process_noise
@@ -232,7 +230,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         )
 
     def _chosen(self, parts: Sequence[Array], hypothesis: Array) -> Array:
-        """Of the arrays of all models that of the one in force."""
+        """Return the array of the model in force from those of all models."""
         chosen = parts[0]
         for number, part in enumerate(parts[1:], 1):
             if self.switches:
@@ -240,7 +238,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return chosen
 
     def _switch(self, hypothesis: Array, uniform: Array) -> Array:
-        """Return the number of the model that follows, ``(N,)``."""
+        """Return the index of the next model, ``(N,)``."""
         rows = numpy.cumsum(self.task.definition.transition, axis=1)[:, :-1]
         thresholds = [
             self._chosen([0.0 * uniform + value for value in column], hypothesis)
@@ -249,13 +247,13 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.xp.astype(category(uniform, thresholds, self.xp), self.xp.float64)
 
     def error_cost(self, error: Array) -> Array:
-        """Return the weighted sum of squared errors; a component without weight need not be known."""
+        """Return the weighted sum of squared errors; a component with weight zero need not be known."""
         weights = self.task.definition.weights.tolist()
         terms = [weight * error[i] ** 2 for i, weight in enumerate(weights) if weight]
         return sum(terms[1:], terms[0])
 
     def reading_deviations(self, measurement: StateSpaceMeasurement) -> Array:
-        """Those of the R that the filters believe, at the initial mean where it depends on the state."""
+        """Return the standard deviations of the filters' R, ``(m, N)``, at the initial mean where R depends on the state."""
         values = measurement.values
         mean = self.task.constant(self.task.definition.mean)
         x = self.xp.stack([mean[i] + 0.0 * values[0] for i in range(self.states)])
@@ -263,11 +261,11 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.xp.stack([self.xp.sqrt(R[j, j]) + 0.0 * values[j] for j in range(values.shape[0])])
 
     def component_readings(self, measurement: StateSpaceMeasurement) -> Array | None:
-        """Return the readings of components that are measured as they are; None where none is."""
+        """Return the readings of directly measured components, ``(n, N)``; None where there are none."""
         return self._of_components(measurement.values, measurement.available)
 
     def component_deviations(self, measurement: StateSpaceMeasurement) -> Array | None:
-        """Return the deviations that the model states for them."""
+        """Return the standard deviations of the readings of components, ``(n, N)``, by the filters' model."""
         return self._of_components(self.reading_deviations(measurement), measurement.available)
 
     def _of_components(self, values: Array, available: Array) -> Array | None:
@@ -280,7 +278,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         )
 
     def context(self, truth: StateSpaceTruth) -> dict[str, Array]:
-        """The model in force and the factors on Q and R."""
+        """Return the model in force and the factors on Q and R."""
         return {
             "hypothesis": truth.hypothesis,
             "process_noise": truth.process_noise,
@@ -289,7 +287,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
 
 
 def components_measured(h: VectorFunction) -> list[int | None]:
-    """Of each component the place of its measurement, where h hands it on as it is."""
+    """Return the index of the measurement of each component that h measures directly, otherwise None."""
     if h.matrix is None or numpy.any(h.offset):
         return [None] * (0 if h.matrix is None else h.matrix.shape[1])
     rows = h.matrix.tolist()
@@ -303,16 +301,16 @@ class StateSpace(StateSpaceProblem):
     ## Description
 
     The state moves by a function f and noise of covariance Q; sensors measure a function h of it with noise of
-    covariance R. Filters start with the same mean and covariance. They know the model, or believe another one where the
-    author says so. Kalman filters are extended ones where f or h is not linear; their Jacobians are exact.
+    covariance R. Filters start with the same mean and covariance. They know the model, or use another one where the
+    author gives one. Kalman filters are extended ones where f or h is not linear; their Jacobians are exact.
 
     ## Action Space
 
-    What each control means stands in ``Actions``; zero is the filter as written.
+    ``Actions`` describes each control; zero is the filter as written.
 
     ## Observation Space
 
-    Normalised innovations and their squares, averages of these, what was received, and the last action.
+    Normalised innovations and their squares, averages of these, availability, and the last action.
 
     ## Rewards
 
@@ -338,13 +336,12 @@ class StateSpace(StateSpaceProblem):
 
 
 REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("evidence_scale",)}
-"""Parameters that say how far an action reaches, by control."""
+"""Parameters that set the range of an action, by control."""
 
 
 def _explain_loss(
     task: StateSpaceProblem, mean: Array, covariance: Array, measurement: StateSpaceMeasurement
 ) -> str:
-    """Name the function of the filters' first model that is not finite near an estimate."""
     return task.believed[0].explain_loss(mean, covariance, measurement)
 
 
@@ -353,12 +350,12 @@ def state_space_attributes(
     components: tuple[Component, ...],
     defaults: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return the attributes of a task's class that follow from what its author gives.
+    """Return the attributes of a task's class that follow from its definition.
 
     Args:
         definition: the models.
-        components: of the state.
-        defaults: parameters in the training distribution, where they are not those of every such task.
+        components: components of the state.
+        defaults: parameters of the training distribution that differ from the defaults of such tasks.
     """
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))
@@ -368,7 +365,7 @@ def state_space_attributes(
         "noisy": ("ten times the measurement noise", {"measurement_noise": (10.0, 10.0)}),
         "gaps": ("gaps of ten measurements on average, a third of the time", {"gaps": 0.05}),
         "biased": ("one sensor is off by three standard deviations", {"bias": 3.0}),
-        "late": ("a third of what the sensors say comes three measurements late", {"late": 1.0 / 3.0}),
+        "late": ("a third of the values of the sensors comes three measurements late", {"late": 1.0 / 3.0}),
     }
     if definition.world[0].timed:
         held_out["jitter"] = ("intervals from a tenth to 1.9 times the usual", {"jitter": 0.9})
