@@ -63,9 +63,9 @@ class StateSpaceModel:
         return isinstance(self.Q, VectorFunction)
 
     def stands_still(self, mean: numpy.ndarray, inputs: numpy.ndarray) -> bool:
-        """Return whether f is the identity and Q zero for an interval of zero, so that measurements may be simultaneous.
+        """Return whether f is the identity and Q zero for an interval of zero.
 
-        The method checks this numerically at a few states.
+        Measurements may then be simultaneous. The method checks this numerically at a few states.
 
         Args:
             mean: centre of the states that are checked, ``(n,)``.

@@ -10,7 +10,7 @@ from ..contract.live_input import LiveInput, Memory
 from .equations import StateSpaceDefinition, StateSpaceProblem, find_invalid_noise
 
 UNEVEN = 0.01
-"""Largest deviation of an interval from the sampling interval, as a share of it; as in tables of regular measurements."""
+"""Largest deviation of an interval from the sampling interval, as a share of it."""
 
 
 class StateSpaceInput(LiveInput):
@@ -32,7 +32,7 @@ class StateSpaceInput(LiveInput):
         self._names = ["values", *(channel.name for channel in self.groups), *self.measured]
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return descriptions of the values by name, and of the values at the start; the interval follows from the times."""
+        """Return descriptions of the values by name, and of those at the start; the interval follows from the times."""
         values, at_start = super().describe()
         found = {name: text for name, text in values.items() if name not in ("interval", "inputs")}
         sensors = {channel.name: f"shape ({channel.size},)" for channel in self.groups}

@@ -81,7 +81,8 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.jitters: bool = self.parameters.jitter > 0.0
         if self.jitters and not self.timed:
             raise ValueError(
-                f"the model of {task.id} is not timed, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) and Q(dt)"
+                f"the model of {task.id} is not timed, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) "
+                "and Q(dt)"
             )
         self.initial_root: Array = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
         first = own.world[0]
@@ -110,7 +111,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
     def begin(self, draws: Draws, normals: Array) -> tuple[StateSpaceTruth, Initial]:
-        """Draw the initial state and the noise of the episode; every filter starts with the same mean and covariance."""
+        """Draw initial state and noise of the episode; every filter starts with the same mean and covariance."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
         process, measurement = (
             draw_between(draws.log_uniform, name, limits) + zero
@@ -253,7 +254,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return sum(terms[1:], terms[0])
 
     def reading_deviations(self, measurement: StateSpaceMeasurement) -> Array:
-        """Return the standard deviations of the filters' R, ``(m, N)``, at the initial mean where R depends on the state."""
+        """Return the standard deviations of the filters' R, ``(m, N)``; at the initial mean if R depends on the state."""
         values = measurement.values
         mean = self.task.constant(self.task.definition.mean)
         x = self.xp.stack([mean[i] + 0.0 * values[0] for i in range(self.states)])
