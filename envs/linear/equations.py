@@ -437,7 +437,7 @@ class Equations:
     def continuous_motion(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Return the motion and sigma points of a transform in which angles of the state stay on the turn nearest the mean.
+        """Return the motion and sigma points of a transform in which angles stay on the turn nearest the mean.
 
         Args:
             mean: state, ``(n, N)``.
@@ -495,7 +495,7 @@ class Equations:
         return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
 
     def gain(self, covariance: Array, received: Received) -> Array:
-        """Return the Kalman gain ``(n, m, N)`` for a predicted covariance ``(n, n, N)``, zero for sensors beyond their gates."""
+        """Return the Kalman gain ``(n, m, N)`` for a covariance ``(n, n, N)``, zero for sensors beyond their gates."""
         if self.gated:
             S = product(product(received.H, covariance), transpose(received.H)) + received.R
             kept = self.within_gates(received.innovation, S)
@@ -536,7 +536,7 @@ class Equations:
         return values
 
     def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
-        """Describe the first finite state of ``(n, N)`` with a value ``(m, ..., N)`` that is not finite; empty if none."""
+        """Describe the first finite state with a value that is not finite; return an empty text if there is none."""
         entries = values.reshape(len(values), -1, x.shape[1])
         wrong = numpy.asarray(~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0))
         if not wrong.any():
