@@ -81,8 +81,8 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.jitters: bool = self.parameters.jitter > 0.0
         if self.jitters and not self.timed:
             raise ValueError(
-                f"the model of {task.id} is not timed, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) "
-                "and Q(dt)"
+                f"the model of {task.id} is not timed, so jitter must be 0, got {self.parameters.jitter}: "
+                "write f(x, dt) and Q(dt)"
             )
         self.initial_root: Array = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
         first = own.world[0]
@@ -254,7 +254,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return sum(terms[1:], terms[0])
 
     def reading_deviations(self, measurement: StateSpaceMeasurement) -> Array:
-        """Return the standard deviations of the filters' R, ``(m, N)``; at the initial mean if R depends on the state."""
+        """Return the standard deviations of the filters' R, ``(m, N)``; at the initial mean if R varies with x."""
         values = measurement.values
         mean = self.task.constant(self.task.definition.mean)
         x = self.xp.stack([mean[i] + 0.0 * values[0] for i in range(self.states)])
