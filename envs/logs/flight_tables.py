@@ -52,7 +52,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "flight": ("flight_id", "icao24", "callsign"),
     "ground": ("onground", "on_ground"),
 }
-"""Columns and their accepted names, of which the first that a file has is read; case does not matter.
+"""Columns and their accepted names: the first that a file has is read; case does not matter.
 
 ``time`` in seconds, in ISO 8601 or as dates of any resolution; ``x``, ``y`` in metres, ``vx``, ``vy`` in m/s; or
 latitude and longitude in degrees, altitude in metres. The state vectors of OpenSky are of this form. Files of the Python
