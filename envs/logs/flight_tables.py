@@ -55,7 +55,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 """Columns and their accepted names: the first that a file has is read; case does not matter.
 
 ``time`` in seconds, in ISO 8601 or as dates of any resolution; ``x``, ``y`` in metres, ``vx``, ``vy`` in m/s; or
-latitude and longitude in degrees, altitude in metres. The state vectors of OpenSky are of this form. Files of the Python
+latitude and longitude in degrees, altitude in metres. The state vectors of OpenSky have this form. Files of the Python
 package ``traffic``, recognised by ``groundspeed``, have altitudes in feet. Rows of one ``flight`` belong together, in
 the order of their times; rows on the ``ground`` are left out.
 """

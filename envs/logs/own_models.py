@@ -1,7 +1,7 @@
 """Tables of measurements of a state-space model: a column for each number that h returns, and for each input.
 
-An input acted since the previous row; where a cell is empty the last value remains in force. The track starts with the model's mean
-and covariance one interval before the first row, as in the simulation.
+An input acted since the previous row; where a cell is empty the last value remains in force. The track starts
+with the model's mean and covariance one interval before the first row, as in the simulation.
 """
 
 import functools

@@ -71,7 +71,7 @@ class Filters(NamedTuple):
     probabilities: Array
     """Weights in force, ``(M, N)``."""
     believed: Array
-    """Probabilities of the classes at the start of the next scan, ``(M, N)``: those of Bayes' rule without evidence under
+    """Probabilities of the classes at the start of the next scan, ``(M, N)``: those of Bayes' rule alone under
     ``evidence``, otherwise the weights in force."""
     expected: Array
     """Probabilities of the classes at the start of this scan, ``(M, N)``."""

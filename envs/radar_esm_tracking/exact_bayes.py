@@ -9,8 +9,8 @@ target's silences,
     P(s, o, j, e)  = w(s, o, j) T1(j, e)                     for targets whose class has changed               (2)
 
 where T0 is the likelihood of all decisions, v and w contain that of the radar, and T1 sums to one over e. (1) is exact
-on the grid of e: as long as no class changes, this is Bayes' rule. (2) assumes that, given the present type, the time of
-the change is independent of the second emitter and the silences. Further approximations:
+on the grid of e: as long as no class changes, this is Bayes' rule. (2) assumes that, given the present type, the time
+of the change is independent of the second emitter and the silences. Further approximations:
 
 * Classes change at one scan of every ``spacing`` (the scans at which the ESM looks). An onset older than B of these is
   merged, by its moments, with all older ones of its class.
@@ -88,9 +88,8 @@ class ClassPrior(NamedTuple):
 
 
 TRAINING = ClassPrior()
-"""Prior of the scenario ``random``: a change between 5 and 55 s in a third of the disturbed episodes; the second emitter's share is
-uniform from 0 to 0.6, of which these are the two points of Gauss and Legendre; rates of silence at their means. Four
-points of the share, four of the rates, eight onsets and a fourth point of the bearing change the cost by less than
+"""Prior of the scenario ``random``: a change between 5 and 55 s in a third of the disturbed episodes; the second emitter's
+share is uniform from 0 to 0.6, with the two points of Gauss and Legendre; rates of silence at their means. Four points of the share, four of the rates, eight onsets and a fourth point of the bearing change the cost by less than
 0.03 %."""
 FEW = TRAINING._replace(onsets=1, second_emitter=(0.3,), sides=1)
 """Prior with little computing time: one onset, the mean share of the second emitter and one distance on either side."""
@@ -105,8 +104,8 @@ VAGUE = ClassPrior(
     outliers=0.02,
     coloured=0.2,
 )
-"""Prior for targets of which little is known (ours): the class may change at any time and repeatedly, types may be drawn
-anew, and radar measurements may be outliers."""
+"""Prior for targets of which little is known (ours): the class may change at any time and repeatedly, types may be
+drawn anew, and radar measurements may be outliers."""
 
 
 class ClassTracks(NamedTuple):
@@ -225,7 +224,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
 
     def of_classes(self, table: Array, points: list[list[int]]) -> Array:
-        """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, over given grid points for each type."""
+        """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, over some grid points for each type."""
         both = table[:, 0] + table[:, 1]
         sums = [ordered_sum(both[:, v] for v in some) for some in points if some]
         types = [i for i, some in enumerate(points) if some]
@@ -338,8 +337,10 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
         look = self.look(measurement)
         first, later = first * look, later * look
-        told = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
-        memory = self.weigh(moved.mean, moved.covariance, moved.unchanged, moved.changed * told, first, later)
+        likelihood = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
+        memory = self.weigh(
+            moved.mean, moved.covariance, moved.unchanged, moved.changed * likelihood, first, later
+        )
         n, size = self.states, self.classes * (prior.onsets + 2)
         P = packed_covariance.unpack(memory.covariance, n)
         estimate, covariance = imm.combine(

@@ -25,8 +25,8 @@ class RadarEsmTrackingParameters(TaskParameters):
     horizon: int = parameter(120, at_least=1)
     """Scans with an action in one episode (ours: 60 s; the paper gives none)."""
     decision_interval: int = parameter(4, at_least=1)
-    """Scans for which one action holds (ours: from one ESM decision to the next. The noise hides the effect of the weights
-    of a single scan: plain PPO learned too little in 200,000 decisions of one scan)."""
+    """Scans for which one action holds (ours: from one ESM decision to the next. The noise hides the effect of
+    the weights of a single scan: plain PPO learned too little in 200,000 decisions of one scan)."""
     esm_period: int = parameter(4, at_least=1)
     """Scans from one ESM decision to the next, W (paper: 2 s)."""
     manoeuvrability: tuple[float, ...] = parameter((0.025, 0.033, 0.1), above=0.0)
@@ -101,7 +101,8 @@ class RadarEsmTrackingParameters(TaskParameters):
     """Limits of the probability, at each ESM look, that a radiating target falls silent; drawn for each episode
     (ours)."""
     silence_end: tuple[float, float] = parameter((1.0, 1.0), at_least=0.0, at_most=1.0, ascending=True)
-    """Limits of the probability, at each ESM look, that a silent target radiates again; drawn for each episode (ours)."""
+    """Limits of the probability, at each ESM look, that a silent target radiates again; drawn for each episode
+    (ours)."""
     second_emitter_probability: tuple[float, float] = parameter(
         (0.0, 0.0), at_least=0.0, at_most=1.0, ascending=True
     )
@@ -117,7 +118,8 @@ class RadarEsmTrackingParameters(TaskParameters):
     """Standard deviation of errors with glint over that of the others (ours)."""
     radar_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Limits of the stationary standard deviation of coloured errors (first-order Gauss-Markov) of range and range
-    rate, in addition to the white ones and over their standard deviation; drawn for each episode, one for both (ours)."""
+    rate, in addition to the white ones and over their standard deviation; drawn for each episode, equal for both
+    (ours)."""
     radar_correlation_time: tuple[float, float] = parameter((10.0, 10.0), above=0.0, ascending=True)
     """Limits of the correlation time of the coloured errors, s; drawn for each episode (ours)."""
     radar_correlation: tuple[float, float] = parameter((0.0, 0.0), above=-1.0, below=1.0, ascending=True)
