@@ -88,8 +88,9 @@ class ClassPrior(NamedTuple):
 
 
 TRAINING = ClassPrior()
-"""Prior of the scenario ``random``: a change between 5 and 55 s in a third of the disturbed episodes; the second emitter's
-share is uniform from 0 to 0.6, with the two points of Gauss and Legendre; rates of silence at their means. Four points of the share, four of the rates, eight onsets and a fourth point of the bearing change the cost by less than
+"""Prior of the scenario ``random``: a change between 5 and 55 s in a third of the disturbed episodes; the second
+emitter's share is uniform from 0 to 0.6, with the two points of Gauss and Legendre; rates of silence at their means.
+Four points of the share, four of the rates, eight onsets and a fourth point of the bearing change the cost by less than
 0.03 %."""
 FEW = TRAINING._replace(onsets=1, second_emitter=(0.3,), sides=1)
 """Prior with little computing time: one onset, the mean share of the second emitter and one distance on either side."""
@@ -224,7 +225,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
 
     def of_classes(self, table: Array, points: list[list[int]]) -> Array:
-        """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, over some grid points for each type."""
+        """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, at some grid points of each type."""
         both = table[:, 0] + table[:, 1]
         sums = [ordered_sum(both[:, v] for v in some) for some in points if some]
         types = [i for i, some in enumerate(points) if some]

@@ -193,8 +193,8 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
     def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
         """Return NIS and log-density of the readings, their number, and the innovation of the output over its sigma.
 
-        NIS and log-density are NaN in a dropout of all sensors. The innovation is that of the first sensor if the output
-        is not measured.
+        NIS and log-density are NaN in a dropout of all sensors. The innovation is that of the first sensor if the
+        output is not measured.
         """
         task, xp = self.task, self.xp
         count = ordered_sum(measurement.available)
@@ -322,7 +322,7 @@ class GainBank(_KalmanBank):
         return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
 
     def covariance(self, state: KalmanState) -> Array:
-        """Return the covariance of the filter, ``(n, n, N)``, times the short average of the NIS where that is above one.
+        """Return the covariance of the filter, ``(n, n, N)``, times the short average of the NIS where above one.
 
         The factor applies only under nonzero actions, because only the innovations show whether the action fits the
         noise. Under the action zero it is the paper's filter with the paper's covariance.

@@ -73,7 +73,7 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of the bank, without the last valid reading in a dropout, which estimators do not receive."""
+        """Return the blocks of the bank without the last valid reading in a dropout, which estimators do not get."""
         reading = Block(
             "reading",
             lambda _, measurement: measurement.available * measurement.reading / self.sensor_sigmas,

@@ -171,7 +171,7 @@ class UavAutopilotParameters(TaskParameters):
     """Decades by which an action can scale the process noise under control ``noise``. Ours: slightly more than
     levels from 0.2 to 5 need."""
     sensor_decades: float = parameter(0.8, above=0.0, at_most=4.0)
-    """Decades by which an action can scale the standard deviation of a sensor. Ours: the largest factor of ``random``."""
+    """Decades by which an action can scale the sigma of a sensor. Ours: the largest factor of ``random``."""
     noise_reach: float = parameter(0.2, above=0.0, at_most=1.0)
     """Share of these two that an action of one has under control ``noise``. Ours: a new policy explores with a standard
     deviation of about one. With the whole range this costs several times as much as the paper's filter, so that the

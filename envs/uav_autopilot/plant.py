@@ -100,8 +100,8 @@ class Design(NamedTuple):
 
 
 MOST_RATIO = 1e15
-"""Largest ratio of the predicted variance of a reading to that of its sensor: an updated covariance contains both, and a
-number has sixteen digits. Of 183 draws of noises and scales, all indefinite ones were above 1e17."""
+"""Largest ratio of the predicted variance of a reading to that of its sensor: an updated covariance contains both, and
+a number has sixteen digits. Of 183 draws of noises and scales, all indefinite ones were above 1e17."""
 
 MOST_CONDITION = 1e14
 """Largest condition number of the correlations of a prediction: beyond it their determinant is rounding."""

@@ -40,7 +40,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "random",
             "Training distribution: steps and doublets of the command; gust level and sensor noise drawn for each "
-            "episode and changing inside it, coloured errors of the sensors in addition to the white ones; short dropouts of "
+            "episode and changing inside it, coloured errors of the sensors besides the white ones; short dropouts of "
             "single sensors; in one of six all noise is white and nominal.",
             _RANDOM,
             {"steady": (50, 600)},

@@ -62,8 +62,8 @@ class Measurement(NamedTuple):
     number: Array
     """Measurements since the start, ``(N,)``; one comes every ``sampling_interval`` seconds."""
     reading: Array
-    """Reading of each sensor, in the unit of its coordinate, ``(m, N)``; in a dropout the last valid one, zero before the
-    first. An estimator gets NaN in a dropout."""
+    """Reading of each sensor, in the unit of its coordinate, ``(m, N)``; in a dropout the last valid one, zero before
+    the first. An estimator gets NaN in a dropout."""
     available: Array
     """1 where a sensor gave a reading, 0 in a dropout, ``(m, N)``."""
     command: Array
