@@ -176,7 +176,7 @@ def test_a_column_is_ignored(make, tmp_path):
     plain = read_recording(written(tmp_path / "plain.csv", TEXT), ID)
     np.testing.assert_array_equal(found.measurements["values"], plain.measurements["values"])
     assert not any("gpss" in note for note in found.notes)
-    with pytest.raises(ValueError, match="it has no column sped, which was to become left out; it has time, gps"):
+    with pytest.raises(ValueError, match="it has no column sped, which was to be left out; it has time, gps"):
         read_recording(path, ID, rename={"sped": "-"})
     with pytest.raises(ValueError, match=r"gpss was to become height, .* or gpss=- to ignore the column"):
         read_recording(path, ID, rename={"gpss": "height"})

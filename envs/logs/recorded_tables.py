@@ -449,10 +449,8 @@ def _rename(
     """
     for old, new in renamed:
         if old not in names:
-            what = "left out" if new == LEFT_OUT else new
-            raise ValueError(
-                f"it has no column {old}, which was to become {what}; it has {list_names(names)}"
-            )
+            fate = "be left out" if new == LEFT_OUT else f"become {new}"
+            raise ValueError(f"it has no column {old}, which was to {fate}; it has {list_names(names)}")
         if new not in known and new != LEFT_OUT:
             raise ValueError(
                 f"{old} was to become {new}, which is not read: choose from {list_names(sorted(known))}, or "
@@ -482,7 +480,7 @@ def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str])
             wanted.remove(close[0])
     if not names:
         return ""
-    return f"; rename the columns, such as by --rename '{','.join(pairs or [f'NAME={wanted[0]}'])}'"
+    return f"; name the columns, such as --rename '{','.join(pairs or [f'NAME={wanted[0]}'])}'"
 
 
 def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:

@@ -77,7 +77,7 @@ class NoisySensors(_OfSensors):
         return SensorLevels(levels, levels.values[0])
 
     def quiet(self, state: SensorLevels, calm: Array) -> SensorLevels:
-        """Return factors of one, the nominal noise."""
+        """Return the levels, with one in undisturbed episodes."""
         values = self.xp.where(calm, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
 
@@ -153,7 +153,7 @@ class SensorBias(_OfSensors):
         return self.sigmas * self.chosen(self.parameters.biased_sensors) * side * size
 
     def quiet(self, state: Array, calm: Array) -> Array:
-        """Return errors of zero."""
+        """Return the errors, with zero in undisturbed episodes."""
         return self.xp.where(calm, 0.0, state)
 
     def change_reading(self, state: Array, reading: Array) -> tuple[Array, Array]:

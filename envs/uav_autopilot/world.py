@@ -28,15 +28,15 @@ class Truth(NamedTuple):
     state: Array
     """State in the units of the task's components, ``(n, N)``."""
     command: Array
-    """r at this measurement, ``(N,)``."""
+    """Command r at this measurement, ``(N,)``."""
     level: Array
     """Level of the disturbance in the interval before this measurement, ``(N,)``."""
     sensor_level: Array
     """Factor on the sensors' noise at this measurement, ``(m, N)``."""
     commands: StepSignal
-    """Values ``(J + 1, N)``."""
+    """Command in each part of the episode, values ``(J + 1, N)``."""
     levels: StepSignal
-    """Values ``(J + 1, N)``."""
+    """Level of the disturbance in each part of the episode, values ``(J + 1, N)``."""
     disturbances: dict[str, Any]
     """States of the sensors' disturbances by name, see :mod:`.disturbances`."""
 
