@@ -138,7 +138,7 @@ def test_broken_lines_of_a_solution_are_counted(tmp_path):
     [
         (lambda text: text.replace(GEODETIC, "%"), "lacks RTKLIB's line with the names of its columns"),
         (lambda text: text.replace("(deg)", "(d'\")"), "are degrees, minutes and seconds"),
-        (lambda text: text.replace("latitude", "x").replace("longitude", "y"), "what is read are latitude"),
+        (lambda text: text.replace("latitude", "x").replace("longitude", "y"), "needed are latitude"),
         (lambda text: text.replace("/08/", "-08-"), "40 lines of 40 are no solutions: is it whole"),
         (lambda text: "", "holds no solution of RTKLIB"),
     ],

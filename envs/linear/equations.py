@@ -62,7 +62,7 @@ class StateSpaceModel:
         """Return whether f and Q are functions of the interval between measurements."""
         return isinstance(self.Q, VectorFunction)
 
-    def stands_still(self, mean: numpy.ndarray, inputs: numpy.ndarray) -> bool:
+    def allows_zero_interval(self, mean: numpy.ndarray, inputs: numpy.ndarray) -> bool:
         """Return whether f is the identity and Q zero for an interval of zero.
 
         Measurements may then be simultaneous. The method checks this numerically at a few states.

@@ -44,7 +44,7 @@ class Input:
                 raise ValueError(f"{field.name} of an input must be finite, {least}, got {value!r}")
 
 
-class InputCourses:
+class InputProcesses:
     """Gauss-Markov processes of the inputs of a simulation.
 
     Args:

@@ -27,7 +27,9 @@ class StateSpaceInput(LiveInput):
         self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]
         super().__init__(task, initial, measurement, tracks)
         own = task.definition
-        self.fuses: bool = all(model.stands_still(own.mean, own.usual_inputs) for model in own.filters)
+        self.fuses: bool = all(
+            model.allows_zero_interval(own.mean, own.usual_inputs) for model in own.filters
+        )
         self._noise_varies = any(isinstance(model.R, VectorFunction) for model in own.filters)
         self._names = ["values", *(channel.name for channel in self.groups), *self.measured]
 

@@ -85,7 +85,7 @@ class Channel(NamedTuple):
         """Return the indices of its numbers."""
         return range(self.first, self.first + self.size)
 
-    def received(self, available: Array) -> Array:
+    def is_received(self, available: Array) -> Array:
         """Return whether any of its numbers was received, ``(N,)``, from ``available``, ``(m, N)``."""
         found = available[self.first] > 0.0
         for place in self.numbers[1:]:
@@ -93,12 +93,12 @@ class Channel(NamedTuple):
         return found
 
 
-def silence_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
+def missing_value_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
     """Return for each of several sensors the cause of costs that it gives no value."""
 
     def cause(channel: Channel) -> Cause:
         def holds(moment: Moment) -> Array:
-            return ~channel.received(moment.measurement.available)
+            return ~channel.is_received(moment.measurement.available)
 
         return Cause(f"no {channel.name}", f"where {channel.name} gives no value", holds)
 
@@ -141,15 +141,15 @@ class Receptions:
         self.channels = channels
         self.deviations = deviations
         self.due: list[Channel] = [channel for channel in self.channels if channel.interval is not None]
-        self.losing: list[Channel] = [channel for channel in self.channels if channel.availability < 1.0]
-        self.pauses: bool = self.parameters.gaps > 0.0
-        self.row_uniforms: int = len(self.losing) + len(self.channels) * self.pauses
+        self.lossy: list[Channel] = [channel for channel in self.channels if channel.availability < 1.0]
+        self.has_gaps: bool = self.parameters.gaps > 0.0
+        self.row_uniforms: int = len(self.lossy) + len(self.channels) * self.has_gaps
 
     def begin(self, draws: Draws, zero: Array) -> SensorStates | None:
         """Return the state at the start of the track from zeros ``(N,)``; None where the sensors have no state."""
         states = SensorStates(
             self.xp.stack([zero] * len(self.due)) if self.due else None,
-            self.xp.stack([zero] * len(self.channels)) if self.pauses else None,
+            self.xp.stack([zero] * len(self.channels)) if self.has_gaps else None,
             self._bias(draws, zero) if self.parameters.bias > 0.0 else None,
         )
         return None if all(part is None for part in states) else states
@@ -175,7 +175,7 @@ class Receptions:
             uniforms: uniform numbers, ``(row_uniforms, N)``.
         """
         xp, here = self.xp, {channel.name: 1.0 + 0.0 * interval for channel in self.channels}
-        if not (self.due or self.losing or self.pauses):
+        if not (self.due or self.lossy or self.has_gaps):
             return states, None
         states = states or SensorStates()
         waited = []
@@ -186,12 +186,12 @@ class Receptions:
             times = xp.floor(total / channel.interval + EARLY)
             here[channel.name] = xp.where(times > 0.0, here[channel.name], 0.0)
             waited.append(total - channel.interval * times)
-        for place, channel in enumerate(self.losing):
+        for place, channel in enumerate(self.lossy):
             here[channel.name] = xp.where(uniforms[place] < channel.availability, here[channel.name], 0.0)
         silent = []
-        for place, channel in enumerate(self.channels if self.pauses else ()):
+        for place, channel in enumerate(self.channels if self.has_gaps else ()):
             assert states.silent is not None
-            uniform = uniforms[len(self.losing) + place]
+            uniform = uniforms[len(self.lossy) + place]
             begins = xp.where(uniform < self.parameters.gaps, 1.0, 0.0)
             goes_on = xp.where(uniform * self.parameters.gap_length >= 1.0, 1.0, 0.0)
             silent.append(xp.where(states.silent[place] > 0.0, goes_on, begins))

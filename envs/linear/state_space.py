@@ -36,10 +36,10 @@ from .equations import (
     StateSpaceProblem,
     usual_sensor_noise,
 )
-from .inputs import InputCourses
+from .inputs import InputProcesses
 from .live import StateSpaceInput
 from .parameters import StateSpaceParameters
-from .sensors import Receptions, SensorStates, silence_causes
+from .sensors import Receptions, SensorStates, missing_value_causes
 from .state_space_banks import StateSpaceKalmanNetBank, bank_tables
 
 
@@ -76,10 +76,10 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.equations: list[Equations] = [Equations(task, model) for model in own.world]
         self.sensor_roots: list[Array] = [self._root(model.R) for model in own.world]
         self.process_roots: list[Array] = [self._root(model.Q) for model in own.world]
-        self.courses: InputCourses = InputCourses(tuple(own.inputs.values()), task.xp)
+        self.input_processes: InputProcesses = InputProcesses(tuple(own.inputs.values()), task.xp)
         self.timed: bool = own.world[0].timed
-        self.jitters: bool = self.parameters.jitter > 0.0
-        if self.jitters and not self.timed:
+        self.has_jitter: bool = self.parameters.jitter > 0.0
+        if self.has_jitter and not self.timed:
             raise ValueError(
                 f"the model of {task.id} is not timed, so jitter must be 0, got {self.parameters.jitter}: "
                 "write f(x, dt) and Q(dt)"
@@ -89,20 +89,20 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         n, m = len(own.mean), first.h.size
         self.states: int = n
         self.noises: int = n + m
-        self.initial_normals: int = n + self.courses.initial_normals
-        self.normals: int = self.noises + self.courses.normals
-        self.switches: bool = own.switching and len(own.world) > 1
-        self.loses: bool = self.parameters.availability < 1.0
-        self.drawn: int = int(self.switches) + int(self.jitters) + int(self.loses)
+        self.initial_normals: int = n + self.input_processes.initial_normals
+        self.normals: int = self.noises + self.input_processes.normals
+        self.is_switching: bool = own.switching and len(own.world) > 1
+        self.has_losses: bool = self.parameters.availability < 1.0
+        self.drawn: int = int(self.is_switching) + int(self.has_jitter) + int(self.has_losses)
         usual = usual_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
         deviations = numpy.sqrt(numpy.diag(usual))
         self.receptions: Receptions = Receptions(task.parameters, task.xp, own.channels, deviations)
         self.delayed: int = self.drawn + self.receptions.row_uniforms
-        self.delays: bool = self.parameters.late > 0.0
-        self.row_uniforms: int = self.delayed + len(own.channels) * self.delays
+        self.has_delays: bool = self.parameters.late > 0.0
+        self.row_uniforms: int = self.delayed + len(own.channels) * self.has_delays
         turning = {j for one in own.channels if one.period for j in one.numbers}
         # An angle is no reading of a component that turns on beyond it.
-        self.places: list[int | None] = [None if j in turning else j for j in components_measured(first.h)]
+        self.places: list[int | None] = [None if j in turning else j for j in measurement_indices(first.h)]
 
     def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
         """Return the root of a constant covariance; None for a function."""
@@ -121,13 +121,13 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
             )
         )
         count = len(own.world)
-        first = draws.integer("hypothesis", (0, count - 1)) if self.switches else zero
+        first = draws.integer("hypothesis", (0, count - 1)) if self.is_switching else zero
         mean = self.task.constant(own.mean)[:, None] + zero
         covariance = self.task.constant(own.covariance)[:, :, None] + zero
         state = mean + apply(self.initial_root[:, :, None], normals[: self.states])
-        inputs = self.courses.begin(normals[self.states :])
+        inputs = self.input_processes.begin(normals[self.states :])
         sensors, waiting = self.receptions.begin(draws, zero), None
-        if self.delays:
+        if self.has_delays:
             nothing = self.xp.stack([self.xp.stack([zero] * (self.noises - self.states))] * 2)
             waiting = self.xp.stack([nothing] * self.parameters.lateness)
         truth = StateSpaceTruth(state, first, process, measurement, inputs, sensors, waiting)
@@ -140,9 +140,9 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         xp, n = self.xp, self.states
         uniforms = noise[self.normals :]
         hypothesis = truth.hypothesis
-        if self.switches:
+        if self.is_switching:
             hypothesis = self._switch(hypothesis, uniforms[0])
-        interval = self._interval(truth, uniforms[int(self.switches)] if self.jitters else None)
+        interval = self._interval(truth, uniforms[int(self.is_switching)] if self.has_jitter else None)
         process = xp.sqrt(truth.process_noise) * noise[:n]
         sensors = xp.sqrt(truth.measurement_noise) * noise[n : self.noises]
         inputs, reported = self._inputs(truth, interval, noise[self.noises : self.normals])
@@ -155,16 +155,18 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
             moved.append(state)
             root = semidefinite_root(equations.sensor_noise(state, passed)) if r is None else r[:, :, None]
             measured.append(equations.measure(state, passed) + apply(root, sensors))
-        state, values = (self._chosen(parts, hypothesis) for parts in (moved, measured))
+        state, values = (self._select(parts, hypothesis) for parts in (moved, measured))
         here = None
-        if self.loses:
+        if self.has_losses:
             here = xp.where(uniforms[self.drawn - 1] < self.parameters.availability, 1.0, 0.0)
         sensors, due = self.receptions.advance(
             truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :]
         )
         truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs, sensors=sensors)
         received = StateSpaceMeasurement(*self._receive(truth, values, (here, due)), interval, reported)
-        return self._delay(truth, received, uniforms[self.delayed :]) if self.delays else (truth, received)
+        return (
+            self._delay(truth, received, uniforms[self.delayed :]) if self.has_delays else (truth, received)
+        )
 
     def _delay(
         self, truth: StateSpaceTruth, received: StateSpaceMeasurement, uniforms: Array
@@ -218,8 +220,8 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         """Return the inputs that act until the next measurement, and those that filters receive, ``(p, N)``."""
         if truth.inputs is None:
             return None, None
-        inputs = self.courses.advance(truth.inputs, self._seconds(truth, interval), normals)
-        return inputs, self.courses.report(inputs, normals)
+        inputs = self.input_processes.advance(truth.inputs, self._seconds(truth, interval), normals)
+        return inputs, self.input_processes.report(inputs, normals)
 
     def _interval(self, truth: StateSpaceTruth, uniform: Array | None) -> Array | None:
         """Return the time until the next measurement, s, ``(N,)``; None where the model is not timed."""
@@ -230,11 +232,11 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
             interval if uniform is None else interval * (1.0 + self.parameters.jitter * (2.0 * uniform - 1.0))
         )
 
-    def _chosen(self, parts: Sequence[Array], hypothesis: Array) -> Array:
+    def _select(self, parts: Sequence[Array], hypothesis: Array) -> Array:
         """Return the array of the model in force from those of all models."""
         chosen = parts[0]
         for number, part in enumerate(parts[1:], 1):
-            if self.switches:
+            if self.is_switching:
                 chosen = self.xp.where(hypothesis == float(number), part, chosen)
         return chosen
 
@@ -242,7 +244,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         """Return the index of the next model, ``(N,)``."""
         rows = numpy.cumsum(self.task.definition.transition, axis=1)[:, :-1]
         thresholds = [
-            self._chosen([0.0 * uniform + value for value in column], hypothesis)
+            self._select([0.0 * uniform + value for value in column], hypothesis)
             for column in rows.T.tolist()
         ]
         return self.xp.astype(category(uniform, thresholds, self.xp), self.xp.float64)
@@ -287,7 +289,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         }
 
 
-def components_measured(h: VectorFunction) -> list[int | None]:
+def measurement_indices(h: VectorFunction) -> list[int | None]:
     """Return the index of the measurement of each component that h measures directly, otherwise None."""
     if h.matrix is None or numpy.any(h.offset):
         return [None] * (0 if h.matrix is None else h.matrix.shape[1])
@@ -380,7 +382,7 @@ def state_space_attributes(
             TrainedBanks({"kalman-net": StateSpaceKalmanNetBank}),
             *(make(definition, defaults) for make in load_present(MODEL_COMPANIONS)),
             LiveReader(StateSpaceInput),
-            Causes((*(silence_causes(definition.channels) if several else (MISSED,)), OUTLIER)),
+            Causes((*(missing_value_causes(definition.channels) if several else (MISSED,)), OUTLIER)),
             LostTracks(explain=_explain_loss),
             ArrayMeanings(measurement=definition.measurement_words),
         ),

@@ -39,7 +39,7 @@ from ..contract.observation import (
 from .equations import Equations, StateSpaceMeasurement, StateSpaceProblem
 from .parameters import StateSpaceParameters
 
-AVERAGED = 0.1
+AVERAGE_WEIGHT = 0.1
 """Weight of the newest measurement in the observed averages."""
 NOISE_RANGE = 20.0
 """``kalman-net``: largest factor and divisor of each standard deviation of the process and measurement noise."""
@@ -139,14 +139,14 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
     def compare(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
         """Compute the innovation, NIS and log-likelihood of the measurement under its prediction."""
         xp = self.xp
-        received = self.received(state, measurement, state.action)
+        received = self.receive(state, measurement, state.action)
         P = state.covariance + self.process_noise(state.mean, measurement, state.action)
         S = product(product(received.H, P), transpose(received.H)) + received.R
         sigma = xp.sqrt(xp.stack([S[j, j] for j in range(self.sensors)]))
         result = update_with_gain(state.mean, P, received, 0.0 * transpose(received.H))
         degrees = ordered_sum(measurement.available)
         share = result.squared_distance / xp.maximum(degrees, 1.0 + 0.0 * degrees)
-        weight = AVERAGED * xp.minimum(degrees, 1.0 + 0.0 * degrees)
+        weight = AVERAGE_WEIGHT * xp.minimum(degrees, 1.0 + 0.0 * degrees)
         return state._replace(
             innovation=received.innovation / sigma,
             nis=result.squared_distance,
@@ -154,7 +154,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
             average=state.average + weight * (xp.log1p(share) - state.average),
         )
 
-    def received(
+    def receive(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> Received:
         """Return the innovation, H and R of the received numbers under the noises of an action."""
@@ -193,7 +193,7 @@ class StateSpaceNoiseBank(StateSpaceBank):
     ) -> ExtendedKalmanState:
         """Update with the noises of the action."""
         action = self.xp.clip(action, -1.0, 1.0)
-        received = self.received(state, measurement, action)
+        received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
         result = update_with_gain(state.mean, P, received, self.equations.gain(P, received))
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
@@ -212,7 +212,7 @@ class StateSpaceGainBank(StateSpaceBank):
     ) -> ExtendedKalmanState:
         """Update with the gain of the action."""
         action = self.xp.clip(action, -1.0, 1.0)
-        received = self.received(state, measurement, action)
+        received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
         factor = self.xp.exp(math.log(self.parameters.gain_factor) * action)
         result = update_with_gain(state.mean, P, received, factor[:, None] * self.equations.gain(P, received))
@@ -321,7 +321,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         """Update with the noises, gain factors and offset of the network."""
         action = self.xp.clip(action, -1.0, 1.0)
         Q = self.process_noise(state.mean, measurement, action)
-        received = self.received(state, measurement, action)
+        received = self.receive(state, measurement, action)
         agile = state.covariance + self._scaled(Q, AGILITY, self._part(action, 2))
         cautious = self._scaled(received.R, AGILITY, self._part(action, 3))
         K = self.equations.gain(agile, received._replace(R=cautious))

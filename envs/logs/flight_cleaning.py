@@ -44,7 +44,7 @@ CLEANING_COUNTS: dict[str, Any] = {
 """Kinds of removed rows and cuts that the cleaning of a flight counts, with their words in notes."""
 
 
-LANDED = 1800.0
+LONGEST_PAUSE = 1800.0
 """Longest gap within one flight, s; after a longer one an aircraft is on another flight."""
 
 
@@ -102,7 +102,7 @@ def clean_flight(
     ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
     parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
     long = [part for part in parts if part.stop - part.start > 1]
-    begins = [True, *(time[b.start] - time[a.stop - 1] > LANDED for a, b in itertools.pairwise(long))]
+    begins = [True, *(time[b.start] - time[a.stop - 1] > LONGEST_PAUSE for a, b in itertools.pairwise(long))]
     flights = numpy.cumsum(begins).tolist()
     pieces = []
     for number, (part, flight) in enumerate(zip(long, flights, strict=True), 1):

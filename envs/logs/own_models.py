@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """Measurements that may be missing between two rows."""
-OF_EPISODES = (
+SIMULATION_PARAMETERS = (
     "horizon",
     "decision_interval",
     "jitter",
@@ -76,7 +76,7 @@ def _read(
             f"it lacks the column {', '.join(lacking)}; it needs time, {', '.join((*names, *inputs))}, empty where "
             f"nothing was received; if it has another name, give --rename 'NAME={lacking[0]}'"
         )
-    known = {name: value for name, value in defaults.items() if name not in OF_EPISODES}
+    known = {name: value for name, value in defaults.items() if name not in SIMULATION_PARAMETERS}
     parameters = {name: value for name, value in known.items() if name not in columns.given}
     timed = definition.world[0].timed
     typical: dict[str, float] = {}

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from ..contract.task import Task
     from ..data.recording import Recording
 
-HARDEST = 100.0
+LARGEST_ACCELERATION = 100.0
 """Largest acceleration of a target, m/s^2: ten g."""
-SMALLEST_STATED = 1e6
+LARGEST_SCATTER_RATIO = 1e6
 """Largest ratio of the scatter of positions to the stated deviation; motion between fixes gives 1e4 at most."""
 FEWEST = 10
 """Smallest number of values from which noise is estimated."""
@@ -53,7 +53,7 @@ NOISE_WORDS = (
 """Words in the names of columns that state noise in any form."""
 NOISE_PARTS = ("sigma", "stddev", "deviation", "variance", "accuracy", "uncertainty", "hdop", "vdop", "pdop")
 """The longest of these words, which may also be parts of a word, as in ``horizontalAccuracy``."""
-LOUD = "WARNING: "
+WARNING_PREFIX = "WARNING: "
 """Prefix of the most important notes."""
 WIDE_BEARINGS = 0.5
 """Range of bearings above which bearings within 2 pi may be radians, rad."""
@@ -286,7 +286,7 @@ def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint:
     notes = []
     if noisy:
         notes.append(
-            f"{LOUD}column{'s' * (len(noisy) > 1)} {', '.join(noisy)} not read, and the name is one of noise: "
+            f"{WARNING_PREFIX}column{'s' * (len(noisy) > 1)} {', '.join(noisy)} not read, and the name is one of noise: "
             f"every filter takes the noise of its measurements from elsewhere{noise_hint and f'; {noise_hint}'}"
         )
     if others:
@@ -409,7 +409,7 @@ def _check_scale(
     speed = float(_length(position[-1] - position[0]) / (time[-1] - time[0]))
     noise = 1.4826 * float(numpy.median(numpy.abs(_deviations(time, position))))
     stated = float(numpy.median(sigma)) / math.sqrt(position.shape[1])
-    if noise > SMALLEST_STATED * stated:
+    if noise > LARGEST_SCATTER_RATIO * stated:
         raise ValueError(
             f"positions scatter by {noise:.3g} m where {stated:.2g} m are stated: are the deviations metres? else "
             "leave them out, and they are fitted"
@@ -463,7 +463,7 @@ def _notes(
     def reach(elapsed: numpy.ndarray) -> numpy.ndarray:
         usual = numpy.maximum(nearby[: len(elapsed)], nearby[-len(elapsed) :])
         return numpy.asarray(
-            5.0 * usual * (elapsed / step).clip(1.0) + 20.0 * error + 0.5 * HARDEST * elapsed**2
+            5.0 * usual * (elapsed / step).clip(1.0) + 20.0 * error + 0.5 * LARGEST_ACCELERATION * elapsed**2
         )
 
     alone = find_outliers(time, position, reach)

@@ -31,7 +31,7 @@ from .flight_tables import (
     seconds,
     sort_by_time,
 )
-from .plausibility import LOUD, check_degrees, check_interval, limit_notes, unknown_column_notes
+from .plausibility import WARNING_PREFIX, check_degrees, check_interval, limit_notes, unknown_column_notes
 from .truth_files import match_truth, offset_note, read_truth
 
 if TYPE_CHECKING:
@@ -545,7 +545,7 @@ def _side_by_side(
     components = [TRUTH + component.name.lower() for component in task.components]
     read = [*TIME, RECORDING, *log_format.columns, *components, *places]
     notes = [*reading_notes, *unknown_column_notes(names, read, log_format.noise_hint)]
-    notes.sort(key=lambda note: not note.startswith(LOUD))
+    notes.sort(key=lambda note: not note.startswith(WARNING_PREFIX))
     unknown = [component.name for component, name in zip(task.components, true, strict=True) if not name]
     if any(true) and unknown:
         notes.append(f"no truth of {', '.join(unknown)}: errors and NEES are of the other components")

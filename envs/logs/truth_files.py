@@ -32,9 +32,9 @@ SAME_TIME = 1e-3
 """Largest difference of equal times, s."""
 OFFSETS = numpy.arange(-30.0, 30.01, 0.1)
 """Clock offsets that are tried for a note, s."""
-BETTER = 0.7
+LARGEST_REMAINDER = 0.7
 """Largest share of the distance between positions and truth that an offset must leave to be noted."""
-AGREE = 0.3
+OFFSET_TOLERANCE = 0.3
 """Largest difference between the offsets of both halves of a log, s."""
 
 
@@ -188,7 +188,7 @@ def offset_note(time: numpy.ndarray, position: numpy.ndarray, truth: numpy.ndarr
     one, other = (OFFSETS[part.argmin()] for part in parts)
     whole = distances(slice(None))
     best, now = whole.argmin(), whole[len(OFFSETS) // 2]
-    if abs(one - other) > AGREE or whole[best] > BETTER * now:
+    if abs(one - other) > OFFSET_TOLERANCE or whole[best] > LARGEST_REMAINDER * now:
         return ""
     return (
         f"positions are {now:.3g} m from the truth in the median, and would be {whole[best]:.3g} m if "

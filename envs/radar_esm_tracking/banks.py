@@ -35,9 +35,9 @@ from .parameters import RadarEsmTrackingParameters
 from .problem import RadarEsmProblem
 from .world import Measurement, Start
 
-TIME_SHOWN = 60.0
+TIME_UNIT = 60.0
 """Unit of the clock in the observation, s."""
-COUNT_SHOWN = 10.0
+COUNT_UNIT = 10.0
 """Unit of the counts in the observation, decisions."""
 
 
@@ -113,10 +113,10 @@ def decision_blocks(task: RadarEsmProblem) -> tuple[Block, Block]:
 
 def clock_block(task: RadarEsmProblem) -> Block:
     """Return the block of the time since the start of the track."""
-    xp, factor = task.xp, task.parameters.sampling_interval / TIME_SHOWN
+    xp, factor = task.xp, task.parameters.sampling_interval / TIME_UNIT
     return Block(
         "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * factor,
-        f"time since the start of the track over {TIME_SHOWN:g} s",
+        f"time since the start of the track over {TIME_UNIT:g} s",
         shown=within(0.0, (task.parameters.horizon + 1) * factor),
     )  # fmt: skip
 
@@ -159,8 +159,8 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         types = tuple(str(j) for j in range(none))
         decision, bearing_difference = decision_blocks(self.task)
         average = f"exponential average over {p.averaging_measurements:g} scans"
-        count = f"decisions for this emitter type so far over {COUNT_SHOWN:g}"
-        counted = within(0.0, (self.last_scan + 1) / COUNT_SHOWN)
+        count = f"decisions for this emitter type so far over {COUNT_UNIT:g}"
+        counted = within(0.0, (self.last_scan + 1) / COUNT_UNIT)
 
         return (
             innovation_block(
@@ -193,9 +193,9 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
                 lambda f, measurement: xp.astype((measurement.decision < none) & ~f.used, xp.float64),
                 "1 where the bearing gate refuses the decision", shown=SHARE, over_interval="mean",
             ),
-            Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_SHOWN), f"used {count}", types, counted),
+            Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_UNIT), f"used {count}", types, counted),
             Block(
-                "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_SHOWN), f"refused {count}", types, counted
+                "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_UNIT), f"refused {count}", types, counted
             ),
             bearing_difference,
             last_weight_block(classes),

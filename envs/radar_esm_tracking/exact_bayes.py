@@ -47,7 +47,7 @@ from ..contract.observation import Array
 from .problem import RadarEsmProblem
 from .world import Measurement, Start
 
-LEAST_NUMBER = 1e-200
+LEAST_PROBABILITY = 1e-200
 """Smallest probability before the normalisation: otherwise an outlier of many sigma would set several hypotheses to
 zero, and their ratios would be lost."""
 
@@ -210,7 +210,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         covariance = self.start_covariance + xp.zeros((1, 1, 1, M, 1)) + none
         table = self.start_table + none
         nothing = xp.zeros((self.classes, p.onsets + 1, table.shape[0], 1)) + LEAST_PROBABILITY + none
-        return self.weigh(
+        return self.normalise(
             mean,
             packed_covariance.pack(covariance),
             self.prior_of_class + none,
@@ -224,7 +224,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         look = emitters.Look(measurement.looked, measurement.decision, measurement.bearing_difference)
         return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
 
-    def of_classes(self, table: Array, points: list[list[int]]) -> Array:
+    def class_likelihoods(self, table: Array, points: list[list[int]]) -> Array:
         """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, at some grid points of each type."""
         both = table[:, 0] + table[:, 1]
         sums = [ordered_sum(both[:, v] for v in some) for some in points if some]
@@ -240,7 +240,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             ]
         )  # fmt: skip
 
-    def weigh(
+    def normalise(
         self, mean: Array, covariance: Array, unchanged: Array, changed: Array, first: Array, later: Array
     ) -> ClassTracks:
         """Normalise T0, T1 and the probabilities of the hypotheses to sums of one."""
@@ -251,7 +251,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         later = xp.stack([part / total for part, total in zip(later, sums, strict=True)])
         weights = xp.concat(
             [
-                (unchanged * self.of_classes(first, self.by_type))[:, None],
+                (unchanged * self.class_likelihoods(first, self.by_type))[:, None],
                 ordered_sum(changed[:, :, j] for j in range(changed.shape[2])),
             ],
             axis=1,
@@ -328,8 +328,8 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             mean=radar.mean,
             covariance=packed_covariance.pack(radar.covariance),
             weights=weights / seen,
-            unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, LEAST_NUMBER, None),
-            changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], LEAST_NUMBER, None),
+            unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, LEAST_PROBABILITY, None),
+            changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], LEAST_PROBABILITY, None),
         )
         moved = self.change(moved, measurement.scan)
         looked = measurement.looked
@@ -339,7 +339,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         look = self.look(measurement)
         first, later = first * look, later * look
         likelihood = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
-        memory = self.weigh(
+        memory = self.normalise(
             moved.mean, moved.covariance, moved.unchanged, moved.changed * likelihood, first, later
         )
         n, size = self.states, self.classes * (prior.onsets + 2)
@@ -363,7 +363,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         again = hazard if prior.again else 0.0 * hazard
 
         # The share that leaves each class, and its filter.
-        leaving = hazard * m.unchanged * self.of_classes(m.first, self.disturbed_by_type)
+        leaving = hazard * m.unchanged * self.class_likelihoods(m.first, self.disturbed_by_type)
         states, P = m.mean[:, :, 0], packed_covariance.unpack(m.covariance, self.states)
         spreads = P[:, :, :, 0]
         if prior.again:

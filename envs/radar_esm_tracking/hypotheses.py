@@ -150,7 +150,7 @@ class HypothesesBank(SettingsBank):
         noise = xp.stack([xp.stack([R[0] + none, none]), xp.stack([none, R[1] + none])])
         after = found.tracks
         disturbed, every = (
-            ordered_sum(after.unchanged * bank.of_classes(after.first, points))
+            ordered_sum(after.unchanged * bank.class_likelihoods(after.first, points))
             for points in (bank.disturbed_by_type, bank.by_type)
         )
         p = xp.reshape(after.weights, (size, -1))

@@ -91,10 +91,10 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         return (
             *super().blocks,
             log_density_block(
-                lambda f, y: xp.where(self.answered(y), f.likelihood.log_likelihood, 0.0) + math.log(unit),
+                lambda f, y: xp.where(self.has_reading(y), f.likelihood.log_likelihood, 0.0) + math.log(unit),
                 "the log-density of the readings in units of their nominal sigmas, nats",
             ),
-            expected_nis_block(xp, self.answered),
+            expected_nis_block(xp, self.has_reading),
             predicted_block(self.names, "readings", of=" of the gusts' level"),
             probability_block(xp, self.names, "probability after them if the action is zero"),
             Block(
@@ -145,7 +145,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         of_each = [ordered_sum(q * level) for q, level in zip(h.sensors, self.log_levels, strict=True)]
         return self.xp.stack([ordered_sum(h.probability * levels) for levels in of_each])
 
-    def answered(self, measurement: Measurement) -> Array:
+    def has_reading(self, measurement: Measurement) -> Array:
         """Return whether any sensor has a reading, ``(N,)``."""
         return ordered_sum(measurement.available) > 0.0
 

@@ -37,14 +37,14 @@ class UavAutopilotPicture(Picture):
         """Return the signals of the loop, NIS, and the levels of the noise."""
         task, truth, estimator = self.task, state.truth, state.filter
         assert isinstance(estimator, KalmanState | HypothesesState)
-        answered = state.measurement.available[self.shown, 0] > 0.0
+        available = state.measurement.available[self.shown, 0] > 0.0
         values = {
             "command": truth.command[0],
             "output": truth.state[task.output, 0],
             "estimate": self.model.mean(state)[task.output, 0],
             "control": self.model.feedback(estimator, state.measurement)[0],
             # The line has a gap where there is no reading.
-            "innovation": estimator.innovation[self.shown, 0] if answered else math.nan,
+            "innovation": estimator.innovation[self.shown, 0] if available else math.nan,
             "mean_nis": estimator.mean_nis[0],
             "level": truth.level[0],
         }
