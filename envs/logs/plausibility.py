@@ -286,8 +286,8 @@ def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint:
     notes = []
     if noisy:
         notes.append(
-            f"{WARNING_PREFIX}column{'s' * (len(noisy) > 1)} {', '.join(noisy)} not read, and the name is one of noise: "
-            f"every filter takes the noise of its measurements from elsewhere{noise_hint and f'; {noise_hint}'}"
+            f"{WARNING_PREFIX}column{'s' * (len(noisy) > 1)} {', '.join(noisy)} not read, and the name is one of "
+            f"noise: every filter takes the noise of its measurements from elsewhere{noise_hint and f'; {noise_hint}'}"
         )
     if others:
         notes.append(f"not read: column{'s' * (len(others) > 1)} {', '.join(others)}")

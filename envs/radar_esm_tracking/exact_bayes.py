@@ -47,7 +47,7 @@ from ..contract.observation import Array
 from .problem import RadarEsmProblem
 from .world import Measurement, Start
 
-LEAST_PROBABILITY = 1e-200
+SMALLEST_PROBABILITY = 1e-200
 """Smallest probability before the normalisation: otherwise an outlier of many sigma would set several hypotheses to
 zero, and their ratios would be lost."""
 
@@ -328,8 +328,8 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             mean=radar.mean,
             covariance=packed_covariance.pack(radar.covariance),
             weights=weights / seen,
-            unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, LEAST_PROBABILITY, None),
-            changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], LEAST_PROBABILITY, None),
+            unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, SMALLEST_PROBABILITY, None),
+            changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], SMALLEST_PROBABILITY, None),
         )
         moved = self.change(moved, measurement.scan)
         looked = measurement.looked
