@@ -338,9 +338,9 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
         look = self.look(measurement)
         first, later = first * look, later * look
-        likelihood = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
+        marginal = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
         memory = self.normalise(
-            moved.mean, moved.covariance, moved.unchanged, moved.changed * likelihood, first, later
+            moved.mean, moved.covariance, moved.unchanged, moved.changed * marginal, first, later
         )
         n, size = self.states, self.classes * (prior.onsets + 2)
         P = packed_covariance.unpack(memory.covariance, n)
