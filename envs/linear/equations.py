@@ -142,7 +142,7 @@ def process_noise(
     if not isinstance(model.Q, VectorFunction):
         return model.Q
     given = numpy.concatenate([x, [interval], inputs])
-    with numpy.errstate(all="ignore"):  # the check of the covariance names what is not finite
+    with numpy.errstate(all="ignore"):  # the check of the covariance reports values that are not finite
         return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
 
 
@@ -344,7 +344,6 @@ class Equations:
     def _noise(
         self, noise: numpy.ndarray | VectorFunction, constant: Array | None, x: Array, passed: Passed
     ) -> Array:
-        """Return the covariance of a noise, a square matrix for each lane."""
         if constant is not None:
             return constant[:, :, None]
         assert isinstance(noise, VectorFunction)

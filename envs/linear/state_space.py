@@ -101,7 +101,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.has_delays: bool = self.parameters.late > 0.0
         self.row_uniforms: int = self.delayed + len(own.channels) * self.has_delays
         turning = {j for one in own.channels if one.period for j in one.numbers}
-        # An angle is no reading of a component that turns on beyond it.
+        # A wrapped angle is no reading of a component, which may exceed a turn.
         self.places: list[int | None] = [None if j in turning else j for j in measurement_indices(first.h)]
 
     def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
@@ -233,7 +233,6 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         )
 
     def _select(self, parts: Sequence[Array], hypothesis: Array) -> Array:
-        """Return the array of the model in force from those of all models."""
         chosen = parts[0]
         for number, part in enumerate(parts[1:], 1):
             if self.is_switching:

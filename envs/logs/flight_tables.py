@@ -225,7 +225,7 @@ def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xa
         if isinstance(values, dict):
             cells = numpy.array(values["words"], dtype=object)
             values = cells.reshape(values["shape"])
-        if values is None:  # its name is all that is wanted
+        if values is None:  # only the name is needed
             dimensions, values = [], numpy.nan
         variables[name] = (dimensions, values, _plain_attributes(attributes))
     return xarray.Dataset(variables, attrs=_plain_attributes(found["attrs"]))
@@ -273,7 +273,6 @@ def _parquet(file: Path, known: ColumnNames) -> FlightTable:
 
 
 def _parquet_column(column: Mapping[str, Any]) -> Any:
-    """Return the numbers, dates or text of a column."""
     import pandas
 
     if "codes" in column:
@@ -288,7 +287,7 @@ def _parquet_column(column: Mapping[str, Any]) -> Any:
 def _json(file: Path, known: ColumnNames) -> FlightTable:
     import pandas
 
-    most = limits().memory // 3  # a text, and what it is made of
+    most = limits().memory // 3  # the text and the objects made from it
     with open_foreign(file, limits().memory) as content:
         text = (gzip.GzipFile(fileobj=content) if file.suffix == ".gz" else content).read(most + 1)
     if len(text) > most:
@@ -345,12 +344,12 @@ def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTab
         wanted = known if isinstance(known, ColumnNames) else ColumnNames(known)
         table = _READERS[suffix_of(file)](file, wanted)
         for name, cells in table.columns.items():
-            if cells.dtype.kind == "O":  # words, whatever pandas keeps them in
+            if cells.dtype.kind == "O":  # text, in any dtype of pandas
                 check_cells(str(name), cells)
         return table
     except UnicodeDecodeError as error:
         raise ValueError("it is no text in UTF-8: save it as such (a spreadsheet: CSV UTF-8)") from error
-    except Exception as error:  # readers raise whatever a broken file makes them stumble over
+    except Exception as error:  # readers raise any error for a broken file
         raise ValueError(str(error) or type(error).__name__) from error
 
 

@@ -444,7 +444,6 @@ def _by_flight(rows: "pandas.DataFrame", flight: "pandas.Series | None") -> dict
 
 
 def _check_degrees(site: tuple[float, float] | None, rows: "pandas.DataFrame") -> None:
-    """Raise ValueError if the site is missing or values are out of the range of degrees."""
     for name, most in (("latitude", 90.0), ("longitude", 360.0)):
         check_degrees(name, rows[name].to_numpy(), most)
     if site is None:

@@ -339,7 +339,7 @@ def read_columns(
         known |= {true + alias for true in ("", TRUTH) for name in GEODETIC for alias in COLUMNS[name]}
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
-    # All that begin with truth_, because components follow from the parameters.
+    # All columns with the prefix truth_, because components depend on the parameters.
     renamed = [
         (old.lower(), each.lower())
         for old, new in (rename or {}).items()
@@ -433,19 +433,16 @@ def _add_truth(
 def _rename(
     read: "pandas.DataFrame", names: list[str], renamed: Sequence[tuple[str, str]], known: ColumnNames
 ) -> tuple["pandas.DataFrame", list[tuple[str, str]]]:
-    """Rename columns as the user requests.
+    """Return the renamed columns, and the old and new name of all columns of the file.
 
     Args:
         read: the columns.
         names: names of all columns of the file.
-        renamed: pairs of old and new name; one column may be in several pairs.
+        renamed: pairs of old and new name; one column may be in several.
         known: names that the environment reads.
 
-    Returns:
-        The renamed columns, and the old and new name of all columns of the file.
-
     Raises:
-        ValueError: for a column that the file lacks, a new name that is not read, or a name that occurs twice.
+        ValueError: for a missing column, a new name that is not read, or a name that occurs twice.
     """
     for old, new in renamed:
         if old not in names:

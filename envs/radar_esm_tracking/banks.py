@@ -270,7 +270,6 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         )
 
     def _average(self, old: Array, new: Array) -> Array:
-        """Return the exponential average updated with a new value."""
         return self.forgetting * old + (1.0 - self.forgetting) * new
 
     def _count_decisions(

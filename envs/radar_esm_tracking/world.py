@@ -196,7 +196,6 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return truth, Start(mean, self.start_covariance + zero, first)
 
     def _types_of(self, target_class: Array) -> Array:
-        """Return the thresholds of the emitter types of a class."""
         return self.xp.take(self.type_thresholds, target_class, axis=1)
 
     def _another_class(self, draws: Draws, name: str, target_class: Array) -> Array:

@@ -46,7 +46,7 @@ class HypothesesState(NamedTuple):
     mean_nis: Array
     """Short average of the NIS, ``(N,)``."""
     log_trace: Array
-    """Log of the predicted covariance's trace over that of the settled filter, ``(N,)``."""
+    """Log of the trace of the predicted covariance over that of the settled filter, ``(N,)``."""
     log_likelihood: Array
     """Log-density of the readings by the moments of all hypotheses together, ``(N,)``."""
     predicted: Array

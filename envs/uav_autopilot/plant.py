@@ -122,7 +122,7 @@ def _check_digits(parameters: UavAutopilotParameters, ratios: numpy.ndarray) -> 
         raise ValueError(
             f"sensor_sigmas must be larger: with the process noise at the largest scale that an action can give, "
             f"{scale:.3g}, the {p.value('sensors')[worst]} is predicted with {scale * ratios[worst]:.1e} times the "
-            f"variance of its sensor, more than the {MOST_RATIO:g} of which a number keeps digits"
+            f"variance of its sensor, more than the {MOST_RATIO:g} that the digits of a number allow"
         )
 
 
