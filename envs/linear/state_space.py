@@ -105,7 +105,6 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.places: list[int | None] = [None if j in turning else j for j in measurement_indices(first.h)]
 
     def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
-        """Return the root of a constant covariance; None for a function."""
         if isinstance(covariance, VectorFunction):
             return None
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
@@ -240,7 +239,6 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return chosen
 
     def _switch(self, hypothesis: Array, uniform: Array) -> Array:
-        """Return the index of the next model, ``(N,)``."""
         rows = numpy.cumsum(self.task.definition.transition, axis=1)[:, :-1]
         thresholds = [
             self._select([0.0 * uniform + value for value in column], hypothesis)

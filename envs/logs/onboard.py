@@ -108,7 +108,6 @@ def _ardupilot_track(topic: str, estimates: numpy.ndarray, origins: numpy.ndarra
 def _in_order(
     source: str, time: numpy.ndarray, latitude: numpy.ndarray, longitude: numpy.ndarray
 ) -> OnboardTrack:
-    """Return the finite rows whose times increase."""
     whole = numpy.isfinite([time, latitude, longitude]).all(axis=0)
     latest = numpy.maximum.accumulate(numpy.append(-numpy.inf, numpy.where(whole, time, -numpy.inf)))[:-1]
     whole &= time > latest

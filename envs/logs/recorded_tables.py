@@ -511,7 +511,6 @@ def _by_recording(table: "pandas.DataFrame", names: "pandas.Series | None") -> d
 
 
 def _names_of_rows(names: "pandas.Series") -> "pandas.Series":
-    """Return the name of the recording of each row; empty where none is given."""
     return names.astype(object).where(names.notna(), "").astype(str)
 
 

@@ -15,8 +15,8 @@ of the change is independent of the second emitter and the silences. Further app
 * Classes change at one scan of every ``spacing`` (the scans at which the ESM looks). An onset older than B of these is
   merged, by its moments, with all older ones of its class.
 * At a change the filters of the previous classes are merged to one Gaussian with their mean and covariance.
-* Rates of silence, and the share of looks at which the ESM receives the second emitter, lie on a few points each; its bearing
-  on a few points on either side.
+* Rates of silence, and the share of looks at which the ESM receives the second emitter, lie on a few points each; its
+  bearing on a few points on either side.
 * The radar's coloured errors have one strength and one correlation time for all targets.
 * Each filter weights outliers separately, if the prior has any.
 
