@@ -51,7 +51,7 @@ class FlightSource(NamedTuple):
     trajectories: tuple[Trajectory, ...]
     notes: tuple[str, ...] = ()
     """Cuts and removed rows, such as "2 gaps over 60 s"."""
-    wrong: str = ""
+    reason: str = ""
     """Reason why nothing of it is used; empty if something is."""
 
 
@@ -121,8 +121,8 @@ class Flights(FlightData):
                 notes.append(f"{dropped} dropped (shorter than {self.fewest_scans} scans of {interval:g} s)")
             if far:
                 notes.append(f"{far}: left out (positions are metres)")
-            if source.wrong:
-                notes = [f"left out: {source.wrong}"]
+            if source.reason:
+                notes = [f"left out: {source.reason}"]
             elif not kept:
                 notes = [f"left out: {', '.join(notes)}"]
             if notes:
@@ -329,10 +329,10 @@ def read_flights(
             if len(files) + len(sources) == 1:
                 raise
             reason = str(error).partition(f"trajectory {file}: ")[2]
-            sources.append(FlightSource(_short(file, files), (), wrong=reason))
+            sources.append(FlightSource(_short(file, files), (), reason=reason))
     trajectories = tuple(t for s in sources for t in s.trajectories)
     if not trajectories:
-        raise ValueError(_nothing(name, [f"{s.name}: {s.wrong}" for s in sources]))
+        raise ValueError(_nothing(name, [f"{s.name}: {s.reason}" for s in sources]))
     return Flights(trajectories, name, fewest_scans, tuple(sources))
 
 
@@ -409,13 +409,13 @@ def _flights_of(
         except ValueError as error:
             if len(groups) == 1:
                 raise
-            bad.append(FlightSource(f"{file.name}:{flight}", (), wrong=str(error)))
+            bad.append(FlightSource(f"{file.name}:{flight}", (), reason=str(error)))
             continue
         good += pieces
         for what, count in found.items():
             counts[what] += count
     if not good:
-        raise ValueError(_nothing(label, [f"{s.name}: {s.wrong}" for s in bad]))
+        raise ValueError(_nothing(label, [f"{s.name}: {s.reason}" for s in bad]))
     notes = [
         f"{count_of(count, *words)}{tail(limits)}"
         for (words, tail), count in zip(CLEANING_COUNTS.values(), counts.values(), strict=True)
