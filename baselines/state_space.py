@@ -410,7 +410,7 @@ class KnownModel:
         """Predict to a measurement and take it in."""
         (measurement, truth, _), xp, chosen = one, self.xp, None
         world: Any = self.task.world
-        for j, equations in enumerate(world.equations if world.switches else world.equations[:1]):
+        for j, equations in enumerate(world.equations if world.is_switching else world.equations[:1]):
             mean, carried = equations.carry(state.mean, state.covariance, measurement)
             P = carried + truth.process_noise * equations.process_noise(mean, measurement)
             R = equations.sensor_noise(mean, measurement, truth.measurement_noise)

@@ -20,7 +20,7 @@ from .envs.linear.equations import StateSpaceDefinition, StateSpaceModel
 from .envs.linear.inputs import Input
 from .envs.linear.parameters import StateSpaceParameters
 from .envs.linear.sensors import Sensor
-from .envs.linear.state_space import StateSpace, components_measured, state_space_attributes
+from .envs.linear.state_space import StateSpace, measurement_indices, state_space_attributes
 from .evaluation.running.seeds import episode_seeds
 from .own_angles import find_periods, warn_of_turns
 from .own_equations import (
@@ -178,7 +178,7 @@ def state_space(
     m = world[0].h.size
     counts = [trace_measurement("h", one.h, n, len(inputs)).size for one in sensors.values()] or [m]
     channels = find_channels(sensors, counts, interval)
-    places = components_measured(world[0].h)
+    places = measurement_indices(world[0].h)
     periods = find_periods(angles, names, places, channels)
     units = units or tuple(angles.get(name, "1") for name in names)
     if len(names) != n or len(units) != n:

@@ -151,7 +151,7 @@ def changed(table, columns, change):
         (lambda t: changed(t, ["time"], lambda a: a[::-1].to_numpy()), "times of the .* IMU must increase"),
         (lambda t: t[(t["time"] < 20.0) | (t["time"] > 21.0)], "gap of 1.05 s after row 799"),
         (lambda t: t[t["time"] > 7.0], "standstill of 5 s at the beginning"),
-        (lambda t: t[t["time"] < 8.0], "nothing between the standstill and the last fix"),
+        (lambda t: t[t["time"] < 8.0], "no samples between the standstill and the last fix"),
         (lambda t: t.drop(columns="rate_x"), "lack the column rate_x"),
         (lambda t: changed(t, ["rate_x"], lambda a: a.where(a.index != 7)), "row 7 of the IMU has a cell without"),
     ],

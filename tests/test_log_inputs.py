@@ -214,7 +214,7 @@ def test_truth_that_one_file_lacks_judges_nobody(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"lon": None}, "lacks the column longitude, which belongs to latitude and longitude"),
+        ({"lon": None}, "lacks the column longitude: latitude and longitude are needed together"),
         ({"lat": np.full(COUNT, 4870.0)}, "latitude reaches 4870, and degrees from -90 to 90"),
         ({"lat": None, "lon": np.full(COUNT, np.nan), "latitude": np.full(COUNT, np.nan)}, "no row has latitude"),
         ({"truth_lat": np.full(COUNT, 48.0)}, "lacks the column truth_longitude"),

@@ -138,7 +138,7 @@ def test_broken_lines_of_a_solution_are_counted(tmp_path):
     [
         (lambda text: text.replace(GEODETIC, "%"), "lacks RTKLIB's line with the names of its columns"),
         (lambda text: text.replace("(deg)", "(d'\")"), "are degrees, minutes and seconds"),
-        (lambda text: text.replace("latitude", "x").replace("longitude", "y"), "what is read are latitude"),
+        (lambda text: text.replace("latitude", "x").replace("longitude", "y"), "needed are latitude"),
         (lambda text: text.replace("/08/", "-08-"), "40 lines of 40 are no solutions: is it whole"),
         (lambda text: "", "holds no solution of RTKLIB"),
     ],
@@ -218,7 +218,7 @@ def test_no_deviation_is_made_of_hdop(pynmea2, tmp_path):
     assert deviation < 0.1  # the sentences are written without noise: they scatter by their turn alone
     recording = read_recording(path, TARGET, range_sigma=2.5)
     assert (recording.measurements["variance"] == 6.25).all()
-    assert recording.notes[0].startswith("no GST sentence says how large errors are: HDOP tells how")
+    assert recording.notes[0].startswith("no GST sentence gives the size of errors: HDOP describes")
 
 
 def test_times_without_a_fix_are_missing_measurements(pynmea2, tmp_path):
@@ -449,7 +449,7 @@ def test_poses_of_a_bag_are_positions(tmp_path):
     path = bag2(tmp_path / "poses", "MCAP", kinds=("geometry_msgs/msg/PoseStamped",))
     recording = read_recording(path, TARGET, range_sigma=2.0)
     np.testing.assert_allclose(recording.measurements["position"][0], expected, atol=1e-9)
-    assert "messages do not say how large errors are" in recording.notes
+    assert "messages do not contain the size of errors" in recording.notes
     talk = bag2(tmp_path / "talk", kinds=("std_msgs/msg/String",))
     with pytest.raises(ValueError, match=r"no .*NavSatFix and no positions; it holds std_msgs/msg/String"):
         read_recording(talk, TARGET)

@@ -517,7 +517,7 @@ def test_files_that_are_no_recordings(name, content, sentence, tmp_path):
 
 
 def test_a_table_does_not_say_of_which_environment_it_is(tmp_path):
-    with pytest.raises(ValueError, match="does not say of which environment"):
+    with pytest.raises(ValueError, match="does not name its environment"):
         read_recording(table(tmp_path / "plots.csv", **PLOTS))
     with pytest.raises(ValueError, match="there is no such file"):
         read_recording(tmp_path / "nothing.nc")

@@ -394,7 +394,7 @@ def test_a_timed_model_that_moves_in_no_time_takes_one_measurement_at_a_time(mak
         ({"f": MOVES["linear"][0], "Q": lambda dt: [[dt]]}, "Q must return 4 numbers, got 1"),
         ({"f": MOVES["linear"][0], "Q": lambda dt: [[-dt, 0.0], [0.0, dt]]}, "Q must be symmetric and without"),
         ({"f": MOVES["linear"][0], "Q": noise_of, "hypotheses": [{"f": F, "Q": Q}]}, "all models must take"),
-        ({"jitter": 0.5}, "knows no time, so jitter must be 0"),
+        ({"jitter": 0.5}, "is not timed, so jitter must be 0"),
     ],
 )  # fmt: skip
 def test_what_is_no_timed_model_is_refused(make, wrong, sentence):

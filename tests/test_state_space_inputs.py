@@ -188,7 +188,7 @@ def test_a_loop_of_ones_own_gives_inputs_by_name_and_the_last_holds_on(make):
     np.testing.assert_allclose(found.mean, mean, rtol=1e-12)
     np.testing.assert_allclose(found.covariance, P, rtol=1e-12)
     np.testing.assert_array_equal(again.mean, found.mean)
-    with pytest.raises(ValueError, match="values has voltage already"):
+    with pytest.raises(ValueError, match="values contains voltage already"):
         filter.update(3.0, voltage=1.0, values=[1.0])
 
 

@@ -223,7 +223,7 @@ def test_one_column_is_two_deviations(tmp_path):
     for name, values in two.measurements.items():
         np.testing.assert_array_equal(one.measurements[name], values, err_msg=name)
     assert {one.columns["sigma_x"], one.columns["sigma_y"]} == {"accuracy"}
-    with pytest.raises(ValueError, match="two columns would be sigma_x"):
+    with pytest.raises(ValueError, match="two columns would become sigma_x"):
         read_recording(tmp_path / "one.csv", target, rename={"accuracy": ["sigma_x", "sigma_x"]})
 
 

@@ -191,7 +191,7 @@ def test_a_loop_of_ones_own_names_the_sensors(make):
     np.testing.assert_allclose(found.mean, mean, rtol=1e-12)
     np.testing.assert_allclose(found.covariance, P, rtol=1e-12, atol=1e-15)
     np.testing.assert_array_equal(again.mean, found.mean)
-    with pytest.raises(ValueError, match="gps has gps_x already"):
+    with pytest.raises(ValueError, match="gps contains gps_x already"):
         filter.update(3.0, gps=[1.0, 2.0], gps_x=1.0)
     with pytest.raises(ValueError, match=r"gps must have shape \(2,\)"):
         filter.update(3.0, gps=[1.0, 2.0, 3.0])

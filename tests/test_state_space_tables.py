@@ -133,13 +133,13 @@ def test_the_innovation_of_a_table_is_the_measurement_less_its_prediction(make, 
 @pytest.mark.parametrize(
     ("kind", "text", "sentence"),
     [
-        (TIMED, "time,gps\n0,1\n1,2\n", r"lacks the column odometry; .* say --rename 'NAME=odometry'"),
+        (TIMED, "time,gps\n0,1\n1,2\n", r"lacks the column odometry; .* give --rename 'NAME=odometry'"),
         (TIMED, "t,pos,odom\n0,1,2\n1,2,3\n", "such as --rename 't=time,pos=gps,odom=odometry'"),
         (TIMED, "time,gps,odometry\n0,,\n1,,\n", "no row has a value of gps, odometry"),
         (TIMED, "time,gps,odometry\n0,1,2\n-1,2,3\n", "time decreases from .* in row 0 to .* in row 1: --sort "),
         (TIMED, "time,gps,odometry\n0,1,2\n1,2,-1e308\n", r"odometry is -1e\+308 in row 1, and 1e\+15 at most"),
         (TIMED, "time,gps,odometry,truth_height\n0,1,2,3\n1,2,3,4\n", "truth_height is no truth of"),
-        (FIXED, "time,gps,odometry\n0,1,2\n0.7,2,3\n", r"moves by 0.5 s .* row 1 is 0.7 s after row 0: say --set"),
+        (FIXED, "time,gps,odometry\n0,1,2\n0.7,2,3\n", r"moves by 0.5 s .* row 1 is 0.7 s after row 0: give --set"),
         (FIXED, "time,gps,odometry\n0,1,2\n0.001,2,3\n", "row 1 is 0.001 s after row 0"),
 
     ],
@@ -158,9 +158,9 @@ def test_columns_are_called_as_the_user_says(make, tmp_path):
     np.testing.assert_array_equal(found.measurements["values"], plain.measurements["values"])
     assert found.columns == {"time": "t", "gps": "pos", "odometry": "odom"}
     for rename, sentence in (
-        ({"position": "gps"}, "it has no column position, which was to be gps; it has t, pos, odom"),
-        ({"pos": "height"}, "pos was to be height, which is not read: choose from gps, odometry"),
-        ({"pos": "gps", "odom": "gps"}, "two columns would be gps"),
+        ({"position": "gps"}, "it has no column position, which was to become gps; it has t, pos, odom"),
+        ({"pos": "height"}, "pos was to become height, which is not read: choose from gps, odometry"),
+        ({"pos": "gps", "odom": "gps"}, "two columns would become gps"),
     ):
         with pytest.raises(ValueError, match=sentence):
             read_recording(path, ID, rename={"t": "time", **rename})
@@ -178,7 +178,7 @@ def test_a_column_is_ignored(make, tmp_path):
     assert not any("gpss" in note for note in found.notes)
     with pytest.raises(ValueError, match="it has no column sped, which was to be left out; it has time, gps"):
         read_recording(path, ID, rename={"sped": "-"})
-    with pytest.raises(ValueError, match=r"gpss was to be height, .* or gpss=- to ignore the column"):
+    with pytest.raises(ValueError, match=r"gpss was to become height, .* or gpss=- to ignore the column"):
         read_recording(path, ID, rename={"gpss": "height"})
 
 

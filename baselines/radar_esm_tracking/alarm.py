@@ -7,7 +7,7 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Reader
-from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
+from ...envs.radar_esm_tracking.banks import COUNT_UNIT
 from ...filters import class_fusion, imm
 from ..alarm import Alarm, innovation_evidence
 
@@ -58,7 +58,7 @@ class ClassAlarm(Alarm):
         used, refused = (numpy.nan_to_num(read(before)) for read in (self.used_count, self.refused_count))
         new_used, new_refused = self.used_count(observation), self.refused_count(observation)
         one_type = self._one_type(new_used) - self._one_type(used)
-        refusals = COUNT_SHOWN * (
+        refusals = COUNT_UNIT * (
             (new_refused - refused).sum(axis=1) * math.log(REFUSAL_SHARE / self.refusal)
             + (new_used - used).sum(axis=1) * math.log((1.0 - REFUSAL_SHARE) / (1.0 - self.refusal))
         )
@@ -66,7 +66,7 @@ class ClassAlarm(Alarm):
 
     def _one_type(self, used_count: numpy.ndarray) -> numpy.ndarray:
         """Log-likelihood ratio of one type to types drawn anew, of all decisions so far."""
-        counts = COUNT_SHOWN * used_count.T
+        counts = COUNT_UNIT * used_count.T
         fixed = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         redrawn = self.log_esm @ counts
         return numpy.logaddexp.reduce(self.log_prior + fixed) - numpy.logaddexp.reduce(

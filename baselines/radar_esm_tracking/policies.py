@@ -11,7 +11,7 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Reader
-from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
+from ...envs.radar_esm_tracking.banks import COUNT_UNIT
 from ...envs.radar_esm_tracking.exact_bayes import FEW, TRAINING, VAGUE, ClassPrior, ExactBayes
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
@@ -66,7 +66,7 @@ class _Posterior(Policy):
     def counts(self, observation: numpy.ndarray, refused: float = 0.0) -> numpy.ndarray:
         """How often the ESM decided for each type, refused decisions counting ``refused``, ``(J, N)``."""
         shown = self.used_count(observation) + refused * self.refused_count(observation)
-        return COUNT_SHOWN * shown.T
+        return COUNT_UNIT * shown.T
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Log-probability of the classes, up to a constant."""

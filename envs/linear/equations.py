@@ -1,16 +1,16 @@
-r"""Equations of a state-space model, and what they give on the arrays of a task.
+r"""Equations of a state-space model, and their values on the arrays of a task.
 
     x(k) = f(x(k-1), dt, u) + w,  w ~ N(0, Q(dt))          z(k) = h(x(k), u) + v,  v ~ N(0, R(x(k), dt, u))
 
-dt is the interval between the measurements k - 1 and k, and u the input that acted in it, constant. A model may do
-without either, and R may be a matrix. A filter evaluates R at the predicted state. Where u is known with white noise of
-covariance N only, what is known of the state after it is
+dt is the interval between the measurements k - 1 and k, and u the constant input that acted in it. A model may have
+neither, and R may be a matrix. A filter evaluates R at the predicted state. Where u is known only with white noise of
+covariance N, the predicted covariance is
 
     P' = F P F^T + G N G^T + Q,  F = df/dx,  G = df/du          at the estimate before
 
-(Simon, Optimal State Estimation (2006), section 13.2, with the input among the noises). Where the sensors measure the
-input, too, R becomes ``R + D N D^T`` with ``D = dh/du``. Reading: that this error and the one of the motion are the
-same one, G N D^T, is left out.
+(Simon, Optimal State Estimation (2006), section 13.2, with the input among the noises). Where h depends on
+the input, R becomes ``R + D N D^T`` with ``D = dh/du``. Reading: the correlation of this error with that of the motion,
+G N D^T, is left out.
 """
 
 import math
@@ -45,29 +45,31 @@ class StateSpaceModel:
     f: VectorFunction
     h: VectorFunction
     Q: numpy.ndarray | VectorFunction
-    """``(n, n)``; or a function to the n^2 numbers of it, row by row: then the model is timed."""
+    """``(n, n)``; or a function that returns its n^2 numbers row by row: then the model is timed."""
     R: numpy.ndarray | VectorFunction
-    """``(m, m)``; or a function to the m^2 numbers of it, row by row."""
+    """``(m, m)``; or a function that returns its m^2 numbers row by row."""
     G: VectorFunction | None = None
-    """f as a function of the inputs, and then of all else; None where no input has noise."""
+    """f as a function of the inputs first, then of its other arguments; None where no input has noise."""
     D: VectorFunction | None = None
-    """h likewise; None also where it knows no inputs."""
+    """h as a function of the inputs first; None where no input has noise or h does not depend on the inputs."""
     sources: Mapping[str, numpy.ndarray | VectorFunction] = field(default_factory=dict)
-    """What Q is the sum of, by the names of the noises; empty where they have none."""
+    """Terms of which Q is the sum, by the names of the noises; empty where the noises have no names."""
     warned: dict[str, str] = field(default_factory=dict)
-    """Warnings of values that are not finite, by the functions that they name."""
+    """Warnings about values that are not finite, by the functions that gave them."""
 
     @property
     def timed(self) -> bool:
-        """Whether f and Q are functions of the interval between measurements."""
+        """Return whether f and Q are functions of the interval between measurements."""
         return isinstance(self.Q, VectorFunction)
 
-    def stands_still(self, mean: numpy.ndarray, inputs: numpy.ndarray) -> bool:
-        """Whether nothing happens in no time, as far as some states show: measurements may then come at one time.
+    def allows_zero_interval(self, mean: numpy.ndarray, inputs: numpy.ndarray) -> bool:
+        """Return whether f is the identity and Q zero for an interval of zero.
+
+        Measurements may then be simultaneous. The method checks this numerically at a few states.
 
         Args:
-            mean: a state near which they are, ``(n,)``.
-            inputs: usual ones, ``(p,)``.
+            mean: centre of the states that are checked, ``(n,)``.
+            inputs: usual inputs, ``(p,)``.
         """
         if not isinstance(self.Q, VectorFunction):
             return False
@@ -79,57 +81,57 @@ class StateSpaceModel:
 
     @property
     def is_linear(self) -> bool:
-        """Whether both functions are matrices."""
+        """Return whether f and h are matrices."""
         maps = (self.f, self.h)
         return all(one.matrix is not None and not numpy.any(one.offset) for one in maps)
 
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceDefinition:
-    """All that makes a task of state-space models."""
+    """Models, initial estimate, cost weights, inputs and sensors of a task of state-space models."""
 
     world: tuple[StateSpaceModel, ...]
-    """Models that the world obeys, M of them."""
+    """The M models of the world."""
     filters: tuple[StateSpaceModel, ...]
-    """What the filters believe of each."""
+    """The model that the filters use for each model of the world."""
     transition: tuple[tuple[float, ...], ...]
     """Probabilities that one model follows another from a measurement to the next (row = from), ``(M, M)``."""
     switching: bool
-    """Whether the world does so; else it obeys the first model."""
+    """Whether the world switches between its models; otherwise it uses the first."""
     mean: numpy.ndarray
-    """``(n,)``."""
+    """Initial mean, ``(n,)``."""
     covariance: numpy.ndarray
-    """``(n, n)``."""
+    """Initial covariance, ``(n, n)``."""
     weights: numpy.ndarray
-    """Of the squared error of each component in the cost, ``(n,)``."""
+    """Weight of the squared error of each component in the cost, ``(n,)``."""
     measured: Mapping[str, str]
-    """Units of the m numbers that are measured, by their names."""
+    """Units of the m measured numbers, by their names."""
     inputs: Mapping[str, Input]
-    """Known inputs by their names, p of them."""
+    """The p known inputs, by their names."""
     channels: tuple[Channel, ...]
-    """Sensors, of which each measures some of the m numbers; without names one for all of them."""
+    """Sensors, each of which measures some of the m numbers; one for all of them where they have no names."""
 
     @property
     def usual_inputs(self) -> numpy.ndarray:
-        """Means of the inputs, ``(p,)``."""
+        """Return the means of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
     @property
     def measurement_words(self) -> str:
-        """What the numbers of a measurement are."""
+        """Return a sentence that names the numbers of a measurement and the inputs."""
         words = f"Of a measurement, values and available are of {', '.join(self.measured)}, in this order"
         inputs = ", ".join(self.inputs)
         return f"{words}; inputs, which acted since the one before, are {inputs}." if inputs else f"{words}."
 
     def usual_noise(self, interval: float) -> numpy.ndarray:
-        """Q of the filters' first model in an interval, s, at the initial mean, ``(n, n)``."""
+        """Return the Q of the filters' first model for an interval, s, at the initial mean, ``(n, n)``."""
         return process_noise(self.filters[0], self.mean, interval, self.usual_inputs)
 
 
 def process_noise(
     model: StateSpaceModel, x: numpy.ndarray, interval: float, inputs: numpy.ndarray
 ) -> numpy.ndarray:
-    """Q of a model, ``(n, n)``; without time the same for all.
+    """Return the Q of a model, ``(n, n)``; constant where the model is not timed.
 
     Args:
         model: the equations.
@@ -140,14 +142,14 @@ def process_noise(
     if not isinstance(model.Q, VectorFunction):
         return model.Q
     given = numpy.concatenate([x, [interval], inputs])
-    with numpy.errstate(all="ignore"):  # the check of the covariance names what is not finite
+    with numpy.errstate(all="ignore"):  # the check of the covariance reports values that are not finite
         return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
 
 
 def sensor_noise(
     model: StateSpaceModel, x: numpy.ndarray, interval: numpy.ndarray, inputs: numpy.ndarray
 ) -> numpy.ndarray:
-    """R of a model at K measurements, ``(m, m, K)``.
+    """Return the R of a model at K measurements, ``(m, m, K)``.
 
     Args:
         model: the equations.
@@ -165,16 +167,16 @@ def sensor_noise(
 def usual_sensor_noise(
     model: StateSpaceModel, mean: numpy.ndarray, interval: float, inputs: Mapping[str, Input]
 ) -> numpy.ndarray:
-    """R of a model at the initial mean, averaged over the inputs of a simulation, ``(m, m)``.
+    """Return the R of a model at the initial mean, averaged over the inputs of a simulation, ``(m, m)``.
 
-    The average is that of 2 p sigma points, which is exact where R is quadratic in the inputs: the R of a deviation
-    that is an input is the sum of its squared mean and its variance.
+    The average is that of 2 p sigma points, which is exact where R is quadratic in the inputs: where the standard
+    deviation is an input, R is the sum of its squared mean and its variance.
 
     Args:
         model: the equations.
-        mean: of the initial state, ``(n,)``.
+        mean: initial mean, ``(n,)``.
         interval: s.
-        inputs: p of them.
+        inputs: the p inputs.
     """
     p = max(len(inputs), 1)
     centre = numpy.array([one.mean for one in inputs.values()])[:, None]
@@ -186,20 +188,21 @@ def usual_sensor_noise(
 
 
 class InvalidNoise(NamedTuple):
-    """A measurement whose R is no covariance."""
+    """A measurement with an R that is not positive definite."""
 
     place: int
-    """Number of the measurement."""
+    """Index of the measurement."""
     sensor: str
     R: list[list[float]]
-    """Of this sensor."""
+    """R of this sensor."""
 
 
 def find_invalid_noise(
     definition: StateSpaceDefinition, available: numpy.ndarray, interval: numpy.ndarray, inputs: numpy.ndarray
 ) -> InvalidNoise | None:
-    """Find a measurement, of K, with a sensor whose R is not positive definite under a model of the filters; None where
-    there is none. A sensor whose R depends on the state is left out.
+    """Find one of K measurements with a sensor whose R is not positive definite under a model of the filters.
+
+    The function returns None where there is none. It skips sensors whose R depends on the state.
 
     Args:
         definition: the models.
@@ -228,44 +231,44 @@ def find_invalid_noise(
 
 
 class StateSpaceMeasurement(NamedTuple):
-    """What the sensors say."""
+    """Values of all sensors, with the interval and the inputs."""
 
     values: Array
-    """What the sensors measured, ``(m, N)``; any number where nothing was received."""
+    """Measured values, ``(m, N)``; arbitrary where nothing was received."""
     available: Array
     """1 where a value was received, 0 where not, ``(m, N)``."""
     interval: Array | None = None
-    """Since the measurement before, or the start, s, ``(N,)``; None where the model is not timed."""
+    """Time since the previous measurement, or the start, s, ``(N,)``; None where the model is not timed."""
     inputs: Array | None = None
-    """Known inputs that acted in that time, ``(p, N)``; None where the model has none."""
+    """Known inputs that acted in that interval, ``(p, N)``; None where the model has none."""
     late: Array | None = None
-    """What comes now and is of ``lateness`` measurements ago, ``(m, N)``, zero where nothing does; None where nothing
-    comes late."""
+    """Values that arrive now with a delay of ``lateness`` measurements, ``(m, N)``, zero where none arrives; None in a
+    task without delays."""
     late_available: Array | None = None
-    """1 where such a value has come, 0 where not, ``(m, N)``; None where nothing comes late."""
+    """1 where a delayed value has arrived, 0 where not, ``(m, N)``; None in a task without delays."""
 
 
 class Passage(NamedTuple):
-    """How a state moves until a measurement, which is not made yet: its interval and inputs."""
+    """Interval and inputs until a measurement that has not been made yet."""
 
     interval: Array | None
     inputs: Array | None
 
 
 QUARTER = 0.25
-"""Of a turn, by which sigma points may move an angle: half of what has a nearest turn."""
+"""Share of a turn by which sigma points may move an angle: half of the range in which the nearest turn is unique."""
 Passed = StateSpaceMeasurement | Passage
-"""What says how a state moved since the measurement before."""
+"""Interval and inputs since the previous measurement."""
 
 
 class StateSpaceProblem(Task):
-    """What equations, world, filters and live input use of a task of state-space models."""
+    """The part of a task of state-space models that equations, world, filters and live input use."""
 
     definition: ClassVar[StateSpaceDefinition]
     parameters: StateSpaceParameters
 
     def set_up(self) -> None:
-        """Put the models that the filters believe on the task's arrays."""
+        """Put the models of the filters on the task's arrays."""
         own = self.definition
         self.believed: list[Equations] = [Equations(self, model) for model in own.filters]
         count = len(own.filters)
@@ -273,7 +276,7 @@ class StateSpaceProblem(Task):
         self.transition: Array = self.constant([list(row) for row in own.transition])
 
     def _sampling_interval(self) -> float | None:
-        """Return the time between measurements, s; None where it differs."""
+        """Return the time between measurements, s; None where it varies."""
         return None if self.parameters.jitter > 0.0 else self.parameters.sampling_interval
 
 
@@ -281,7 +284,7 @@ class Equations:
     """A model on the arrays of a task.
 
     Args:
-        task: whose arrays they are.
+        task: the task, which provides the arrays.
         model: the equations.
     """
 
@@ -297,7 +300,7 @@ class Equations:
         )
         self.channels: tuple[Channel, ...] = task.definition.channels
         self.periods: dict[int, float] = {i: c.period for c in self.channels if c.period for i in c.numbers}
-        """Of the numbers of a measurement that are angles."""
+        """Periods of the numbers of a measurement that are angles, by their indices."""
         self.angles: dict[int, float] = task.periods
         self.gated: bool = any(channel.gate for channel in self.channels)
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
@@ -307,28 +310,28 @@ class Equations:
         return None if isinstance(noise, VectorFunction) else task.constant(noise)
 
     def move(self, x: Array, passed: Passed) -> Array:
-        """State without noise at the next measurement, ``(n, ...)``.
+        """Return the state at the next measurement without noise, ``(n, ...)``.
 
         Args:
             x: ``(n, ...)``.
-            passed: what went on until then.
+            passed: interval and inputs until then.
         """
         return self._value("f", self.model.f, self._with_passed(x, passed))
 
     def _with_passed(self, x: Array, passed: Passed) -> Array:
-        """State with the interval and the inputs as its last rows, ``(n + 1 + p, ...)``."""
+        """Return the state with the interval and the inputs as its last rows, ``(n + 1 + p, ...)``."""
         rows = [] if passed.interval is None else [passed.interval]
         if passed.inputs is not None:
             rows += [passed.inputs[j] for j in range(passed.inputs.shape[0])]
         return self.xp.concat([x, *((0.0 * x[0] + row)[None] for row in rows)]) if rows else x
 
     def process_noise(self, x: Array, passed: Passed, of_sources: Mapping[str, Any] | None = None) -> Array:
-        """Q, ``(n, n, N)``, without time ``(n, n, 1)``.
+        """Return Q, ``(n, n, N)``; ``(n, n, 1)`` where the model is not timed.
 
         Args:
             x: predicted state, ``(n, N)``.
-            passed: what went on until then.
-            of_sources: factors on some of its sources, by their names, a number or ``(N,)`` each.
+            passed: interval and inputs until then.
+            of_sources: factors on some terms of Q by their names, a number or ``(N,)`` each.
         """
         if not of_sources:
             return self._noise(self.model.Q, self._Q, x, passed)
@@ -341,7 +344,6 @@ class Equations:
     def _noise(
         self, noise: numpy.ndarray | VectorFunction, constant: Array | None, x: Array, passed: Passed
     ) -> Array:
-        """Covariance of a noise, a square matrix for each lane."""
         if constant is not None:
             return constant[:, :, None]
         assert isinstance(noise, VectorFunction)
@@ -351,20 +353,20 @@ class Equations:
         return self.xp.reshape(entries, (size, size, *x.shape[1:]))
 
     def input_noise(self, x: Array, passed: Passed) -> Array | float:
-        """What noise of the inputs adds to the covariance, ``(n, n, N)``.
+        """Return the covariance ``G N G^T`` that noise of the inputs adds, ``(n, n, N)``; 0.0 without such noise.
 
         Args:
-            x: state before, ``(n, N)``.
-            passed: what went on since.
+            x: state at the previous measurement, ``(n, N)``.
+            passed: interval and inputs since then.
         """
         return self._through(self.model.G, self._with_passed(x, Passage(passed.interval, None)), passed)
 
     def measured_noise(self, R: Array, x: Array, passed: Passed) -> Array:
-        """R with what noise of the inputs adds to it, ``(m, m, N)``; the state at the measurement."""
+        """Return ``R + D N D^T``, R with the noise of the inputs, ``(m, m, N)``, at the state of the measurement."""
         return R if self.model.D is None else R + self._through(self.model.D, x, passed)
 
     def _through(self, function: VectorFunction | None, given: Array, passed: Passed) -> Array | float:
-        """Covariance that noise of the inputs has behind a function of them, and of what else is given to it."""
+        """Return the covariance that noise of the inputs gives to a function of inputs and further arguments."""
         if function is None:
             return 0.0
         assert passed.inputs is not None
@@ -378,13 +380,13 @@ class Equations:
     def sensor_noise(
         self, x: Array, passed: Passed, factor: Any = 1.0, of_sensors: Mapping[str, Any] | None = None
     ) -> Array:
-        """R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
+        """Return R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
 
         Args:
             x: state at the measurement, ``(n, N)``.
-            passed: what went on until then.
+            passed: interval and inputs until then.
             factor: a number, or ``(N,)``.
-            of_sensors: further ones of some sensors, by their names.
+            of_sensors: further factors for some sensors, by their names.
         """
         R = factor * self._noise(self.model.R, self._R, x, passed)
         if not of_sensors:
@@ -396,34 +398,33 @@ class Equations:
         return self.xp.stack(rows)
 
     def measure(self, x: Array, passed: Passed) -> Array:
-        """Measurement without noise, ``(m, ...)``.
+        """Return the measurement without noise, ``(m, ...)``.
 
         Args:
             x: ``(n, ...)``.
-            passed: what went on until then.
+            passed: interval and inputs until then.
         """
         return self._value("h", self.model.h, self._with_inputs(x, passed))
 
     def _with_inputs(self, x: Array, passed: Passed) -> Array:
-        """What h takes: the state, with the inputs as its last rows where it knows them."""
         return self._with_passed(x, Passage(None, passed.inputs)) if self.model.h.given else x
 
     def subtract(self, z: Array, predicted: Array) -> Array:
-        """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
+        """Return the innovation, measurement minus prediction, ``(m, ...)``, angles within half a turn."""
         return shorten(z - predicted, self.periods)
 
     def continuous_measurement(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Measurement function and sigma points of a transform in which angles are continuous.
+        """Return the measurement function and sigma points of a transform in which angles are continuous.
 
-        An angle changes by its slope along a state in which it is linear, over any number of turns, and otherwise by
-        less than half a turn: the points lie close enough for that.
+        Along a state in which an angle is linear it follows its slope over any number of turns. Along the others it
+        changes by less than half a turn, for which the points are close enough.
 
         Args:
             mean: predicted state, ``(n, N)``.
-            covariance: of it, ``(n, n, N)``.
-            passed: what went on until then.
+            covariance: its covariance, ``(n, n, N)``.
+            passed: interval and inputs until then.
         """
         return self._unfold(
             partial(self.measure, passed=passed),
@@ -435,12 +436,12 @@ class Equations:
     def continuous_motion(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Motion and sigma points of a transform in which angles of the state keep the turn nearest to the mean's.
+        """Return the motion and sigma points of a transform in which angles stay on the turn nearest the mean.
 
         Args:
             mean: state, ``(n, N)``.
-            covariance: of it, ``(n, n, N)``.
-            passed: what went on until the next measurement.
+            covariance: its covariance, ``(n, n, N)``.
+            passed: interval and inputs until the next measurement.
         """
         return self._unfold(
             partial(self.move, passed=passed),
@@ -456,11 +457,11 @@ class Equations:
         mean: Array,
         covariance: Array,
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Function whose angles are continuous from the mean to each point, and points that are close enough for it.
+        """Return the function with angles continuous from the mean to each point, and points close enough for that.
 
         Args:
             function: from points ``(n, 2n + 1, N)``.
-            traced: the same of one point, what computes its Jacobian at the mean, and the periods of its angles.
+            traced: the traced function, a function that computes its Jacobian at the mean, the periods of its angles.
             mean: ``(n, N)``.
             covariance: ``(n, n, N)``.
         """
@@ -481,11 +482,11 @@ class Equations:
         return continuous, narrow(turns, covariance, QUARTER)
 
     def receive(self, measurement: StateSpaceMeasurement, mean: Array, R: Array) -> Received:
-        """What was received of a measurement, as it was predicted.
+        """Return the innovation, H and R of the received numbers of a measurement.
 
         Args:
-            measurement: with numbers also where nothing was received.
-            mean: predicted, ``(n, N)``.
+            measurement: finite also where nothing was received.
+            mean: predicted mean, ``(n, N)``.
             R: covariance of the noise, ``(m, m, N)`` or ``(m, m, 1)``.
         """
         nu = self.subtract(measurement.values, self.measure(mean, measurement))
@@ -493,7 +494,7 @@ class Equations:
         return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
 
     def gain(self, covariance: Array, received: Received) -> Array:
-        """Kalman gain for a predicted covariance ``(n, n, N)``, zero for sensors beyond their gates, ``(n, m, N)``."""
+        """Return the Kalman gain ``(n, m, N)`` for a covariance ``(n, n, N)``, zero for sensors beyond their gates."""
         if self.gated:
             S = product(product(received.H, covariance), transpose(received.H)) + received.R
             kept = self.within_gates(received.innovation, S)
@@ -501,7 +502,7 @@ class Equations:
         return kalman_gain(covariance, received)
 
     def within_gates(self, nu: Array, S: Array) -> Array:
-        """1 for numbers of sensors whose innovation is within their gate, else 0, ``(m, N)``.
+        """Return 1 for numbers of sensors whose innovation is within their gate, else 0, ``(m, N)``.
 
         Args:
             nu: innovation, ``(m, N)``.
@@ -521,7 +522,7 @@ class Equations:
         return self.xp.reshape(values, (function.size, *x.shape[1:]))
 
     def _warn(self, name: str, compute: Callable[[Array, Any], Array], x: Array) -> Array:
-        """Values at vectors ``(n, N)``; in place of NumPy's warning, unless it is off, one that names the function."""
+        """Return the values at vectors ``(n, N)``; warn with the function's name where NumPy would warn."""
         if self.xp is not numpy:
             return compute(x, self.xp)
         with numpy.errstate(all="ignore"):
@@ -534,9 +535,7 @@ class Equations:
         return values
 
     def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
-        """Name the function, or its sensor, and the first finite state of ``(n, N)`` where a value ``(m, ..., N)`` is
-        not finite; empty where all are.
-        """
+        """Describe the first finite state with a value that is not finite; return an empty text if there is none."""
         entries = values.reshape(len(values), -1, x.shape[1])
         wrong = numpy.asarray(~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0))
         if not wrong.any():
@@ -559,11 +558,11 @@ class Equations:
     def explain_loss(
         self, mean: numpy.ndarray, covariance: numpy.ndarray, measurement: StateSpaceMeasurement
     ) -> str:
-        """Name the function that is not finite near an estimate, where the next measurement is taken in.
+        """Name the function that is not finite near an estimate at the update with the next measurement.
 
         Args:
-            mean: last valid one, ``(n, N)``.
-            covariance: ``(n, n, N)``.
+            mean: last valid mean, ``(n, N)``.
+            covariance: its covariance, ``(n, n, N)``.
             measurement: the next one.
 
         Returns:
@@ -580,19 +579,25 @@ class Equations:
             return self._describe("h", self.model.h.value(given, numpy), given)
 
     def transition_matrix(self, x: Array, passed: Passed) -> Array:
-        """Jacobian of f, ``(n, n, N)``; the last axis is 1 where it is the same everywhere."""
+        """Return the Jacobian of f, ``(n, n, N)``; the last axis has length 1 where it is constant."""
         if self._F is not None:
             return self._F[:, :, None]
         return self._warn("the derivative of f", self.model.f.jacobian, self._with_passed(x, passed))
 
     def measurement_matrix(self, x: Array, passed: Passed) -> Array:
-        """Jacobian of h, ``(m, n, N)``; the last axis is 1 where it is the same everywhere."""
+        """Return the Jacobian of h, ``(m, n, N)``; the last axis has length 1 where it is constant."""
         if self._H is not None:
             return self._H[:, :, None]
         return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))
 
     def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
-        """Mean and covariance at the next measurement, without process noise; ``passed`` as of :meth:`move`."""
+        """Return the mean and covariance at the next measurement, without process noise.
+
+        Args:
+            mean: ``(n, N)``.
+            covariance: ``(n, n, N)``.
+            passed: interval and inputs until then.
+        """
         F = self.transition_matrix(mean, passed)
         carried = product(product(F, covariance), transpose(F))
         if self.model.G is not None:

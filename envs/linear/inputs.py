@@ -5,7 +5,7 @@ A simulation draws each as a Gauss-Markov process around its mean (Gelb, Applied
 
     u(k) = mean + a (u(k-1) - mean) + deviation sqrt(1 - a^2) n(k),  a = exp(-dt / correlation_time),  n(k) ~ N(0, 1)
 
-and tells filters ``u(k) + noise e(k)``, e(k) ~ N(0, 1).
+and filters receive ``u(k) + noise e(k)``, e(k) ~ N(0, 1).
 """
 
 import math
@@ -18,22 +18,22 @@ from ..contract.observation import Array
 
 @dataclass(frozen=True)
 class Input:
-    """A known input: how it behaves in a simulation, and how well it is known.
+    """A known input: its Gauss-Markov process in a simulation, and the noise with which filters know it.
 
     Raises:
-        ValueError: for what cannot be.
+        ValueError: for a number that is not finite or out of range.
     """
 
     mean: float = 0.0
-    """In its own unit, as the deviation and the noise."""
+    """Mean, in the unit of the input, as are deviation and noise."""
     deviation: float = 1.0
-    """Of its course from the mean."""
+    """Standard deviation of the input around its mean."""
     correlation_time: float = 10.0
-    """Of its course, s."""
+    """Correlation time of the process, s."""
     noise: float = 0.0
-    """Standard deviation of what is told from what acts, independent at every measurement."""
+    """Standard deviation of the reported input around the one that acts, independent at every measurement."""
     unit: str = "1"
-    """Of its mean, in tables and pages."""
+    """Unit of the mean, in tables and pages."""
 
     def __post_init__(self) -> None:
         for field in fields(self)[:-1]:
@@ -44,16 +44,16 @@ class Input:
                 raise ValueError(f"{field.name} of an input must be finite, {least}, got {value!r}")
 
 
-class InputCourses:
-    """Courses of the inputs of a simulation.
+class InputProcesses:
+    """Gauss-Markov processes of the inputs of a simulation.
 
     Args:
-        inputs: p of them.
+        inputs: the p inputs.
         xp: array namespace.
 
     Attributes:
-        initial_normals: standard normal numbers that are taken at the start, p.
-        normals: at each measurement, p for the courses and one for each input with noise.
+        initial_normals: number of standard normal numbers at the start, p.
+        normals: number of them at each measurement, p for the processes and one for each input with noise.
     """
 
     def __init__(self, inputs: Sequence[Input], xp: ModuleType) -> None:
@@ -64,19 +64,23 @@ class InputCourses:
         self.normals: int = len(inputs) + len(self.noisy)
 
     def begin(self, normals: Array) -> Array | None:
-        """Inputs before the first measurement, ``(p, N)``, of standard normal numbers likewise; None without any."""
+        """Return the inputs before the first measurement, ``(p, N)``; None without inputs.
+
+        Args:
+            normals: standard normal numbers, ``(p, N)``.
+        """
         if not self.inputs:
             return None
         each = zip(self.inputs, normals, strict=True)
         return self.xp.stack([one.mean + one.deviation * number for one, number in each])
 
     def advance(self, inputs: Array, interval: Array, normals: Array) -> Array:
-        """Inputs that act until the next measurement, ``(p, N)``.
+        """Return the inputs that act until the next measurement, ``(p, N)``.
 
         Args:
-            inputs: that acted until the one before, ``(p, N)``.
+            inputs: those that acted until the previous measurement, ``(p, N)``.
             interval: s, ``(N,)``.
-            normals: :attr:`normals` of them, ``(normals, N)``.
+            normals: standard normal numbers, ``(normals, N)``.
         """
         xp, after = self.xp, []
         for j, one in enumerate(self.inputs):
@@ -86,8 +90,13 @@ class InputCourses:
         return xp.stack(after)
 
     def report(self, inputs: Array, normals: Array) -> Array:
-        """What is told of them, ``(p, N)``; arguments as of :meth:`advance`."""
-        told = [inputs[j] for j in range(len(self.inputs))]
+        """Return the inputs as filters receive them, ``(p, N)``.
+
+        Args:
+            inputs: those that act, ``(p, N)``.
+            normals: standard normal numbers, ``(normals, N)``.
+        """
+        reported = [inputs[j] for j in range(len(self.inputs))]
         for place, j in enumerate(self.noisy):
-            told[j] = told[j] + self.inputs[j].noise * normals[len(told) + place]
-        return self.xp.stack(told)
+            reported[j] = reported[j] + self.inputs[j].noise * normals[len(reported) + place]
+        return self.xp.stack(reported)

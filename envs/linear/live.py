@@ -1,4 +1,4 @@
-"""Measurements of a state-space model as they come one by one, see :mod:`..contract.live_input`."""
+"""Live measurements of a state-space model, see :mod:`..contract.live_input`."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,13 +10,14 @@ from ..contract.live_input import LiveInput, Memory
 from .equations import StateSpaceDefinition, StateSpaceProblem, find_invalid_noise
 
 UNEVEN = 0.01
-"""Share of the sampling interval by which a time may be off, as in tables of regular measurements."""
+"""Largest deviation of an interval from the sampling interval, as a share of it."""
 
 
 class StateSpaceInput(LiveInput):
-    """Values of the sensors and inputs, by their names or those of the sensors together. A timed model takes any
-    interval, also none where it then stands still; any other says the state one sampling interval later, and nothing
-    else.
+    """Reader of live values of sensors and inputs, by the names of their numbers or of the sensors.
+
+    A timed model accepts any interval, and zero where the state does not move in it. Any other model accepts only its
+    sampling interval.
     """
 
     def __init__(self, task: StateSpaceProblem, initial: Any, measurement: Any, tracks: int) -> None:
@@ -26,28 +27,34 @@ class StateSpaceInput(LiveInput):
         self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]
         super().__init__(task, initial, measurement, tracks)
         own = task.definition
-        self.fuses: bool = all(model.stands_still(own.mean, own.usual_inputs) for model in own.filters)
+        self.fuses: bool = all(
+            model.allows_zero_interval(own.mean, own.usual_inputs) for model in own.filters
+        )
         self._noise_varies = any(isinstance(model.R, VectorFunction) for model in own.filters)
         self._names = ["values", *(channel.name for channel in self.groups), *self.measured]
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return what the sensors and inputs say; the interval follows from the times."""
+        """Return descriptions of the values by name, and of those at the start; the interval follows from the times."""
         values, at_start = super().describe()
         found = {name: text for name, text in values.items() if name not in ("interval", "inputs")}
         sensors = {channel.name: f"shape ({channel.size},)" for channel in self.groups}
         names = {**sensors, **dict.fromkeys(self.measured, "a number")}
-        held = dict.fromkeys(
-            self.inputs, "an input that acted since the last measurement; the last one holds on"
+        inputs = dict.fromkeys(
+            self.inputs, "an input that acted since the last measurement; the last value remains in force"
         )
-        return {**names, **held, **found}, at_start
+        return {**names, **inputs, **found}, at_start
 
     def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Start with inputs that nobody knows yet."""
+        """Start with inputs that are not known yet (NaN)."""
         initial, memory = super().start(time, given)
         return initial, {**memory, "inputs": self.same_of_all(numpy.nan, (len(self.inputs),))}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Make the measurement; refuse an interval that the model does not know."""
+        """Return the measurement and the memory.
+
+        Raises:
+            ValueError: if the model cannot move by this interval.
+        """
         interval, own = time - memory["time"], self.parameters.sampling_interval
         values = self._by_name(values)
         if self.inputs:
@@ -60,12 +67,12 @@ class StateSpaceInput(LiveInput):
             raise ValueError(
                 f"the model of {self.task.id} moves by {own:g} s from one measurement to the next, got "
                 f"{float(numpy.extract(wrong, interval)[0]):g} s: call "
-                "update once in every interval, without values where nothing came, or write f(x, dt) and Q(dt)"
+                "update once in every interval, without values where nothing was received, or write f(x, dt) and Q(dt)"
             )
         return self._checked(super().measure(memory, time, values), interval)
 
     def _checked(self, made: tuple[Any, Memory], interval: Any) -> tuple[Any, Memory]:
-        """Return a measurement; raise ValueError where its inputs make R of a sensor no covariance."""
+        """Return the measurement; raise ValueError where its inputs make R of a sensor not positive definite."""
         if not self._noise_varies:
             return made
         measurement, N = made[0], self.tracks
@@ -73,18 +80,18 @@ class StateSpaceInput(LiveInput):
         there = numpy.reshape(measurement.available, (-1, N))
         found = find_invalid_noise(self.definition, there, numpy.atleast_1d(interval), inputs)
         if found is not None:
-            said = ", ".join(f"{name}={inputs[j, found.place]:g}" for j, name in enumerate(self.inputs))
+            values = ", ".join(f"{name}={inputs[j, found.place]:g}" for j, name in enumerate(self.inputs))
             raise ValueError(
-                f"R of {found.sensor} must be positive definite, and with {said} it is {found.R}: leave the sensor out "
-                "where its noise is not known"
+                f"R of {found.sensor} must be positive definite, and with {values} it is {found.R}: leave the sensor "
+                "out where its noise is not known"
             )
         return made
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values with what the sensors say in one array, ``(m, N)``, of one track ``(m,)``.
+        """Return the values with all sensors in one array, ``(m, N)``, for one track ``(m,)``.
 
         Raises:
-            ValueError: where it is said twice.
+            ValueError: if a number is given twice.
         """
         named = [name for name in self._names if values.get(name) is not None]
         if named in ([], ["values"]):
@@ -94,24 +101,24 @@ class StateSpaceInput(LiveInput):
             given, own = self.read(values, channel.name, (channel.size,)), rows[channel.places]
             if (numpy.isfinite(given) & numpy.isfinite(own)).any():
                 raise ValueError(
-                    f"{channel.name} has {self.measured[channel.first]} already: give one of them"
+                    f"{channel.name} contains {self.measured[channel.first]} already: give one of them"
                 )
             rows[channel.places] = numpy.where(numpy.isfinite(given), given, own)
         if "values" in named:
-            raise ValueError(f"values has {named[1]} already: give one of them")
+            raise ValueError(f"values contains {named[1]} already: give one of them")
         return {**values, "values": rows}
 
     def _hold(self, before: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Inputs, ``(p, N)``, of one track ``(p,)``: what came, and else what came before.
+        """Return the newest value of each input, ``(p, N)``, for one track ``(p,)``.
 
         Raises:
-            ValueError: where nothing has come so far.
+            ValueError: if an input has had no value so far.
         """
         given = numpy.array([self.read(values, name) for name in self.inputs])
         found = numpy.where(numpy.isfinite(given), given, before)
         if not numpy.isfinite(found).all():
             lacking = self.inputs[int((~numpy.isfinite(found)).reshape(len(found), -1).any(axis=1).argmax())]
             raise ValueError(
-                f"{self.task.id} needs {lacking} at the first measurement; later the last one holds on"
+                f"{self.task.id} needs {lacking} at the first measurement; later the last value remains in force"
             )
         return found

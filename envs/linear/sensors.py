@@ -1,7 +1,7 @@
-"""Sensors of a state-space model by name: what each measures, when, and what may go wrong with it.
+"""Named sensors of a state-space model: what they measure, when, and their faults.
 
-A measurement holds the numbers of all sensors, one after the other, and says which were received. What several sensors
-say at one time is taken in together: their noises are independent, so the order would matter only to linearisation.
+A measurement contains the numbers of all sensors, one after the other, and which of them were received. Filters update
+with simultaneous sensors jointly: their noises are independent, so the order would matter only to linearisation.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ LIMITS: dict[str, tuple[Any, ParameterLimits]] = {
     "gate": (float | None, ParameterLimits(above=0.0)),
     "wraps": (str | None, ParameterLimits(choices=tuple(PERIODS))),
 }
-"""What must hold for a sensor's fields."""
+"""Types and limits of the fields of a sensor."""
 EARLY = 1e-6
 """Share of a sensor's interval by which it may be due early: sums of intervals are rounded."""
 
@@ -34,29 +34,29 @@ class Sensor:
     """A sensor of a state-space model.
 
     Raises:
-        ValueError: for what cannot be.
+        ValueError: if a field is outside its limits.
     """
 
     h: Any
-    """What it measures: a function of the state ``(n,)`` that returns a list of numbers, or a matrix ``(m, n)``."""
+    """Measurement function: from the state ``(n,)`` to a list of m numbers, or a matrix ``(m, n)``."""
     R: Any
-    """Covariance of its noise, ``(m, m)``, or the variance where it measures one number; or a function that returns
-    either, of the state and of ``dt`` and ``u``, as many of them as it names: ``R(x)``, ``R(u)``, ``R(x, dt, u)``."""
+    """Covariance of the noise, ``(m, m)``, or the variance of a sensor with one number; or a function that returns
+    either, with any of the arguments state, ``dt`` and ``u``: ``R(x)``, ``R(u)``, ``R(x, dt, u)``."""
     interval: float | None = None
-    """Between its measurements in a simulation, s: it speaks at the first measurement at which it is due. None: at
-    every measurement."""
+    """Time between its measurements in a simulation, s: the sensor measures at the first measurement at which it is
+    due. None: at every measurement."""
     availability: float = 1.0
     """Probability that a measurement which is due is received."""
     gate: float | None = None
-    """Distance of an innovation from zero, in predicted standard deviations (Mahalanobis), beyond which no filter takes
-    the measurement in; None: all are. The likelihood counts it all the same."""
+    """Mahalanobis distance of an innovation from zero beyond which no filter updates with the measurement; None: no
+    gate. The likelihood includes the measurement in any case."""
     wraps: str | None = None
-    """``"rad"`` or ``"deg"``: it measures angles, and innovations are between minus and plus half a turn."""
+    """``"rad"`` or ``"deg"``: the sensor measures angles, and innovations are between minus and plus half a turn."""
     names: Sequence[str] = ()
-    """Of its m numbers, which are columns of a table ``SENSOR_NAME``; default: 1, 2 and so on. One number is called as
-    the sensor."""
+    """Names of its m numbers, columns of a table ``SENSOR_NAME``; default: 1, 2 and so on. A single number has the name
+    of the sensor."""
     units: Sequence[str] = ()
-    """Of its numbers; default: of the component that it measures, or of the angle."""
+    """Units of its numbers; default: that of the measured component, or of the angle."""
 
     def __post_init__(self) -> None:
         for name, (hint, limits) in LIMITS.items():
@@ -64,7 +64,7 @@ class Sensor:
 
 
 class Channel(NamedTuple):
-    """A sensor's place among the m numbers of a measurement, and how it behaves."""
+    """A sensor's place among the m numbers of a measurement, with its rate, availability and gate."""
 
     name: str
     first: int
@@ -73,43 +73,43 @@ class Channel(NamedTuple):
     availability: float = 1.0
     gate: float | None = None
     period: float | None = None
-    """Of its numbers, where they are angles."""
+    """Period of its numbers, where they are angles."""
 
     @property
     def places(self) -> slice:
-        """Of its numbers."""
+        """Return the slice of its numbers."""
         return slice(self.first, self.first + self.size)
 
     @property
     def numbers(self) -> range:
-        """Place of each of them."""
+        """Return the indices of its numbers."""
         return range(self.first, self.first + self.size)
 
-    def received(self, available: Array) -> Array:
-        """Whether it said anything, ``(N,)``, from what was received, ``(m, N)``."""
+    def is_received(self, available: Array) -> Array:
+        """Return whether any of its numbers was received, ``(N,)``, from ``available``, ``(m, N)``."""
         found = available[self.first] > 0.0
         for place in self.numbers[1:]:
             found = found | (available[place] > 0.0)
         return found
 
 
-def silence_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
-    """Return a cause of costs for each of several sensors: that it says nothing."""
+def missing_value_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
+    """Return for each of several sensors the cause of costs that it gives no value."""
 
     def cause(channel: Channel) -> Cause:
         def holds(moment: Moment) -> Array:
-            return ~channel.received(moment.measurement.available)
+            return ~channel.is_received(moment.measurement.available)
 
-        return Cause(f"no {channel.name}", f"where {channel.name} says nothing", holds)
+        return Cause(f"no {channel.name}", f"where {channel.name} gives no value", holds)
 
     return tuple(map(cause, channels))
 
 
 class SensorStates(NamedTuple):
-    """Where the sensors of a simulation stand."""
+    """State of the sensors of a simulation."""
 
     waited: Array | None = None
-    """Since each sensor with an interval was due, s, ``(sensors, N)``."""
+    """Time since each sensor with an interval was due, s, ``(sensors, N)``."""
     silent: Array | None = None
     """1 in a gap of a sensor, else 0, ``(sensors, N)``."""
     bias: Array | None = None
@@ -117,16 +117,16 @@ class SensorStates(NamedTuple):
 
 
 class Receptions:
-    """When the sensors of a simulation speak, and which of them has an offset.
+    """Rates, gaps, losses and the offset of the sensors of a simulation.
 
     Args:
-        parameters: of the task.
+        parameters: parameters of the task.
         xp: its array namespace.
         channels: the sensors.
-        deviations: of the noise of the m numbers, ``(m,)``.
+        deviations: standard deviations of the noise of the m numbers, ``(m,)``.
 
     Attributes:
-        row_uniforms: uniform numbers that are taken at each measurement.
+        row_uniforms: number of uniform numbers at each measurement.
     """
 
     def __init__(
@@ -141,21 +141,21 @@ class Receptions:
         self.channels = channels
         self.deviations = deviations
         self.due: list[Channel] = [channel for channel in self.channels if channel.interval is not None]
-        self.losing: list[Channel] = [channel for channel in self.channels if channel.availability < 1.0]
-        self.pauses: bool = self.parameters.gaps > 0.0
-        self.row_uniforms: int = len(self.losing) + len(self.channels) * self.pauses
+        self.lossy: list[Channel] = [channel for channel in self.channels if channel.availability < 1.0]
+        self.has_gaps: bool = self.parameters.gaps > 0.0
+        self.row_uniforms: int = len(self.lossy) + len(self.channels) * self.has_gaps
 
     def begin(self, draws: Draws, zero: Array) -> SensorStates | None:
-        """State at the start of the track, of zeros ``(N,)``; None where nothing has to be remembered."""
+        """Return the state at the start of the track from zeros ``(N,)``; None where the sensors have no state."""
         states = SensorStates(
             self.xp.stack([zero] * len(self.due)) if self.due else None,
-            self.xp.stack([zero] * len(self.channels)) if self.pauses else None,
+            self.xp.stack([zero] * len(self.channels)) if self.has_gaps else None,
             self._bias(draws, zero) if self.parameters.bias > 0.0 else None,
         )
         return None if all(part is None for part in states) else states
 
     def _bias(self, draws: Draws, zero: Array) -> Array:
-        """Offset of one sensor, up or down, ``(m, N)``."""
+        """Return the offset of one sensor, up or down, ``(m, N)``."""
         biased = draws.integer("biased_sensor", (0, len(self.channels) - 1))
         sign = 2.0 * draws.integer("sign", (0, 1)) - 1.0
         size, rows = (self.parameters.bias * self.deviations).tolist(), []
@@ -167,15 +167,15 @@ class Receptions:
     def advance(
         self, states: SensorStates | None, interval: Array, uniforms: Array
     ) -> tuple[SensorStates | None, Array | None]:
-        """State at a measurement, and what is received of it, ``(m, N)``; None where all is.
+        """Return the state at a measurement, and 1 for each number received, else 0, ``(m, N)``; None where all are.
 
         Args:
-            states: at the one before.
-            interval: since then, s, ``(N,)``.
-            uniforms: :attr:`row_uniforms` of them, ``(row_uniforms, N)``.
+            states: state at the previous measurement.
+            interval: time since then, s, ``(N,)``.
+            uniforms: uniform numbers, ``(row_uniforms, N)``.
         """
         xp, here = self.xp, {channel.name: 1.0 + 0.0 * interval for channel in self.channels}
-        if not (self.due or self.losing or self.pauses):
+        if not (self.due or self.lossy or self.has_gaps):
             return states, None
         states = states or SensorStates()
         waited = []
@@ -186,12 +186,12 @@ class Receptions:
             times = xp.floor(total / channel.interval + EARLY)
             here[channel.name] = xp.where(times > 0.0, here[channel.name], 0.0)
             waited.append(total - channel.interval * times)
-        for place, channel in enumerate(self.losing):
+        for place, channel in enumerate(self.lossy):
             here[channel.name] = xp.where(uniforms[place] < channel.availability, here[channel.name], 0.0)
         silent = []
-        for place, channel in enumerate(self.channels if self.pauses else ()):
+        for place, channel in enumerate(self.channels if self.has_gaps else ()):
             assert states.silent is not None
-            uniform = uniforms[len(self.losing) + place]
+            uniform = uniforms[len(self.lossy) + place]
             begins = xp.where(uniform < self.parameters.gaps, 1.0, 0.0)
             goes_on = xp.where(uniform * self.parameters.gap_length >= 1.0, 1.0, 0.0)
             silent.append(xp.where(states.silent[place] > 0.0, goes_on, begins))

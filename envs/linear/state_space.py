@@ -1,13 +1,13 @@
-r"""A task made of a state-space model that somebody gives: what is declared, the world, and the task.
+r"""A task made of a user's state-space model: its world and its class.
 
     x(k) = f(x(k-1)) + w,  w ~ N(0, Q)          z(k) = h(x(k)) + v,  v ~ N(0, R)          x(0) ~ N(mean, covariance)
 
-A model may know the time, then f and Q are of the interval dt since the measurement before, and known inputs u, which
-are drawn with the episode and acted in this interval: ``x(k) = f(x(k-1), dt, u) + w``, ``w ~ N(0, Q(dt))``. A
-measurement then says both (:mod:`.equations`, :mod:`.inputs`).
+f and Q of a timed model are functions of the interval dt since the previous measurement. A model may also have known
+inputs u, drawn with the episode, that acted in this interval: ``x(k) = f(x(k-1), dt, u) + w``, ``w ~ N(0, Q(dt))``. A
+measurement then contains both (:mod:`.equations`, :mod:`.inputs`).
 
-The world obeys one model, or several between which it switches as a Markov chain from measurement to measurement. The
-filters may believe others. Functions are traced once, on vectors of symbols, and differentiated exactly
+The world has one model, or switches between several as a Markov chain from measurement to measurement. The filters may
+use other models. The functions are traced once, on vectors of symbols, and differentiated exactly
 (:mod:`..compiler.vector_functions`).
 """
 
@@ -36,31 +36,31 @@ from .equations import (
     StateSpaceProblem,
     usual_sensor_noise,
 )
-from .inputs import InputCourses
+from .inputs import InputProcesses
 from .live import StateSpaceInput
 from .parameters import StateSpaceParameters
-from .sensors import Receptions, SensorStates, silence_causes
+from .sensors import Receptions, SensorStates, missing_value_causes
 from .state_space_banks import StateSpaceKalmanNetBank, bank_tables
 
 
 class StateSpaceTruth(NamedTuple):
-    """What is."""
+    """True state, model, noise factors and inputs."""
 
     state: Array
     """``(n, N)``."""
     hypothesis: Array
-    """Number of the model that led here, ``(N,)``."""
+    """Index of the model in force since the previous measurement, ``(N,)``."""
     process_noise: Array
-    """True Q over the model's, ``(N,)``."""
+    """Ratio of the true Q to the model's, ``(N,)``."""
     measurement_noise: Array
-    """True R over the model's, ``(N,)``."""
+    """Ratio of the true R to the model's, ``(N,)``."""
     inputs: Array | None = None
-    """Inputs that acted since the measurement before, ``(p, N)``; None where the model has none."""
+    """Inputs that acted since the previous measurement, ``(p, N)``; None where the model has none."""
     sensors: SensorStates | None = None
-    """Where the sensors stand; None where nothing is to be remembered."""
+    """State of the sensors; None where they have none."""
     waiting: Array | None = None
-    """What is under way, values and where there are any, the oldest first, ``(lateness, 2, m, N)``; None where nothing
-    comes late."""
+    """Delayed values and their availability, the oldest first, ``(lateness, 2, m, N)``; None in a task without
+    delays."""
 
 
 class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasurement]):
@@ -76,41 +76,41 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.equations: list[Equations] = [Equations(task, model) for model in own.world]
         self.sensor_roots: list[Array] = [self._root(model.R) for model in own.world]
         self.process_roots: list[Array] = [self._root(model.Q) for model in own.world]
-        self.courses: InputCourses = InputCourses(tuple(own.inputs.values()), task.xp)
+        self.input_processes: InputProcesses = InputProcesses(tuple(own.inputs.values()), task.xp)
         self.timed: bool = own.world[0].timed
-        self.jitters: bool = self.parameters.jitter > 0.0
-        if self.jitters and not self.timed:
+        self.has_jitter: bool = self.parameters.jitter > 0.0
+        if self.has_jitter and not self.timed:
             raise ValueError(
-                f"{task.id} knows no time, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) and Q(dt)"
+                f"the model of {task.id} is not timed, so jitter must be 0, got {self.parameters.jitter}: "
+                "write f(x, dt) and Q(dt)"
             )
         self.initial_root: Array = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
         first = own.world[0]
         n, m = len(own.mean), first.h.size
         self.states: int = n
         self.noises: int = n + m
-        self.initial_normals: int = n + self.courses.initial_normals
-        self.normals: int = self.noises + self.courses.normals
-        self.switches: bool = own.switching and len(own.world) > 1
-        self.loses: bool = self.parameters.availability < 1.0
-        self.drawn: int = int(self.switches) + int(self.jitters) + int(self.loses)
+        self.initial_normals: int = n + self.input_processes.initial_normals
+        self.normals: int = self.noises + self.input_processes.normals
+        self.is_switching: bool = own.switching and len(own.world) > 1
+        self.has_losses: bool = self.parameters.availability < 1.0
+        self.drawn: int = int(self.is_switching) + int(self.has_jitter) + int(self.has_losses)
         usual = usual_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
         deviations = numpy.sqrt(numpy.diag(usual))
         self.receptions: Receptions = Receptions(task.parameters, task.xp, own.channels, deviations)
         self.delayed: int = self.drawn + self.receptions.row_uniforms
-        self.delays: bool = self.parameters.late > 0.0
-        self.row_uniforms: int = self.delayed + len(own.channels) * self.delays
+        self.has_delays: bool = self.parameters.late > 0.0
+        self.row_uniforms: int = self.delayed + len(own.channels) * self.has_delays
         turning = {j for one in own.channels if one.period for j in one.numbers}
-        # An angle is no reading of a component that turns on beyond it.
-        self.places: list[int | None] = [None if j in turning else j for j in components_measured(first.h)]
+        # A wrapped angle is no reading of a component, which may exceed a turn.
+        self.places: list[int | None] = [None if j in turning else j for j in measurement_indices(first.h)]
 
     def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
-        """Root of a covariance that is the same for all measurements; None of any other."""
         if isinstance(covariance, VectorFunction):
             return None
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
     def begin(self, draws: Draws, normals: Array) -> tuple[StateSpaceTruth, Initial]:
-        """Draw the start and the noise of the episode; everyone starts with the same mean and covariance."""
+        """Draw initial state and noise of the episode; every filter starts with the same mean and covariance."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
         process, measurement = (
             draw_between(draws.log_uniform, name, limits) + zero
@@ -120,13 +120,13 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
             )
         )
         count = len(own.world)
-        first = draws.integer("hypothesis", (0, count - 1)) if self.switches else zero
+        first = draws.integer("hypothesis", (0, count - 1)) if self.is_switching else zero
         mean = self.task.constant(own.mean)[:, None] + zero
         covariance = self.task.constant(own.covariance)[:, :, None] + zero
         state = mean + apply(self.initial_root[:, :, None], normals[: self.states])
-        inputs = self.courses.begin(normals[self.states :])
+        inputs = self.input_processes.begin(normals[self.states :])
         sensors, waiting = self.receptions.begin(draws, zero), None
-        if self.delays:
+        if self.has_delays:
             nothing = self.xp.stack([self.xp.stack([zero] * (self.noises - self.states))] * 2)
             waiting = self.xp.stack([nothing] * self.parameters.lateness)
         truth = StateSpaceTruth(state, first, process, measurement, inputs, sensors, waiting)
@@ -135,16 +135,16 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def advance(
         self, truth: StateSpaceTruth, noise: Array, feedback: Any
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Switch, move, measure."""
+        """Switch the model, move the state and measure it."""
         xp, n = self.xp, self.states
         uniforms = noise[self.normals :]
         hypothesis = truth.hypothesis
-        if self.switches:
+        if self.is_switching:
             hypothesis = self._switch(hypothesis, uniforms[0])
-        interval = self._interval(truth, uniforms[int(self.switches)] if self.jitters else None)
+        interval = self._interval(truth, uniforms[int(self.is_switching)] if self.has_jitter else None)
         process = xp.sqrt(truth.process_noise) * noise[:n]
         sensors = xp.sqrt(truth.measurement_noise) * noise[n : self.noises]
-        inputs, told = self._inputs(truth, interval, noise[self.noises : self.normals])
+        inputs, reported = self._inputs(truth, interval, noise[self.noises : self.normals])
         passed = Passage(interval, inputs)
         moved, measured = [], []
         for equations, q, r in zip(self.equations, self.process_roots, self.sensor_roots, strict=True):
@@ -154,46 +154,48 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
             moved.append(state)
             root = semidefinite_root(equations.sensor_noise(state, passed)) if r is None else r[:, :, None]
             measured.append(equations.measure(state, passed) + apply(root, sensors))
-        state, values = (self._chosen(parts, hypothesis) for parts in (moved, measured))
+        state, values = (self._select(parts, hypothesis) for parts in (moved, measured))
         here = None
-        if self.loses:
+        if self.has_losses:
             here = xp.where(uniforms[self.drawn - 1] < self.parameters.availability, 1.0, 0.0)
         sensors, due = self.receptions.advance(
             truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :]
         )
         truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs, sensors=sensors)
-        received = StateSpaceMeasurement(*self._receive(truth, values, (here, due)), interval, told)
-        return self._delay(truth, received, uniforms[self.delayed :]) if self.delays else (truth, received)
+        received = StateSpaceMeasurement(*self._receive(truth, values, (here, due)), interval, reported)
+        return (
+            self._delay(truth, received, uniforms[self.delayed :]) if self.has_delays else (truth, received)
+        )
 
     def _delay(
         self, truth: StateSpaceTruth, received: StateSpaceMeasurement, uniforms: Array
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Hold back what comes late, and hand over what was held back.
+        """Delay the values of some sensors, and add the delayed values that arrive now.
 
         Args:
-            truth: at this measurement, with what is under way from those before.
-            received: all that the sensors say of it.
-            uniforms: of each sensor, ``(sensors, N)``.
+            truth: truth at this measurement, with the delayed values of earlier ones.
+            received: values of all sensors.
+            uniforms: a uniform number for each sensor, ``(sensors, N)``.
         """
         xp, rows = self.xp, []
         for place, channel in enumerate(self.task.definition.channels):
             rows += [xp.where(uniforms[place] < self.parameters.late, 1.0, 0.0)] * channel.size
-        held, waiting = xp.stack(rows), truth.waiting
+        delayed, waiting = xp.stack(rows), truth.waiting
         assert waiting is not None
-        kept = xp.stack([held * received.values, held * received.available])
-        truth = truth._replace(waiting=xp.concat([waiting[1:], kept[None]]))
-        in_time = (1.0 - held) * received.values, (1.0 - held) * received.available
+        later = xp.stack([delayed * received.values, delayed * received.available])
+        truth = truth._replace(waiting=xp.concat([waiting[1:], later[None]]))
+        in_time = (1.0 - delayed) * received.values, (1.0 - delayed) * received.available
         return truth, StateSpaceMeasurement(*in_time, received.interval, received.inputs, *waiting[0])
 
     def _receive(
         self, truth: StateSpaceTruth, values: Array, here: Sequence[Array | None]
     ) -> tuple[Array, Array]:
-        """What is received of the values of all sensors, zero elsewhere, and where it is, ``(m, N)`` both.
+        """Return the received values of all sensors, zero elsewhere, and their availability, both ``(m, N)``.
 
         Args:
-            truth: at this measurement.
-            values: ``(m, N)``.
-            here: where something is received, ``(N,)`` or ``(m, N)`` each.
+            truth: truth at this measurement.
+            values: measured values, ``(m, N)``.
+            here: masks of 1 where values are received and 0 elsewhere, ``(N,)`` or ``(m, N)`` each.
         """
         available = 1.0 + 0.0 * values
         if truth.sensors is not None and truth.sensors.bias is not None:
@@ -207,21 +209,21 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return values, available
 
     def _seconds(self, truth: StateSpaceTruth, interval: Array | None) -> Array:
-        """Time that passes until the next measurement, s, ``(N,)``, also of a model that is not timed."""
+        """Return the time until the next measurement, s, ``(N,)``, also for a model that is not timed."""
         usual: Array = self.parameters.sampling_interval + 0.0 * truth.process_noise
         return usual if interval is None else interval
 
     def _inputs(
         self, truth: StateSpaceTruth, interval: Array | None, normals: Array
     ) -> tuple[Array | None, Array | None]:
-        """Inputs that act until the next measurement, and what is told of them, ``(p, N)``; None without inputs."""
+        """Return the inputs that act until the next measurement, and those that filters receive, ``(p, N)``."""
         if truth.inputs is None:
             return None, None
-        inputs = self.courses.advance(truth.inputs, self._seconds(truth, interval), normals)
-        return inputs, self.courses.report(inputs, normals)
+        inputs = self.input_processes.advance(truth.inputs, self._seconds(truth, interval), normals)
+        return inputs, self.input_processes.report(inputs, normals)
 
     def _interval(self, truth: StateSpaceTruth, uniform: Array | None) -> Array | None:
-        """Time that passes until the next measurement, s, ``(N,)``; None where the model is not timed."""
+        """Return the time until the next measurement, s, ``(N,)``; None where the model is not timed."""
         if not self.timed:
             return None
         interval = self.parameters.sampling_interval + 0.0 * truth.process_noise
@@ -229,31 +231,29 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
             interval if uniform is None else interval * (1.0 + self.parameters.jitter * (2.0 * uniform - 1.0))
         )
 
-    def _chosen(self, parts: Sequence[Array], hypothesis: Array) -> Array:
-        """Of the arrays of all models that of the one in force."""
+    def _select(self, parts: Sequence[Array], hypothesis: Array) -> Array:
         chosen = parts[0]
         for number, part in enumerate(parts[1:], 1):
-            if self.switches:
+            if self.is_switching:
                 chosen = self.xp.where(hypothesis == float(number), part, chosen)
         return chosen
 
     def _switch(self, hypothesis: Array, uniform: Array) -> Array:
-        """Number of the model that follows, ``(N,)``."""
         rows = numpy.cumsum(self.task.definition.transition, axis=1)[:, :-1]
         thresholds = [
-            self._chosen([0.0 * uniform + value for value in column], hypothesis)
+            self._select([0.0 * uniform + value for value in column], hypothesis)
             for column in rows.T.tolist()
         ]
         return self.xp.astype(category(uniform, thresholds, self.xp), self.xp.float64)
 
     def error_cost(self, error: Array) -> Array:
-        """Weighted sum of squared errors; a component without weight need not be known."""
+        """Return the weighted sum of squared errors; a component with weight zero need not be known."""
         weights = self.task.definition.weights.tolist()
         terms = [weight * error[i] ** 2 for i, weight in enumerate(weights) if weight]
         return sum(terms[1:], terms[0])
 
     def reading_deviations(self, measurement: StateSpaceMeasurement) -> Array:
-        """Those of the R that the filters believe, at the initial mean where it depends on the state."""
+        """Return the standard deviations of the filters' R, ``(m, N)``; at the initial mean if R varies with x."""
         values = measurement.values
         mean = self.task.constant(self.task.definition.mean)
         x = self.xp.stack([mean[i] + 0.0 * values[0] for i in range(self.states)])
@@ -261,11 +261,11 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.xp.stack([self.xp.sqrt(R[j, j]) + 0.0 * values[j] for j in range(values.shape[0])])
 
     def component_readings(self, measurement: StateSpaceMeasurement) -> Array | None:
-        """Readings of components that are measured as they are; None where none is."""
+        """Return the readings of directly measured components, ``(n, N)``; None where there are none."""
         return self._of_components(measurement.values, measurement.available)
 
     def component_deviations(self, measurement: StateSpaceMeasurement) -> Array | None:
-        """Deviations that the model states for them."""
+        """Return the standard deviations of the readings of components, ``(n, N)``, by the filters' model."""
         return self._of_components(self.reading_deviations(measurement), measurement.available)
 
     def _of_components(self, values: Array, available: Array) -> Array | None:
@@ -278,7 +278,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         )
 
     def context(self, truth: StateSpaceTruth) -> dict[str, Array]:
-        """The model in force and the factors on Q and R."""
+        """Return the model in force and the factors on Q and R."""
         return {
             "hypothesis": truth.hypothesis,
             "process_noise": truth.process_noise,
@@ -286,8 +286,8 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         }
 
 
-def components_measured(h: VectorFunction) -> list[int | None]:
-    """Of each component the place of its measurement, where h hands it on as it is."""
+def measurement_indices(h: VectorFunction) -> list[int | None]:
+    """Return the index of the measurement of each component that h measures directly, otherwise None."""
     if h.matrix is None or numpy.any(h.offset):
         return [None] * (0 if h.matrix is None else h.matrix.shape[1])
     rows = h.matrix.tolist()
@@ -301,16 +301,16 @@ class StateSpace(StateSpaceProblem):
     ## Description
 
     The state moves by a function f and noise of covariance Q; sensors measure a function h of it with noise of
-    covariance R. Filters start with the same mean and covariance. They know the model, or believe another one where the
-    author says so. Kalman filters are extended ones where f or h is not linear; their Jacobians are exact.
+    covariance R. Filters start with the same mean and covariance. They know the model, or use another one where the
+    author gives one. Kalman filters are extended ones where f or h is not linear; their Jacobians are exact.
 
     ## Action Space
 
-    What each control means stands in ``Actions``; zero is the filter as written.
+    ``Actions`` describes each control; zero is the filter as written.
 
     ## Observation Space
 
-    Normalised innovations and their squares, averages of these, what was received, and the last action.
+    Normalised innovations and their squares, averages of these, availability, and the last action.
 
     ## Rewards
 
@@ -336,13 +336,12 @@ class StateSpace(StateSpaceProblem):
 
 
 REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("evidence_scale",)}
-"""Parameters that say how far an action reaches, by control."""
+"""Parameters that set the range of an action, by control."""
 
 
 def _explain_loss(
     task: StateSpaceProblem, mean: Array, covariance: Array, measurement: StateSpaceMeasurement
 ) -> str:
-    """Name the function of the filters' first model that is not finite near an estimate."""
     return task.believed[0].explain_loss(mean, covariance, measurement)
 
 
@@ -351,12 +350,12 @@ def state_space_attributes(
     components: tuple[Component, ...],
     defaults: dict[str, Any],
 ) -> dict[str, Any]:
-    """Attributes of a task's class that follow from what its author gives.
+    """Return the attributes of a task's class that follow from its definition.
 
     Args:
         definition: the models.
-        components: of the state.
-        defaults: parameters in the training distribution, where they are not those of every such task.
+        components: components of the state.
+        defaults: parameters of the training distribution that differ from the defaults of such tasks.
     """
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))
@@ -366,7 +365,7 @@ def state_space_attributes(
         "noisy": ("ten times the measurement noise", {"measurement_noise": (10.0, 10.0)}),
         "gaps": ("gaps of ten measurements on average, a third of the time", {"gaps": 0.05}),
         "biased": ("one sensor is off by three standard deviations", {"bias": 3.0}),
-        "late": ("a third of what the sensors say comes three measurements late", {"late": 1.0 / 3.0}),
+        "late": ("a third of the values of the sensors comes three measurements late", {"late": 1.0 / 3.0}),
     }
     if definition.world[0].timed:
         held_out["jitter"] = ("intervals from a tenth to 1.9 times the usual", {"jitter": 0.9})
@@ -380,7 +379,7 @@ def state_space_attributes(
             TrainedBanks({"kalman-net": StateSpaceKalmanNetBank}),
             *(make(definition, defaults) for make in load_present(MODEL_COMPANIONS)),
             LiveReader(StateSpaceInput),
-            Causes((*(silence_causes(definition.channels) if several else (MISSED,)), OUTLIER)),
+            Causes((*(missing_value_causes(definition.channels) if several else (MISSED,)), OUTLIER)),
             LostTracks(explain=_explain_loss),
             ArrayMeanings(measurement=definition.measurement_words),
         ),

@@ -1,4 +1,4 @@
-r"""The banks of a task of state-space models: one extended Kalman filter, or an interacting multiple model (IMM).
+r"""Banks of a task of state-space models: one extended Kalman filter, or an interacting multiple model (IMM).
 
 With a the action in [-1, 1], and the model's Q, R, its Jacobians F, H and the predicted mean x' = f(x):
 
@@ -39,39 +39,40 @@ from ..contract.observation import (
 from .equations import Equations, StateSpaceMeasurement, StateSpaceProblem
 from .parameters import StateSpaceParameters
 
-AVERAGED = 0.1
-"""Weight of the newest measurement in the averages that are shown."""
+AVERAGE_WEIGHT = 0.1
+"""Weight of the newest measurement in the observed averages."""
 NOISE_RANGE = 20.0
-"""``kalman-net``: largest factor and divisor of each deviation of the process noise, and of a measurement."""
+"""``kalman-net``: largest factor and divisor of each standard deviation of the process and measurement noise."""
 AGILITY = 5.0
-"""Likewise of the deviations in the gain alone."""
+"""``kalman-net``: largest factor and divisor of the standard deviations in the gain alone."""
 OFFSET = 5.0
-"""Largest correction that it adds to the predicted state, in deviations of the process noise."""
+"""``kalman-net``: largest offset of the predicted state, in standard deviations of the process noise."""
 
 
 class ExtendedKalmanState(NamedTuple):
-    """An extended Kalman filter at one moment."""
+    """State of an extended Kalman filter."""
 
     mean: Array
     """``(n, N)``; predicted between ``predict`` and the action."""
     covariance: Array
-    """``(n, n, N)``; likewise, and then without process noise."""
+    """``(n, n, N)``; between ``predict`` and the action predicted without process noise."""
     innovation: Array
-    """Over its predicted sigma, ``(m, N)``."""
+    """Innovation over its predicted sigma, ``(m, N)``."""
     nis: Array
-    """Normalised innovation squared over the values received, ``(N,)``."""
+    """Normalised innovation squared of the received values, ``(N,)``."""
     log_likelihood: Array
-    """Log-density of the last measurement as it was predicted, ``(N,)``."""
+    """Log-density of the last measurement under its prediction, ``(N,)``."""
     average: Array
     """Exponential average of log(1 + nis / degrees), ``(N,)``."""
     action: Array
-    """Applied to the last measurement, ``(A, N)``."""
+    """Action of the last measurement, ``(A, N)``."""
     correction: Array | None = None
-    """Of the state by the last update, in deviations of the process noise, ``(n, N)``; None where none sees it."""
+    """Correction of the state by the last update, in standard deviations of the process noise, ``(n, N)``; None where
+    it is not observed."""
 
 
 class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalmanState]):
-    """What the banks with one filter share."""
+    """Base of the banks with one filter."""
 
     parameters: StateSpaceParameters
 
@@ -84,17 +85,17 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """A number from -1 to 1 for each entry of the action."""
+        """Return a box from -1 to 1 for each entry of the action."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 
     @property
     def answers(self) -> Sequence[str]:
-        """What the entries of the action are."""
+        """Return the names of the entries of the action."""
         raise NotImplementedError
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What every filter of one model shows."""
+        """Return the observation blocks of a filter with one model."""
         parts = tuple(map(str, range(1, self.sensors + 1))) if self.sensors > 1 else ()
         return (
             innovation_block(parts, text="innovations over their sigma"),
@@ -110,7 +111,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Start where everyone starts."""
+        """Return the filter at the initial estimate."""
         zero = 0.0 * initial.mean[0]
         return ExtendedKalmanState(
             initial.mean,
@@ -123,29 +124,29 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         )
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Covariance of the process noise at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
+        """Return Q at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Covariance of the measurement noise at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
+        """Return R at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
         return self.equations.sensor_noise(mean, measurement)
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Predict, and compare under the noises of the last action."""
+        """Predict, and compute the innovation statistics under the noises of the last action."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def compare(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """What is known of the measurement as it was predicted."""
+        """Compute the innovation, NIS and log-likelihood of the measurement under its prediction."""
         xp = self.xp
-        received = self.received(state, measurement, state.action)
+        received = self.receive(state, measurement, state.action)
         P = state.covariance + self.process_noise(state.mean, measurement, state.action)
         S = product(product(received.H, P), transpose(received.H)) + received.R
         sigma = xp.sqrt(xp.stack([S[j, j] for j in range(self.sensors)]))
         result = update_with_gain(state.mean, P, received, 0.0 * transpose(received.H))
         degrees = ordered_sum(measurement.available)
         share = result.squared_distance / xp.maximum(degrees, 1.0 + 0.0 * degrees)
-        weight = AVERAGED * xp.minimum(degrees, 1.0 + 0.0 * degrees)
+        weight = AVERAGE_WEIGHT * xp.minimum(degrees, 1.0 + 0.0 * degrees)
         return state._replace(
             innovation=received.innovation / sigma,
             nis=result.squared_distance,
@@ -153,15 +154,15 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
             average=state.average + weight * (xp.log1p(share) - state.average),
         )
 
-    def received(
+    def receive(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> Received:
-        """What was received, under the noises of an action."""
+        """Return the innovation, H and R of the received numbers under the noises of an action."""
         R = self.sensor_noise(state.mean, measurement, action)
         return self.equations.receive(measurement, state.mean, R)
 
     def records(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> dict[str, Array]:
-        """How likely the measurement was; NaN where nothing was received."""
+        """Return the log-likelihood, NIS and its degrees of freedom; NaN where nothing was received."""
         degrees = ordered_sum(measurement.available)
         there = degrees > 0.0
         return {
@@ -180,19 +181,19 @@ class StateSpaceNoiseBank(StateSpaceBank):
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Scaled Q."""
+        """Return Q scaled by the action, ``(n, n, N)``."""
         return self._scale(action, 0) * self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Scaled R."""
+        """Return R scaled by the action, ``(m, m, N)``."""
         return self.equations.sensor_noise(mean, measurement, self._scale(action, 1))
 
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the noises that the action asks for."""
+        """Update with the noises of the action."""
         action = self.xp.clip(action, -1.0, 1.0)
-        received = self.received(state, measurement, action)
+        received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
         result = update_with_gain(state.mean, P, received, self.equations.gain(P, received))
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
@@ -203,15 +204,15 @@ class StateSpaceGainBank(StateSpaceBank):
 
     @property
     def answers(self) -> Sequence[str]:
-        """The components."""
+        """Return the names of the components."""
         return tuple(component.name for component in self.task.components)
 
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the gain that the action asks for."""
+        """Update with the gain of the action."""
         action = self.xp.clip(action, -1.0, 1.0)
-        received = self.received(state, measurement, action)
+        received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
         factor = self.xp.exp(math.log(self.parameters.gain_factor) * action)
         result = update_with_gain(state.mean, P, received, factor[:, None] * self.equations.gain(P, received))
@@ -229,9 +230,9 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         K = M H^T (H M H^T + C R' C)^-1,  M = F P F^T + A D Q D A,  in Joseph's form with P' and R'
 
     The gain of a network on innovations is that of Revach and others, "KalmanNet: Neural Network Aided Kalman Filtering
-    for Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547. Reading: their network answers
-    with the gain itself; here with the noises of a Kalman gain, so that a network that knows nothing is the filter as
-    written.
+    for Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547. Reading: their network returns
+    the gain itself; here it returns the noises of a Kalman gain, so that an untrained network (action zero) is the
+    filter as written.
     """
 
     def __init__(self, task: StateSpaceProblem, control: str) -> None:
@@ -243,14 +244,14 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
     @property
     def answers(self) -> Sequence[str]:
-        """Noises, what the gain alone takes for them, and the offset."""
+        """Return the names of the noises, their factors in the gain alone, and the offset."""
         counts = {"process": self.states, "sensor": self.sensors, "agility": self.states}
         counts |= {"caution": self.sensors, "offset": self.states}
         return tuple(f"{name}_{i + 1}" for name, count in counts.items() for i in range(count))
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Also the state, the last correction and how sure the filter is."""
+        """Return the blocks of one filter, with the state, the last correction and the log-deviation of the state."""
         names = tuple(component.name for component in self.task.components)
         names = names if len(names) > 1 else ()
         xp = self.xp
@@ -269,28 +270,38 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
                 SIGNED_LOG,
             ),
             Block(
-                "correction", lambda f, _: f.correction, "the last correction, likewise", names, SIGNED_LOG
+                "correction",
+                lambda f, _: f.correction,
+                "last correction over the deviation of the process noise",
+                names,
+                SIGNED_LOG,
             ),
-            Block("spread", spread, "deviation of the state, likewise", names, KEPT_AS_LOG),
+            Block(
+                "spread",
+                spread,
+                "deviation of the state over that of the process noise",
+                names,
+                KEPT_AS_LOG,
+            ),
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Start where everyone starts."""
+        """Return the filter at the initial estimate."""
         return super().start(initial)._replace(correction=0.0 * initial.mean)
 
     def _part(self, action: Array, place: int) -> Array:
-        """Entries of an action: process, sensor, agility, caution, offset."""
+        """Return a part of an action: 0 process, 1 sensor, 2 agility, 3 caution, 4 offset."""
         n, m = self.states, self.sensors
         ends = numpy.cumsum([0, n, m, n, m, n]).tolist()
         return action[ends[place] : ends[place + 1]]
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Q under the action."""
+        """Return Q under the action, ``D Q D``, ``(n, n, N)``."""
         Q = self.equations.process_noise(mean, measurement)
         return self._scaled(Q, NOISE_RANGE, self._part(action, 0))
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """R under the action."""
+        """Return R under the action, ``W R W``, ``(m, m, N)``."""
         R = self.equations.sensor_noise(mean, measurement)
         return self._scaled(R, NOISE_RANGE, self._part(action, 1))
 
@@ -299,7 +310,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         return outer(scale, scale) * matrix
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Predict with the offset that was answered, and compare."""
+        """Predict with the offset of the last action, and compute the innovation statistics."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
@@ -307,10 +318,10 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update as the network answers."""
+        """Update with the noises, gain factors and offset of the network."""
         action = self.xp.clip(action, -1.0, 1.0)
         Q = self.process_noise(state.mean, measurement, action)
-        received = self.received(state, measurement, action)
+        received = self.receive(state, measurement, action)
         agile = state.covariance + self._scaled(Q, AGILITY, self._part(action, 2))
         cautious = self._scaled(received.R, AGILITY, self._part(action, 3))
         K = self.equations.gain(agile, received._replace(R=cautious))
@@ -324,26 +335,26 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
 
 class Mixture(NamedTuple):
-    """An interacting multiple model at one moment."""
+    """State of an interacting multiple model."""
 
     mean: Array
-    """``(n, N)``; after an action."""
+    """Mean after an action, ``(n, N)``."""
     covariance: Array
-    """``(n, n, N)``; likewise."""
+    """Covariance after an action, ``(n, n, N)``."""
     means: Array
-    """Of the hypotheses, ``(n, M, N)``."""
+    """Means of the hypotheses, ``(n, M, N)``."""
     covariances: Array
-    """``(n, n, M, N)``."""
+    """Covariances of the hypotheses, ``(n, n, M, N)``."""
     log_predicted: Array
     """Logarithm of the predicted probabilities, ``(M, N)``."""
     probabilities: Array
-    """In force after the last action, ``(M, N)``."""
+    """Probabilities after the last action, ``(M, N)``."""
     log_likelihood: Array
-    """Of the last measurement under each hypothesis, ``(M, N)``."""
+    """Log-likelihood of the last measurement under each hypothesis, ``(M, N)``."""
     nis: Array
-    """``(M, N)``."""
+    """NIS of each hypothesis, ``(M, N)``."""
     action: Array
-    """``(M, N)``."""
+    """Last action, ``(M, N)``."""
 
 
 class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture]):
@@ -351,10 +362,10 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
     Args:
         task: the problem.
-        control: its name.
+        control: name of the control.
         process_noise: factor on Q of all hypotheses, a number or ``(N,)``.
-        measurement_noise: likewise on R.
-        of_sources: factors on some sources of Q, by their names.
+        measurement_noise: factor on R of all hypotheses, a number or ``(N,)``.
+        of_sources: factors on some terms of Q, by their names.
         of_sensors: factors on R of some sensors, by their names.
     """
 
@@ -377,12 +388,12 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """A number of evidence for each hypothesis."""
+        """Return the space of the evidence, one number for each hypothesis."""
         return bank_action_space(self.control, self.count)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Probabilities and likelihoods of the hypotheses, what was received, and the last action."""
+        """Return the blocks of probabilities, likelihoods, availability and the last action."""
         xp, modes = self.xp, self.task.modes
         parts = tuple(map(str, range(1, self.task.definition.filters[0].h.size + 1)))
         return (
@@ -407,7 +418,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def start(self, initial: Initial) -> Mixture:
-        """Start every hypothesis where everyone starts, all equally probable."""
+        """Return all hypotheses at the initial estimate, equally probable."""
         xp, zero = self.xp, 0.0 * initial.mean[0]
         one = xp.stack([zero] * self.count)
         return Mixture(
@@ -423,7 +434,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def predict(self, state: Mixture, measurement: StateSpaceMeasurement) -> Mixture:
-        """Mix, and let every hypothesis predict and take the measurement in, as none of that depends on the action."""
+        """Mix, predict and update every hypothesis; none of that depends on the action."""
         xp = self.xp
         chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
         means, covariances = imm.mix(self._align(state.means), state.covariances, chain.mixing)
@@ -443,11 +454,11 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def _align(self, means: Array) -> Array:
-        """Means of the hypotheses, ``(n, M, N)``, with angles on the turn of the first."""
+        """Return the means ``(n, M, N)`` with angles on the turn of the first hypothesis."""
         return unwrap(means, means[:, :1], self.task.periods)
 
     def act(self, state: Mixture, measurement: StateSpaceMeasurement, action: Array) -> Mixture:
-        """Weigh the hypotheses."""
+        """Weight the hypotheses with the evidence of the action, and combine them."""
         probabilities = bank_probabilities(
             self.control,
             action,
@@ -461,7 +472,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         return state._replace(mean=mean, covariance=covariance, probabilities=probabilities, action=action)
 
     def records(self, state: Mixture, measurement: StateSpaceMeasurement) -> dict[str, Array]:
-        """How likely the measurement was, and the probabilities."""
+        """Return the log-likelihood of the measurement and the probabilities of the hypotheses."""
         there = ordered_sum(measurement.available) > 0.0
         density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
         return {
@@ -471,7 +482,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
 
 def bank_tables(count: int) -> tuple[Mapping[str, Any], Mapping[str, str]]:
-    """Banks of a task with so many hypotheses by their controls, the default first, and what their actions mean."""
+    """Return banks and descriptions of actions by control, the default first, for a number of hypotheses."""
     banks: dict[str, Any] = {"noise": StateSpaceNoiseBank, "gain": StateSpaceGainBank}
     actions = {
         "noise": "times `noise_decades` decades: factors on Q and R; **0 is the filter as written**",

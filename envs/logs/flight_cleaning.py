@@ -1,4 +1,4 @@
-"""Cleaning of one recorded flight: units that cannot be, positions far off the track, gaps and jumps."""
+"""Cleaning of one recorded flight: implausible units, positions far off the track, gaps and jumps."""
 
 import itertools
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Cleaning(NamedTuple):
-    """Where the radar is, and what a flight may look like; see :func:`~.flights.read_flights`."""
+    """Site of the radar and limits of a flight; see :func:`~.flights.read_flights`."""
 
     site: tuple[float, float] | None
     longest_gap: float
@@ -23,7 +23,7 @@ class Cleaning(NamedTuple):
     smoothing: float
 
     def check(self) -> None:
-        """Raise ValueError if a limit cannot be."""
+        """Raise ValueError if a limit is out of range."""
         check("longest_gap", self.longest_gap, float, ParameterLimits(above=0.0))
         check(
             "speeds", freeze(self.speeds), tuple[float, float], ParameterLimits(at_least=0.0, ascending=True)
@@ -41,11 +41,11 @@ CLEANING_COUNTS: dict[str, Any] = {
     "gaps": (("gap",), lambda limits: f" over {limits.longest_gap:g} s"),
     "jumps": (("jump",), lambda limits: f" over {limits.speeds[1]:g} m/s"),
 }
-"""What is counted while a flight is cleaned, and how it is told."""
+"""Kinds of removed rows and cuts that the cleaning of a flight counts, with their words in notes."""
 
 
-LANDED = 1800.0
-"""s; after a longer gap an aircraft flies another flight."""
+LONGEST_PAUSE = 1800.0
+"""Longest gap within one flight, s; after a longer one an aircraft is on another flight."""
 
 
 def clean_flight(
@@ -54,16 +54,16 @@ def clean_flight(
     """Cut one flight into pieces.
 
     Args:
-        name: of the flight.
-        rows: with the columns time (s), x, y (m) and perhaps vx, vy (m/s); where positions came as latitude and
-            longitude these too; ground, whether it is on the ground.
-        limits: what it may look like.
+        name: name of the flight.
+        rows: table with the columns time (s), x, y (m), ground (true for rows on the ground), optionally vx, vy (m/s),
+            and latitude and longitude if positions were given so.
+        limits: limits of a flight.
 
     Returns:
-        The pieces, and how much of what ``CLEANING_COUNTS`` names there was.
+        The pieces, and the counts of ``CLEANING_COUNTS``.
 
     Raises:
-        ValueError: if it cannot be a flight, with the likely cause.
+        ValueError: if the rows cannot be a flight, with the likely cause.
     """
     counts = dict.fromkeys(CLEANING_COUNTS, 0)
 
@@ -75,7 +75,7 @@ def clean_flight(
     degrees = [column for column in ("latitude", "longitude") if column in rows]
     rates = [column for column in ("vx", "vy") if column in rows]
     if degrees:
-        # A receiver repeats the last position where it has no new one, and the altitude goes on.
+        # A receiver repeats the last position where it has no new one, while the altitude changes.
         rows = rows.assign(repeated=(rows[degrees].diff() == 0.0).all(axis=1))
     keep(~rows["ground"], "ground")
     keep(rows[["x", "y", *rates]].notna().all(axis=1), "missing")
@@ -102,7 +102,7 @@ def clean_flight(
     ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
     parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
     long = [part for part in parts if part.stop - part.start > 1]
-    begins = [True, *(time[b.start] - time[a.stop - 1] > LANDED for a, b in itertools.pairwise(long))]
+    begins = [True, *(time[b.start] - time[a.stop - 1] > LONGEST_PAUSE for a, b in itertools.pairwise(long))]
     flights = numpy.cumsum(begins).tolist()
     pieces = []
     for number, (part, flight) in enumerate(zip(long, flights, strict=True), 1):
@@ -116,7 +116,7 @@ def clean_flight(
 
 
 def _arrays(rows: "pandas.DataFrame") -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray | None]:
-    """Times ``(n,)``, positions and velocities ``(n, 2)``."""
+    """Return times ``(n,)``, positions and velocities ``(n, 2)``."""
     # In the order of rows in memory, on which the last bit of a fit depends.
     pairs = [
         numpy.ascontiguousarray(rows[[*pair]].to_numpy())
@@ -127,18 +127,18 @@ def _arrays(rows: "pandas.DataFrame") -> tuple[numpy.ndarray, numpy.ndarray, num
 
 
 FEWEST_IN_WINDOW = 5
-"""Positions that a parabola is fitted to at least."""
+"""Smallest number of positions in a fit of a parabola."""
 
 
 def fit_parabolas(
     time: numpy.ndarray, position: numpy.ndarray, half_width: float
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Position and velocity of the parabolas that fit best around each time.
+    """Return position and velocity of the parabolas fitted by least squares around each time.
 
     Args:
         time: s, ``(n,)``, n >= ``FEWEST_IN_WINDOW``.
         position: m, ``(n, 2)``.
-        half_width: of the window on either side, s; where it holds few positions it is as wide as it takes.
+        half_width: half the width of the window, s; a window with few positions is widened.
     """
     count = len(time)
     row = numpy.arange(count)

@@ -1,6 +1,6 @@
-"""Tables of flights and of recordings in files, read by the names of their columns.
+"""Readers of tables of flights and of recordings, by the names of their columns.
 
-Read whole or not at all, through the door for files from outside (:mod:`.foreign_files`).
+A file is read completely or rejected, with the limits of :mod:`.foreign_files`.
 """
 
 import csv
@@ -33,11 +33,11 @@ if TYPE_CHECKING:  # imported where they are used: `import filtergym` takes neit
     import xarray
 
 FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz", *RECEIVER_READERS)
-"""Files that can be read."""
+"""Suffixes of the files that can be read."""
 MOST_ROWS = 1_000_000
-"""Of a file: a day of one target at ten a second; more would not leave room for anything else in memory."""
+"""Largest number of rows of a file: a day of one target at ten a second; more would fill the memory."""
 LONGEST_LINE = 1_000_000
-"""Characters of a row of CSV."""
+"""Longest row of CSV, characters."""
 EXTRA = "pip install 'filtergym[flights]'"
 
 COLUMNS: Mapping[str, tuple[str, ...]] = {
@@ -52,29 +52,29 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "flight": ("flight_id", "icao24", "callsign"),
     "ground": ("onground", "on_ground"),
 }
-"""What is read, and the names under which it is known, the first one that a file has; upper and lower case are alike.
+"""Columns and their accepted names: the first that a file has is read; case does not matter.
 
 ``time`` in seconds, in ISO 8601 or as dates of any resolution; ``x``, ``y`` in metres, ``vx``, ``vy`` in m/s; or
-latitude and longitude in degrees, altitude in metres. The state vectors of OpenSky are of this form. Of the Python
-package ``traffic``, known by its ``groundspeed``, altitudes are feet. Rows of one ``flight`` belong together, in the
-order of their times; rows on the ``ground`` are not flown.
+latitude and longitude in degrees, altitude in metres. The state vectors of OpenSky have this form. Files of the Python
+package ``traffic``, recognised by ``groundspeed``, have altitudes in feet. Rows of one ``flight`` belong together, in
+the order of their times; rows on the ``ground`` are left out.
 """
 FOOT = 0.3048
 DELIMITERS = ",;\t"
-"""Of cells in CSV: the first of these that the line of names has."""
+"""Delimiters of cells in CSV: the first of these in the line of names applies."""
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 DATE = re.compile(
     r"(?:(?P<y>\d{4})/(?P<m>\d{1,2})/(?P<d>\d{1,2})|(?P<D>\d{1,2})\.(?P<M>\d{1,2})\.(?P<Y>\d{4}))(?=[ T]|$)"
 )
-"""Year/month/day, or day.month.year."""
+"""Dates as year/month/day or day.month.year."""
 CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:\.\d+)?)")
 OFFSET = r":\d{2}.*(?:[Zz]|[+-]\d{2}(?::?\d{2})?)$"
-"""Of local time from UTC, at the end of a date."""
+"""Offset of local time from UTC, at the end of a date."""
 DAY = 86400.0
 COUNTERS = (2.0**32, 2.0**32 / 1e3, 2.0**32 / 1e6)
-"""After which counters of 32 bits start again, in their unit, or in s of those of milli- and microseconds."""
+"""Ranges after which counters of 32 bits restart, in their unit, or in s for milli- and microseconds."""
 COUNTER_SHARE = 0.01
-"""Of such a time, that may lie between two rows."""
+"""Largest step between two rows at a restart, as a share of the range."""
 UNITS: Mapping[str, tuple[str, ...]] = {
     "time": ("s", "second", "seconds", "sec"),
     "x": ("m", "metre", "metres", "meter", "meters"),
@@ -83,27 +83,27 @@ UNITS: Mapping[str, tuple[str, ...]] = {
     "vy": ("m/s", "m s-1", "m s^-1", "m s**-1"),
     "altitude": ("m", "metre", "metres", "meter", "meters"),
 }
-"""Units that a NetCDF variable may say it has."""
+"""Accepted units of NetCDF variables."""
 
 
 class FlightTable(NamedTuple):
-    """What was read of a file."""
+    """Columns, names and notes from a file."""
 
     columns: "pandas.DataFrame"
-    """Those that are known, by their names in lower case; what is empty is missing."""
+    """Known columns by their names in lower case; empty cells are missing values."""
     names: list[str]
-    """Of all columns that the file has."""
+    """Names of all columns of the file."""
     notes: tuple[str, ...] = ()
-    """What is to be told of the reading, a line each."""
+    """Notes on the reading, one line each."""
 
 
 class ColumnNames(frozenset[str]):
-    """Names of the columns that are read, in lower case, and of those that begin with ``prefix``, if there is one."""
+    """Names of the columns that are read, in lower case, and the prefix of further ones, if there is one."""
 
     prefix: str
 
     def __new__(cls, names: Iterable[str], prefix: str = "") -> "ColumnNames":
-        """Make them of names."""
+        """Create the set from names and a prefix."""
         found = super().__new__(cls, names)
         found.prefix = prefix
         return found
@@ -113,7 +113,7 @@ class ColumnNames(frozenset[str]):
 
     @property
     def request(self) -> dict[str, Any]:
-        """As a parser takes them."""
+        """Return the names in the form of a parser's arguments."""
         return {"names": sorted(self), "prefix": self.prefix}
 
 
@@ -142,10 +142,10 @@ def _csv(file: Path, known: ColumnNames) -> FlightTable:
 
 
 def _bounded_lines(text: TextIO) -> Iterator[str]:
-    """Lines of a text.
+    """Return the lines of a text.
 
     Raises:
-        ValueError: for one that no row is as long as.
+        ValueError: for a line longer than ``LONGEST_LINE``.
     """
     while line := text.readline(LONGEST_LINE):
         if len(line) == LONGEST_LINE:
@@ -154,7 +154,7 @@ def _bounded_lines(text: TextIO) -> Iterator[str]:
 
 
 def _replace_decimal_commas(cells: Sequence[str]) -> Sequence[str]:
-    """Return the cells of a column with points in place of decimal commas, if it is numbers and none has a point."""
+    """Return the cells with points for decimal commas, if the column has commas and no points."""
     if not any("," in cell for cell in cells) or any("." in cell for cell in cells):
         return cells
     return [cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in cells]
@@ -166,10 +166,10 @@ def open_netcdf(file: Path, wanted: ColumnNames | None = None, **decoding: Any) 
     Args:
         file: its path.
         wanted: names of the variables that are read, others are empty; None: all are read.
-        **decoding: as of ``xarray.decode_cf``, which applies what attributes say of offsets, dates and missing values.
+        **decoding: arguments of ``xarray.decode_cf``, which applies the attributes for offsets, dates, missing values.
 
     Raises:
-        ValueError: if it is none, breaks a limit, or needs a package that is not installed.
+        ValueError: if the file is not NetCDF, exceeds a limit, or needs a package that is not installed.
     """
     import xarray
 
@@ -190,7 +190,7 @@ def netcdf_attribute_names(file: Path) -> list[str]:
     """Return the names of the attributes of a NetCDF file.
 
     Raises:
-        ValueError: if it is none, or needs a package that is not installed.
+        ValueError: if the file is not NetCDF, or needs a package that is not installed.
     """
     if _is_hdf(file):
         found: list[str] = parse_apart("netcdf4_names", file, EXTRA)["names"]
@@ -199,7 +199,7 @@ def netcdf_attribute_names(file: Path) -> list[str]:
 
 
 def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xarray.Dataset":
-    """Read a NetCDF file as it stands there; arguments and errors as of :func:`open_netcdf`."""
+    """Read a NetCDF file without decoding."""
     import xarray
 
     if not _is_hdf(file):
@@ -225,14 +225,14 @@ def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xa
         if isinstance(values, dict):
             cells = numpy.array(values["words"], dtype=object)
             values = cells.reshape(values["shape"])
-        if values is None:  # its name is all that is wanted
+        if values is None:  # only the name is needed
             dimensions, values = [], numpy.nan
         variables[name] = (dimensions, values, _plain_attributes(attributes))
     return xarray.Dataset(variables, attrs=_plain_attributes(found["attrs"]))
 
 
 def _plain_attributes(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return attributes by their names, single numbers as such."""
+    """Return the attributes, with arrays of one number as that number."""
     return {
         name: value[()] if isinstance(value, numpy.ndarray) and value.ndim == 0 else value
         for name, value in pairs
@@ -273,7 +273,6 @@ def _parquet(file: Path, known: ColumnNames) -> FlightTable:
 
 
 def _parquet_column(column: Mapping[str, Any]) -> Any:
-    """Return numbers, dates or words of a column."""
     import pandas
 
     if "codes" in column:
@@ -288,7 +287,7 @@ def _parquet_column(column: Mapping[str, Any]) -> Any:
 def _json(file: Path, known: ColumnNames) -> FlightTable:
     import pandas
 
-    most = limits().memory // 3  # a text, and what it is made of
+    most = limits().memory // 3  # the text and the objects made from it
     with open_foreign(file, limits().memory) as content:
         text = (gzip.GzipFile(fileobj=content) if file.suffix == ".gz" else content).read(most + 1)
     if len(text) > most:
@@ -305,7 +304,7 @@ def _json(file: Path, known: ColumnNames) -> FlightTable:
         if len(seen) > MOST_COLUMNS:
             break
     names = [*seen]
-    # Only what is known: a row with names that no other has would be a column of a million empty cells.
+    # Only known names: a name that a single row has would make a column of a million empty cells.
     chosen = {n: lower for n, lower in zip(names, check_column_names(names), strict=True) if lower in known}
     if isinstance(rows, list):
         found = pandas.DataFrame({n: [row.get(n, math.nan) for row in rows] for n in chosen})
@@ -325,7 +324,7 @@ _COLUMN_OF_ALIAS = {alias: name for name, aliases in COLUMNS.items() for alias i
 
 
 def suffix_of(file: Path) -> str:
-    """Last part of a file's name, ``.json.gz`` for one; empty if it is not of a file of flights."""
+    """Return the suffix of a file, such as ``.json.gz``; empty if it is none of ``FLIGHT_SUFFIXES``."""
     return next((suffix for suffix in FLIGHT_SUFFIXES if file.name.endswith(suffix)), "")
 
 
@@ -333,11 +332,11 @@ def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTab
     """Read the known columns of a file.
 
     Args:
-        file: of one of ``FLIGHT_SUFFIXES``.
+        file: path with one of ``FLIGHT_SUFFIXES``.
         known: names in lower case; default: those of flights.
 
     Raises:
-        ValueError: if it cannot be read, or is too large.
+        ValueError: if the file cannot be read, or is too large.
     """
     try:
         if not suffix_of(file):
@@ -345,25 +344,25 @@ def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTab
         wanted = known if isinstance(known, ColumnNames) else ColumnNames(known)
         table = _READERS[suffix_of(file)](file, wanted)
         for name, cells in table.columns.items():
-            if cells.dtype.kind == "O":  # words, whatever pandas keeps them in
+            if cells.dtype.kind == "O":  # text, in any dtype of pandas
                 check_cells(str(name), cells)
         return table
     except UnicodeDecodeError as error:
         raise ValueError("it is no text in UTF-8: save it as such (a spreadsheet: CSV UTF-8)") from error
-    except Exception as error:  # readers raise whatever a broken file makes them stumble over
+    except Exception as error:  # readers raise any error for a broken file
         raise ValueError(str(error) or type(error).__name__) from error
 
 
 def list_names(names: Sequence[str], most: int = 20) -> str:
-    """Return names in a row, and how many more there are."""
+    """Return the first names as text, with the number of the others."""
     return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")
 
 
 def flight_columns(table: FlightTable) -> tuple["pandas.DataFrame", bool]:
-    """Return the columns of a flight by what they are, and whether altitudes are feet.
+    """Return the columns of a flight by their standard names, and whether altitudes are in feet.
 
     Raises:
-        ValueError: if one is missing.
+        ValueError: if a column is missing.
     """
     there = {
         name: [alias for alias in aliases if alias in table.columns] for name, aliases in COLUMNS.items()
@@ -384,10 +383,10 @@ def flight_columns(table: FlightTable) -> tuple["pandas.DataFrame", bool]:
 
 
 def numbers(name: str, values: "pandas.Series") -> "pandas.Series":
-    """Return a column as numbers; what is empty is NaN.
+    """Return a column as numbers; empty cells are NaN.
 
     Raises:
-        ValueError: for words.
+        ValueError: for a cell that is no number.
     """
     import pandas
 
@@ -412,12 +411,12 @@ def _is_number(cell: Any) -> bool:
 
 
 def is_true(values: "pandas.Series") -> "pandas.Series":
-    """Return which rows say that something is true, in words or as a number; what says nothing does not."""
+    """Return the mask of rows with a true value, as text or as a number; an empty cell is false."""
     return values.astype(str).str.strip().str.lower().isin(["true", "1", "1.0"])
 
 
 def _rewrite_date(date: Any) -> str:
-    """Return a date in the form of ISO 8601, if it is one in another that cannot be misread."""
+    """Return a date in ISO 8601 if it has another unambiguous form, otherwise unchanged."""
     word = re.sub(r"(:\d{2}),(\d)", r"\1.\2", str(date).strip())
     found = DATE.match(word)
     if found is None:
@@ -427,10 +426,10 @@ def _rewrite_date(date: Any) -> str:
 
 
 def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
-    """Times of day in seconds, on through midnight.
+    """Return the times of day in seconds, continued through midnight.
 
     Raises:
-        ValueError: for what is none.
+        ValueError: for a value that is no time of day.
     """
     found = values.map(CLOCK.fullmatch)
     if found.isna().any():
@@ -443,14 +442,15 @@ def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
 
 
 def clock_seconds(values: "pandas.Series") -> tuple[str, numpy.ndarray]:
-    """Times in seconds by a clock that other files have, too, and which: ``dates``, since 1970, ``times of day``, since
-    midnight, or ``seconds`` as they are; of dates to a microsecond.
+    """Return the kind of clock and the times in seconds, which are comparable between files.
+
+    The kinds are ``dates``, since 1970, to a microsecond; ``times of day``, since midnight; and ``seconds`` as given.
 
     Args:
-        values: times as of :func:`seconds`, numbers from 1e8 on are since 1970.
+        values: times in any form of :func:`seconds`; numbers from 1e8 on count since 1970.
 
     Raises:
-        ValueError: for what is no time.
+        ValueError: for a value that is no time.
     """
     import pandas
 
@@ -470,18 +470,18 @@ def clock_seconds(values: "pandas.Series") -> tuple[str, numpy.ndarray]:
 
 
 def describe_time(clock: str, time: float) -> str:
-    """Write a time of :func:`clock_seconds` for people."""
+    """Return a time of :func:`clock_seconds` as readable text."""
     if clock != "dates":
         return f"{time:g} s"
     return str(numpy.datetime64(round(time), "s"))
 
 
 def check_order(time: numpy.ndarray, written: numpy.ndarray | None = None) -> None:
-    """Raise ValueError for times that decrease, with both times and what to do.
+    """Raise ValueError for times that decrease, with both times and advice.
 
     Args:
         time: s, ``(rows,)``.
-        written: as they stand in the file, likewise; default: the same.
+        written: times as written in the file, ``(rows,)``; default: ``time``.
     """
     steps = numpy.diff(time)
     if (steps < 0.0).any():
@@ -500,22 +500,22 @@ def check_order(time: numpy.ndarray, written: numpy.ndarray | None = None) -> No
 
 
 def _counter_turn(step: float) -> float | None:
-    """Return the range of the counter that starts again at a step of time, s; None at other steps."""
+    """Return the range of the counter that restarts at a step of time, s; None at other steps."""
     return next((turn for turn in COUNTERS if abs(step + turn) < COUNTER_SHARE * turn), None)
 
 
 def sort_by_time(
     table: "pandas.DataFrame", times: "pandas.Series", group: numpy.ndarray | None = None
 ) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Sort the rows of a table by time; those of a counter that starts again stay as they are.
+    """Sort the rows of a table by time; those of a counter that restarts are not sorted.
 
     Args:
         table: rows, numbered from zero.
-        times: of the rows, as they are written.
-        group: number of the recording that each row is of, ``(rows,)``; default: all are of one.
+        times: times of the rows, as written.
+        group: number of the recording of each row, ``(rows,)``; default: one recording.
 
     Returns:
-        The rows, those of a recording one after the other, and a sentence on how many were late, if any was.
+        The rows, grouped by recording, and a note with the number of rows out of order, if any.
     """
     import pandas
 
@@ -530,14 +530,14 @@ def sort_by_time(
 
 
 def seconds(values: "pandas.Series") -> "pandas.Series":
-    """Times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
+    """Return the times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
 
-    Times of day that come back by more than half a day are those of the next one. Dates are ISO 8601, with an offset
+    Times of day that decrease by more than half a day are those of the next day. Dates are ISO 8601, with an offset
     from UTC or without, or year/month/day or day.month.year and a time of day. Numbers too large for seconds since 1970
     are milli-, micro- or nanoseconds since then.
 
     Raises:
-        ValueError: for what is neither.
+        ValueError: for a value in none of these forms.
     """
     import pandas
 
@@ -549,10 +549,10 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
 
 
 def _parse_times(values: "pandas.Series") -> tuple["pandas.Series", float]:
-    """Return dates, lengths of time, or numbers, and how many of these are a second.
+    """Return dates, time differences, or numbers, and the number of these units in a second.
 
     Raises:
-        ValueError: for what is none.
+        ValueError: for a value that is no time.
     """
     import pandas
 

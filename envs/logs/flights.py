@@ -1,12 +1,13 @@
-"""Recorded flights from files: read by the names of their columns, put around the radar, cleaned and cut into pieces.
+"""Recorded flights from files: read by column names, projected to the radar's plane, cleaned and cut into pieces.
 
-What a file may hold stands in :mod:`.flight_tables`. Latitude and longitude become metres east and north of the
-radar's site, in the plane that touches the ellipsoid there. Own code, because it is a rotation of Earth-fixed
-coordinates that the satellites need anyway; a geodesy library is the oracle of its tests.
+:mod:`.flight_tables` lists the accepted columns. Latitude and longitude become metres east and north of the
+radar's site, in the plane that touches the ellipsoid there. The package has its own
+projection, because it is a rotation of Earth-fixed coordinates that the satellites need anyway; the tests compare it
+with a geodesy library.
 
-A file is never believed (:mod:`.flight_cleaning`): a flight whose speed cannot be that of a target is refused with the
-likely cause, a single position far off the track is taken out, and a track is cut where it jumps or where nothing was
-received for long. What was done is told in one line a file.
+Every file is checked (:mod:`.flight_cleaning`): a flight with an impossible speed is an error with the likely cause, a
+single position far off the track is removed, and a track is cut where it jumps or has a long gap. A note of one line a
+file lists these changes.
 """
 
 import difflib
@@ -44,25 +45,25 @@ if TYPE_CHECKING:
 
 
 class FlightSource(NamedTuple):
-    """One file, or one trajectory of a sequence, and what has become of it."""
+    """One file, or one trajectory of a sequence, with notes on its use."""
 
     name: str
     trajectories: tuple[Trajectory, ...]
     notes: tuple[str, ...] = ()
-    """What was cut: "2 gaps over 60 s"."""
-    wrong: str = ""
-    """Why nothing of it is used; empty if something is."""
+    """Cuts and removed rows, such as "2 gaps over 60 s"."""
+    reason: str = ""
+    """Reason why nothing of it is used; empty if something is."""
 
 
 @dataclass(frozen=True)
 class Flights(FlightData):
-    """A set of flights of which every episode flies one, drawn with equal probability.
+    """A set of flights, of which every episode replays one, drawn with equal probability.
 
     Args:
         trajectories: the pieces that can be flown.
-        name: what reports call the set.
+        name: name of the set in reports.
         fewest_scans: pieces that last fewer sampling intervals are dropped.
-        sources: what they were read from.
+        sources: files or trajectories that the pieces come from.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -87,19 +88,19 @@ class Flights(FlightData):
             object.__setattr__(self, "sources", found)
 
     def fields(self) -> dict[str, Any]:
-        """Return its trajectories and what else makes the same set."""
+        """Return the trajectories and the other arguments that make the same set."""
         flown = [trajectory.fields() for trajectory in self.trajectories]
         return {"trajectories": flown, "name": self.name, "fewest_scans": self.fewest_scans}
 
     def flyable(self, interval: float, farthest: float) -> tuple[list[Trajectory], list[str]]:
-        """Return the pieces that can be flown, and what is to be told of every source, a line each.
+        """Return the pieces that can be flown, and a note on every source, one line each.
 
         Args:
             interval: sampling interval, s.
-            farthest: from the radar, m.
+            farthest: largest distance from the radar, m.
 
         Raises:
-            ValueError: if there are none.
+            ValueError: if no piece can be flown.
         """
         used, lines = [], []
         for source in self.sources:
@@ -120,8 +121,8 @@ class Flights(FlightData):
                 notes.append(f"{dropped} dropped (shorter than {self.fewest_scans} scans of {interval:g} s)")
             if far:
                 notes.append(f"{far}: left out (positions are metres)")
-            if source.wrong:
-                notes = [f"left out: {source.wrong}"]
+            if source.reason:
+                notes = [f"left out: {source.reason}"]
             elif not kept:
                 notes = [f"left out: {', '.join(notes)}"]
             if notes:
@@ -133,12 +134,12 @@ class Flights(FlightData):
 
 
 def flight_of(trajectory: Trajectory) -> str:
-    """Name of the flight that a trajectory is, or is a piece of."""
+    """Return the name of a trajectory's flight, of which it may be a piece."""
     return trajectory.flight or trajectory.name
 
 
 def _number_namesakes(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Number whole flights that have the same name: they are not pieces of one."""
+    """Number whole flights with the same name, which are not pieces of one flight."""
     names = [flight_of(trajectory) for trajectory in trajectories]
     return [
         replace(trajectory, name=f"{trajectory.name} {i}")
@@ -156,10 +157,10 @@ def _nothing(name: str, reasons: Sequence[str]) -> str:
 
 
 def flights_from(fields: Mapping[str, Any]) -> Flights:
-    """Return the set of flights whose fields a dictionary holds, as they come out of JSON.
+    """Return the set of flights from a dictionary of its fields, as JSON gives it.
 
     Raises:
-        ValueError: if there is an unknown field, or the trajectories are none.
+        ValueError: if there is an unknown field, or no valid list of trajectories.
     """
     known = {"trajectories", "name", "fewest_scans"}
     if not {"trajectories"} <= set(fields) <= known:
@@ -181,7 +182,7 @@ def flights_from(fields: Mapping[str, Any]) -> Flights:
 
 
 def names_flights(source: Any) -> bool:
-    """Whether a scenario is the path of a file or folder of flights, a pattern of such, or a sequence of flights."""
+    """Return whether a scenario is a path or pattern of files of flights, a folder of them, or a sequence."""
     if isinstance(source, Path):
         return True
     if isinstance(source, str):
@@ -193,13 +194,13 @@ def names_flights(source: Any) -> bool:
 
 
 TRAFFIC = "traffic:"
-"""Before the name of a sample of the Python package ``traffic``."""
+"""Prefix of the name of a sample of the Python package ``traffic``."""
 
 
 def traffic_samples() -> dict[str, Path]:
-    """Files of the samples in the package ``traffic`` by their names; none where it is not installed.
+    """Return the sample files of the package ``traffic`` by their names; none if it is not installed.
 
-    It is not imported: that would bring a long chain of libraries, and the samples are JSON.
+    The package is not imported: that would import many libraries, and the samples are JSON.
     """
     found = importlib.util.find_spec("traffic")
     folders = list(found.submodule_search_locations or ()) if found else []
@@ -211,7 +212,7 @@ def traffic_samples() -> dict[str, Path]:
 
 
 def _traffic_sample(name: str) -> Path:
-    """File of a sample in the package ``traffic``.
+    """Return the path of a sample in the package ``traffic``.
 
     Raises:
         ValueError: if there is no such sample, or no such package.
@@ -230,10 +231,10 @@ def _traffic_sample(name: str) -> Path:
 
 
 def files_of(source: str | Path) -> list[Path]:
-    """Files that a path or a pattern stands for, in the order of their names.
+    """Return the files of a path, folder or pattern, in the order of their names.
 
     Raises:
-        ValueError: for what is no path, and where there are none.
+        ValueError: if it is no path, or matches no files.
     """
     if not isinstance(source, str | Path):
         raise ValueError(
@@ -273,24 +274,24 @@ def read_flights(
 
     Args:
         source: a file (CSV, NetCDF, Parquet), a folder of such, a pattern such as ``"flights/*.csv"``, a
-            :class:`~.trajectory.Trajectory`, or a sequence of these. Trajectories are taken as they are.
+            :class:`~.trajectory.Trajectory`, or a sequence of these. Trajectories are used unchanged.
             ``"traffic:quickstart"`` is a sample of the Python package ``traffic``.
-        site: latitude and longitude of the radar, degrees; needed where files hold these and not x and y. That of a
-            sample is the median of its positions by default.
-        longest_gap: s; a track is cut where two positions are farther apart in time.
-        speeds: m/s; a flight whose median speed is outside is refused, and where it is faster from one position to
-            the next, the one position is taken out, or the track is cut.
-        reach: m; latitudes and longitudes farther from the site are taken out.
-        smoothing: s; positions and velocities are those of parabolas fitted to what lies this far on either side. Zero
-            takes positions as they are.
+        site: latitude and longitude of the radar, degrees; needed for files without x and y. The default for a
+            sample is the median of its positions.
+        longest_gap: longest time between two positions, s; a track is cut at longer ones.
+        speeds: limits of the median speed of a flight, m/s; a flight outside is an error. Where it is faster from one
+            position to the next, one position is removed, or the track is cut.
+        reach: largest distance of latitudes and longitudes from the site, m; farther ones are removed.
+        smoothing: half the width, s, of the window of positions for a parabola, which gives position and velocity. Zero
+            leaves positions unchanged.
         fewest_scans: pieces that last fewer sampling intervals of the environment are dropped.
 
     Returns:
-        What can be given as scenario: every episode flies one piece.
+        A set of flights for the argument ``scenario``: every episode replays one piece.
 
     Raises:
-        ValueError: if nothing can be used, or an argument is out of its limits. One broken file of several is left out
-            and named in the notes.
+        ValueError: if nothing can be used, or an argument is out of its limits. One broken file of several is skipped,
+            and the notes name it.
     """
     limits = Cleaning(_check_site(site), longest_gap, speeds, reach, smoothing)
     limits.check()
@@ -328,10 +329,10 @@ def read_flights(
             if len(files) + len(sources) == 1:
                 raise
             reason = str(error).partition(f"trajectory {file}: ")[2]
-            sources.append(FlightSource(_short(file, files), (), wrong=reason))
+            sources.append(FlightSource(_short(file, files), (), reason=reason))
     trajectories = tuple(t for s in sources for t in s.trajectories)
     if not trajectories:
-        raise ValueError(_nothing(name, [f"{s.name}: {s.wrong}" for s in sources]))
+        raise ValueError(_nothing(name, [f"{s.name}: {s.reason}" for s in sources]))
     return Flights(trajectories, name, fewest_scans, tuple(sources))
 
 
@@ -353,7 +354,7 @@ def _check_site(site: Any) -> tuple[float, float] | None:
 
 
 def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[FlightSource]:
-    """Read one file: a source for it, and one more for every flight in it that cannot be used.
+    """Read one file, with a source for it and one for every flight in it that cannot be used.
 
     Raises:
         ValueError: if nothing of it can be used.
@@ -408,13 +409,13 @@ def _flights_of(
         except ValueError as error:
             if len(groups) == 1:
                 raise
-            bad.append(FlightSource(f"{file.name}:{flight}", (), wrong=str(error)))
+            bad.append(FlightSource(f"{file.name}:{flight}", (), reason=str(error)))
             continue
         good += pieces
         for what, count in found.items():
             counts[what] += count
     if not good:
-        raise ValueError(_nothing(label, [f"{s.name}: {s.wrong}" for s in bad]))
+        raise ValueError(_nothing(label, [f"{s.name}: {s.reason}" for s in bad]))
     notes = [
         f"{count_of(count, *words)}{tail(limits)}"
         for (words, tail), count in zip(CLEANING_COUNTS.values(), counts.values(), strict=True)
@@ -428,15 +429,13 @@ def _flights_of(
 
 
 def _median_site(rows: "pandas.DataFrame") -> tuple[float, float]:
-    """Latitude and longitude in the middle of all positions, to a hundredth of a degree."""
+    """Return the median latitude and longitude of all positions, to a hundredth of a degree."""
     latitude, longitude = (round(float(rows[name].median()), 2) for name in ("latitude", "longitude"))
     return latitude, longitude
 
 
 def _by_flight(rows: "pandas.DataFrame", flight: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
-    """Rows of every flight of a file, by its name, in the order of their times; one without a name, and as they stand,
-    where the file names none.
-    """
+    """Return the rows of every flight by name, sorted by time; a single unsorted group if the file has no names."""
     if flight is None:
         return {"": rows}
     names = flight.astype(object).where(flight.notna(), "").astype(str).str.strip()
@@ -445,7 +444,6 @@ def _by_flight(rows: "pandas.DataFrame", flight: "pandas.Series | None") -> dict
 
 
 def _check_degrees(site: tuple[float, float] | None, rows: "pandas.DataFrame") -> None:
-    """Raise ValueError without a site, and for what are no degrees."""
     for name, most in (("latitude", 90.0), ("longitude", 360.0)):
         check_degrees(name, rows[name].to_numpy(), most)
     if site is None:
@@ -456,11 +454,11 @@ def _check_degrees(site: tuple[float, float] | None, rows: "pandas.DataFrame") -
 
 
 def _around(site: tuple[float, float], rows: "pandas.DataFrame") -> "pandas.DataFrame":
-    """Add metres east and north of a site to the degrees of one flight."""
+    """Add x and y, m east and north of a site, to the rows of one flight."""
     latitude, longitude = (numpy.radians(rows[name].to_numpy()) for name in ("latitude", "longitude"))
     altitude = numpy.zeros_like(latitude)
     if "altitude" in rows:
-        # A few rows lack it, and a kilometre of height moves a target by 0.016 % of its range.
+        # A few rows have no altitude, and a kilometre of height moves a target by 0.016 % of its range.
         filled = rows["altitude"].reset_index(drop=True).interpolate(limit_direction="both")
         altitude = filled.fillna(0.0).to_numpy()
     x, y = east_north(latitude, longitude, altitude, (math.radians(site[0]), math.radians(site[1])))

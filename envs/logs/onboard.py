@@ -1,11 +1,11 @@
-"""The positions that a vehicle's own filter estimated in flight, from the log of an autopilot.
+"""Positions that a vehicle's own filter estimated in flight, from the log of an autopilot.
 
 * PX4, ``.ulg``: metres north and east of a reference, of ``vehicle_local_position``, the estimate that flew, or of the
   first ``estimator_local_position``.
 * ArduPilot, ``.bin``: metres north and east of ``ORGN``, of ``XKF1`` (EKF3) or ``NKF1`` (EKF2), the first core.
 
-Both made these metres of latitude and longitude on a sphere. Here they become latitude and longitude again by the
-inverse, so that fixes and estimates can be put into one plane on the ellipsoid.
+Both autopilots project latitude and longitude to metres on a sphere. This module inverts the projection, so that fixes
+and estimates can be put into one plane on the ellipsoid.
 """
 
 from pathlib import Path
@@ -19,24 +19,24 @@ from .flight_tables import MOST_ROWS
 from .receiver_logs import DATAFLASH_SUFFIXES, EXTRA
 
 PX4_RADIUS = 6371000.0
-"""m, of PX4's sphere: ``CONSTANTS_RADIUS_OF_EARTH``."""
+"""Radius of PX4's sphere, m: ``CONSTANTS_RADIUS_OF_EARTH``."""
 ARDUPILOT_RADIUS = 6378100.0
-"""m, of ArduPilot's: ``LATLON_TO_M`` is 0.011131884502145 m for 1e-7 degrees."""
+"""Radius of ArduPilot's sphere, m: ``LATLON_TO_M`` is 0.011131884502145 m for 1e-7 degrees."""
 LONGEST_GAP = 1.0
-"""s between two estimates, over which none is interpolated."""
+"""Longest time between two estimates for interpolation, s."""
 
 
 class OnboardTrack(NamedTuple):
     """Positions that a vehicle's own filter estimated."""
 
     source: str
-    """Filter, autopilot and topic, in words."""
+    """Filter, autopilot and topic, as text."""
     time: numpy.ndarray
-    """s by the clock of the log, increasing, ``(n,)``."""
+    """Times by the clock of the log, s, increasing, ``(n,)``."""
     latitude: numpy.ndarray
-    """Degrees, ``(n,)``."""
+    """Latitude, degrees, ``(n,)``."""
     longitude: numpy.ndarray
-    """Degrees, ``(n,)``."""
+    """Longitude, degrees, ``(n,)``."""
 
     def at(self, time: numpy.ndarray, origin: PlaneOrigin) -> numpy.ndarray:
         """Return positions east and north of an origin at some times, m, ``(..., 2)``; NaN where there is no estimate
@@ -50,8 +50,10 @@ class OnboardTrack(NamedTuple):
 
 
 def read_onboard(path: Any) -> OnboardTrack | None:
-    """Read what the filter of the vehicle estimated; None of what is no single log of an autopilot, or holds none.
-    ValueError for a log of an autopilot that cannot be read.
+    """Return the track that the vehicle's filter estimated; None for other files, or a log without estimates.
+
+    Raises:
+        ValueError: if the log of an autopilot cannot be read.
     """
     file = Path(path) if isinstance(path, str | Path) else Path()
     if not file.is_file() or file.suffix not in (".ulg", *DATAFLASH_SUFFIXES):
@@ -67,7 +69,7 @@ def read_onboard(path: Any) -> OnboardTrack | None:
 def _px4_track(topic: str, fields: dict[str, numpy.ndarray]) -> OnboardTrack:
     """Invert the azimuthal equidistant projection of PX4's ``map_projection``."""
     valid = fields.get("xy_valid", numpy.ones(len(fields["timestamp"]))) > 0
-    # The sample that the estimate is of; the time of its publication is some ms later.
+    # Time of the sample of the estimate; its publication is some ms later.
     time, x, y, latitude, longitude = (
         fields[name][valid].astype(float)
         for name in (
@@ -87,8 +89,9 @@ def _px4_track(topic: str, fields: dict[str, numpy.ndarray]) -> OnboardTrack:
 
 
 def _ardupilot_track(topic: str, estimates: numpy.ndarray, origins: numpy.ndarray) -> OnboardTrack | None:
-    """Add metres north and east to the origin in force, of which type 0 is the filter's; times in us, ``(3, n)`` and
-    ``(4, m)``.
+    """Add metres north and east to the origin in force.
+
+    Estimates ``(3, n)`` and origins ``(4, m)`` have times in us; origins of type 0 are those of the filter.
     """
     origins = origins[:, origins[1] == 0.0]
     if not origins.size:
@@ -105,7 +108,6 @@ def _ardupilot_track(topic: str, estimates: numpy.ndarray, origins: numpy.ndarra
 def _in_order(
     source: str, time: numpy.ndarray, latitude: numpy.ndarray, longitude: numpy.ndarray
 ) -> OnboardTrack:
-    """Return the finite rows whose times increase."""
     whole = numpy.isfinite([time, latitude, longitude]).all(axis=0)
     latest = numpy.maximum.accumulate(numpy.append(-numpy.inf, numpy.where(whole, time, -numpy.inf)))[:-1]
     whole &= time > latest

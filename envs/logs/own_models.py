@@ -1,7 +1,7 @@
-"""Tables of measurements as those of a state-space model: a column for each number that h returns, and for each input.
+"""Tables of measurements of a state-space model: a column for each number that h returns, and for each input.
 
-An input acted since the row before; where a cell is empty the last one held on. The track starts with the model's mean
-and covariance one interval before the first row, as in the simulation.
+An input acted since the previous row; where a cell is empty the last value remains in force. The track starts
+with the model's mean and covariance one interval before the first row, as in the simulation.
 """
 
 import functools
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """Measurements that may be missing between two rows."""
-OF_EPISODES = (
+SIMULATION_PARAMETERS = (
     "horizon",
     "decision_interval",
     "jitter",
@@ -28,15 +28,15 @@ OF_EPISODES = (
     "availability",
     "late",
 )
-"""Parameters of a simulation, which a log has not."""
+"""Parameters of a simulation only, which do not apply to a log."""
 
 
 def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping[str, Any]) -> LogFormat:
-    """Tables of a state-space model.
+    """Return the log format of a state-space model.
 
     Args:
         definition: the models.
-        defaults: parameters that the author has set.
+        defaults: parameters of the task.
     """
     one = len(definition.filters) == 1
     columns = {name.lower(): unit for name, unit in definition.measured.items()}
@@ -64,19 +64,19 @@ def _read(
     defaults: Mapping[str, Any],
     columns: Columns,
 ) -> TrackLog:
-    """Make measurements of one track.
+    """Return the measurements of one track.
 
     Raises:
-        ValueError: for what lacks or cannot be.
+        ValueError: if a column is missing or a value is not possible.
     """
     names, inputs = ([name.lower() for name in part] for part in (definition.measured, definition.inputs))
     lacking = [name for name in (*names, *inputs) if not columns.has(name)]
     if lacking:
         raise ValueError(
             f"it lacks the column {', '.join(lacking)}; it needs time, {', '.join((*names, *inputs))}, empty where "
-            f"nothing came; if it has another name, say --rename 'NAME={lacking[0]}'"
+            f"nothing was received; if it has another name, give --rename 'NAME={lacking[0]}'"
         )
-    known = {name: value for name, value in defaults.items() if name not in OF_EPISODES}
+    known = {name: value for name, value in defaults.items() if name not in SIMULATION_PARAMETERS}
     parameters = {name: value for name, value in known.items() if name not in columns.given}
     timed = definition.world[0].timed
     typical: dict[str, float] = {}
@@ -109,26 +109,26 @@ def _read(
 def _check_noise(
     definition: "StateSpaceDefinition", made: Mapping[str, numpy.ndarray], rows: numpy.ndarray, usual: float
 ) -> None:
-    """Raise ValueError for a row that makes R of a sensor no covariance, such as an accuracy of zero."""
+    """Raise ValueError for a row that makes R of a sensor not positive definite, such as an accuracy of zero."""
     count = len(rows)
     interval = made.get("interval", numpy.full(count, usual))
     inputs = made.get("inputs", numpy.zeros((count, 0)))
     found = find_invalid_noise(definition, made["available"].T, interval, inputs.T)
     if found is not None:
-        said = ", ".join(
+        values = ", ".join(
             f"{name} is {value:g}" for name, value in zip(definition.inputs, inputs[found.place], strict=True)
         )
         raise ValueError(
-            f"R of {found.sensor} must be positive definite, and in row {rows[found.place]}, where {said}, it is "
+            f"R of {found.sensor} must be positive definite, and in row {rows[found.place]}, where {values}, it is "
             f"{found.R}: leave the cells of a sensor empty where its noise is not known"
         )
 
 
 def _hold(name: str, given: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
-    """An input at every measurement, ``(T,)``: where the rows do not say it the last one, and before all the first.
+    """Return an input at every measurement, ``(T,)``, with empty cells filled forward, then backward.
 
     Raises:
-        ValueError: where no row says it.
+        ValueError: if no row has a value.
     """
     there = numpy.isfinite(given)
     if not there.any():
@@ -139,7 +139,7 @@ def _hold(name: str, given: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray
 
 
 def _fill_gaps(time: numpy.ndarray, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Row of every measurement of a model that moves by one interval, -1 where there is none, and the times, s.
+    """Return the row of every measurement at a fixed interval, -1 where there is none, and the times, s.
 
     Raises:
         ValueError: for rows that are not whole intervals apart.
@@ -151,7 +151,7 @@ def _fill_gaps(time: numpy.ndarray, interval: float) -> tuple[numpy.ndarray, num
         row = int(wrong.argmax())
         raise ValueError(
             f"the model moves by {interval:g} s from one measurement to the next, and row {row + 1} is "
-            f"{time[row + 1] - time[row]:g} s after row {row}: say --set sampling_interval=SECONDS if the model is "
+            f"{time[row + 1] - time[row]:g} s after row {row}: give --set sampling_interval=SECONDS if the model is "
             "made for another one, or write f(x, dt) and Q(dt), which take any time"
         )
     places = numpy.append(0, numpy.cumsum(steps)).astype(int)
@@ -161,7 +161,7 @@ def _fill_gaps(time: numpy.ndarray, interval: float) -> tuple[numpy.ndarray, num
 
 
 def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any) -> TrackStart:
-    """Refuse to start from measurements: a track starts where the model says."""
+    """Raise ValueError: a track starts from the mean and covariance of the model."""
     raise ValueError(
         "it lacks initial_mean and initial_covariance, and the model does not start from measurements"
     )
@@ -170,9 +170,7 @@ def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, pa
 def _predict(
     definition: "StateSpaceDefinition", mean: numpy.ndarray, measurement: Any, parameters: Any
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Measurement that the filters' model predicts from an estimate, and what was received, ``(m, ...)`` each; angles
-    by whole turns near what was predicted.
-    """
+    """Return the predicted and the received measurement, ``(m, ...)`` each, with angles on the nearest turn."""
     model = definition.filters[0]
     rows = [mean]
     rows += [measurement.interval[None]] if model.timed else []

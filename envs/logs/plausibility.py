@@ -1,8 +1,8 @@
-"""Whether what a file says of a track can be true: units, clocks, and positions that no target can reach.
+"""Plausibility checks of tracks in files: units, clocks, and positions that no target can reach.
 
-Flights (:mod:`.flight_cleaning`) and recordings (:func:`check_recording`) use these checks. What cannot be is refused
-in one sentence with the likely cause. What is possible and noteworthy becomes a note: nothing of a recording is changed
-or left out, because a sensor may have said it.
+Flights (:mod:`.flight_cleaning`) and recordings (:func:`check_recording`) use these checks. Impossible values raise an
+error of one sentence with the likely cause. Possible but noteworthy values give a note. The checks never change or drop
+rows of a recording, because a sensor may have measured them.
 """
 
 import difflib
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from ..contract.task import Task
     from ..data.recording import Recording
 
-HARDEST = 100.0
-"""m/s^2; no target accelerates more: ten g."""
-SMALLEST_STATED = 1e6
-"""Times that positions scatter as stated, above which what is stated is none: motion between fixes is 1e4 at most."""
+LARGEST_ACCELERATION = 100.0
+"""Largest acceleration of a target, m/s^2: ten g."""
+LARGEST_SCATTER_RATIO = 1e6
+"""Largest ratio of the scatter of positions to the stated deviation; motion between fixes gives 1e4 at most."""
 FEWEST = 10
-"""Values from which on noise is estimated."""
+"""Smallest number of values from which noise is estimated."""
 STANDING = 5.0
-"""Deviations, as stated, within which a target stands for all that one sees; one error in 1e5 is larger."""
+"""Stated deviations within which a target counts as standing still; one error in 1e5 is larger."""
 MOST_NOTES = 10
-"""Of a file; the rest is counted."""
+"""Largest number of notes of a file; further ones are only counted."""
 SPEED_UNITS = {"knots": 1.944, "km/h": 3.6, "feet per second": 3.281, "km/s": 1e-3}
-"""Numbers of a unit in one m/s."""
+"""Factors from m/s to other units of speed."""
 DEVIATIONS = ("sigma", "std", "stddev", "deviation", "variance", "var", "accuracy", "uncertainty", "rms")
-"""Words in the names of columns that say how large errors are."""
+"""Words in the names of columns that contain the size of errors."""
 NOISE_WORDS = (
     *DEVIATIONS,
     "sd",
@@ -52,15 +52,15 @@ NOISE_WORDS = (
 )
 """Words in the names of columns that state noise in any form."""
 NOISE_PARTS = ("sigma", "stddev", "deviation", "variance", "accuracy", "uncertainty", "hdop", "vdop", "pdop")
-"""The longest of them, which may also be a part of a word, as in ``horizontalAccuracy``."""
-LOUD = "WARNING: "
-"""How a note begins that no user may miss."""
+"""The longest of these words, which may also be parts of a word, as in ``horizontalAccuracy``."""
+WARNING_PREFIX = "WARNING: "
+"""Prefix of the most important notes."""
 WIDE_BEARINGS = 0.5
-"""Range of bearings from which on those within 2 pi may be radians."""
+"""Range of bearings above which bearings within 2 pi may be radians, rad."""
 
 
 def speeds_of(time: numpy.ndarray, position: numpy.ndarray) -> numpy.ndarray:
-    """Speed from each position ``(n, k)`` to the next, m/s, ``(n - 1,)``."""
+    """Return the speed from each position ``(n, k)`` to the next, m/s, ``(n - 1,)``."""
     return numpy.asarray(_length(numpy.diff(position, axis=0)) / numpy.diff(time))
 
 
@@ -80,12 +80,12 @@ def check_speed(
     Args:
         time: s, ``(n,)``, increasing.
         position: m, ``(n, k)``.
-        speeds: lowest and highest that are possible, m/s.
-        sigma: of the error of a position, m, which looks like speed.
-        moving: whether a target that stands still cannot be.
+        speeds: lowest and highest possible speed, m/s.
+        sigma: standard deviation of the error of a position, m, which adds apparent speed.
+        moving: whether the lowest speed applies, because the target cannot stand still.
 
     Raises:
-        ValueError: with the likely cause, if the median speed is out of the limits.
+        ValueError: with the likely cause, if the median speed is outside the limits.
     """
     speed = float(numpy.median(speeds_of(time, position)))
     step = float(numpy.median(numpy.diff(time)))
@@ -127,16 +127,16 @@ def check_speed(
 
 
 def check_velocity(what: str, time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray) -> None:
-    """Check that velocities are what exact positions say.
+    """Check velocities against the differences of exact positions.
 
     Args:
-        what: names of the velocities.
+        what: names of the velocities, for the error message.
         time: s, ``(n,)``.
         position: m, ``(n, k)``.
         velocity: m/s, ``(n, k)``.
 
     Raises:
-        ValueError: with the likely unit, if not.
+        ValueError: with the likely unit, if they disagree.
     """
     speed = float(numpy.median(speeds_of(time, position)))
     if not speed:
@@ -145,13 +145,13 @@ def check_velocity(what: str, time: numpy.ndarray, position: numpy.ndarray, velo
     if not 0.8 <= ratio <= 1.25:
         unit = next((unit for unit, factor in SPEED_UNITS.items() if abs(ratio / factor - 1.0) < 0.05), None)
         raise ValueError(
-            f"{what} are {ratio:.3g} times what the positions say: "
+            f"{what} are {ratio:.3g} times those of the positions: "
             + (f"are they {unit}?" if unit else "are they m/s, and the positions metres?")
         )
 
 
 def check_degrees(name: str, values: numpy.ndarray, most: float) -> None:
-    """Raise ValueError for angles beyond so many degrees."""
+    """Raise ValueError for angles beyond ``most`` degrees."""
     largest = float(numpy.nanmax(numpy.abs(values), initial=0.0))
     if largest > most:
         cause = ": is it metres?" if largest > 1000.0 else ""
@@ -161,16 +161,16 @@ def check_degrees(name: str, values: numpy.ndarray, most: float) -> None:
 
 
 def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma: float) -> list[str]:
-    """Check that bearings are degrees, and return what is noteworthy of them.
+    """Check that bearings are degrees, and return notes on them.
 
     Args:
-        name: of the column.
+        name: name of the column.
         time: s, ``(n,)``.
-        values: ``(n,)``, NaN where there is none.
+        values: bearings, ``(n,)``, NaN where there is none.
         sigma: stated standard deviation, degrees.
 
     Raises:
-        ValueError: for angles beyond a full turn, and for such that lie and scatter as radians do.
+        ValueError: for angles beyond a full turn, and for angles with the range and scatter of radians.
     """
     check_degrees(name, values, 360.0)
     there = numpy.isfinite(values)
@@ -182,7 +182,7 @@ def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma:
             f"{name} scatters by {scatter:.2g} degrees where {sigma:g} are stated, and stays within 2 pi: is it "
             "radians? else state its deviation"
         )
-    # Whose deviation is in radians, too, scatters as is stated: only a wide range gives it away.
+    # If the deviation is in radians, too, the scatter agrees with it: only a wide range shows the mistake.
     if numpy.nanmax(values) - numpy.nanmin(values) > WIDE_BEARINGS:
         return [
             f"{name} stays within 2 pi and is taken for degrees, as its deviation: if they are radians, convert both"
@@ -191,8 +191,12 @@ def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma:
 
 
 def check_extents(names: tuple[str, str], one: numpy.ndarray, other: numpy.ndarray) -> None:
-    """Raise ValueError if the one of two series of the same positions, ``(n, k)``, is metres and the other kilometres;
-    NaN where there is none.
+    """Raise ValueError if one of two series of the same positions is in metres and the other in kilometres.
+
+    Args:
+        names: names of the series.
+        one: ``(n, k)``, NaN where there is no position.
+        other: ``(n, k)``, NaN where there is no position.
     """
     extents = [
         _length(numpy.nanmax(values, axis=0) - numpy.nanmin(values, axis=0)) for values in (one, other)
@@ -205,7 +209,7 @@ def check_extents(names: tuple[str, str], one: numpy.ndarray, other: numpy.ndarr
 
 
 def check_interval(step: float, longest: float) -> None:
-    """Raise ValueError if times are farther apart than measurements of a sensor are, s."""
+    """Raise ValueError if the interval between times is longer than ``longest``, both in s."""
     if step > longest:
         raise ValueError(
             f"times are {step:g} s apart, and at most {longest:g} s are expected: are they milliseconds? else name "
@@ -216,12 +220,12 @@ def check_interval(step: float, longest: float) -> None:
 def find_outliers(
     time: numpy.ndarray, position: numpy.ndarray, reach: Callable[[numpy.ndarray], Any]
 ) -> numpy.ndarray:
-    """Return which positions lie off the track: too far from the one before and the next, which agree, ``(n,)``.
+    """Return the mask ``(n,)`` of positions too far from both neighbours, which are near each other.
 
     Args:
         time: s, ``(n,)``.
         position: m, ``(n, k)``.
-        reach: how far apart two positions can be that lie so many seconds apart, m.
+        reach: function from a time difference, s, to the largest possible distance, m.
     """
 
     def far(apart: int) -> numpy.ndarray:
@@ -235,8 +239,9 @@ def find_outliers(
 
 
 def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
-    """Deviation of values ``(n, k)`` from the line through their neighbours, each as large as their noise,
-    ``(n - 2, k)``.
+    """Return the deviation of values ``(n, k)`` from the line through their neighbours, ``(n - 2, k)``.
+
+    The deviations are scaled to the variance of the noise of the values.
     """
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, None]
     line = before * values[:-2] + (1.0 - before) * values[2:]
@@ -244,23 +249,25 @@ def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
-    """Deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3, from the median distance to the line
-    through their neighbours; at least what 64-bit numbers of their size can tell.
+    """Return the standard deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3.
+
+    It is estimated from the median distance to the line through the neighbours, and not below the resolution of 64-bit
+    numbers of that size.
     """
     scatter = 1.4826 * float(numpy.median(numpy.abs(_deviations(time, values))))
     return max(scatter, 1e-9 * float(numpy.abs(values).max(initial=0.0)), 1e-6)
 
 
 def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint: str = "") -> list[str]:
-    """Return the notes on columns of a table that nobody reads, the loud ones first.
+    """Return the notes on columns of a table that are not read, warnings first.
 
     Args:
-        names: of the columns, in lower case.
+        names: names of the columns, in lower case.
         known: names that are read.
-        noise_hint: how a column of noise is read, at the end of the sentence.
+        noise_hint: advice on the column of noise that is read, for the end of the note.
 
     Raises:
-        ValueError: for a name that is nearly a known one, or says how large errors are: who wrote it wants it read.
+        ValueError: for a name close to a known one, or of a column with the size of errors: its user expects it read.
     """
     given, known = list(names), list(known)
     ignored = [name for name in given if name not in known]
@@ -279,8 +286,8 @@ def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint:
     notes = []
     if noisy:
         notes.append(
-            f"{LOUD}column{'s' * (len(noisy) > 1)} {', '.join(noisy)} not read, and the name is one of noise: "
-            f"every filter takes the noise of its measurements from elsewhere{noise_hint and f'; {noise_hint}'}"
+            f"{WARNING_PREFIX}column{'s' * (len(noisy) > 1)} {', '.join(noisy)} not read, and the name is one of "
+            f"noise: every filter takes the noise of its measurements from elsewhere{noise_hint and f'; {noise_hint}'}"
         )
     if others:
         notes.append(f"not read: column{'s' * (len(others) > 1)} {', '.join(others)}")
@@ -288,12 +295,10 @@ def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint:
 
 
 def _words(name: str) -> list[str]:
-    """Words of the name of a column."""
     return re.split(r"[^a-z0-9]+", name)
 
 
 def _is_noise(name: str) -> bool:
-    """Whether the name of a column is one of noise."""
     return any(word in NOISE_WORDS for word in _words(name)) or any(part in name for part in NOISE_PARTS)
 
 
@@ -304,19 +309,19 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
     """Check every episode of a recording.
 
     Args:
-        recording: what was read.
-        task: that replays it.
-        speeds: lowest and highest that are possible, m/s; the lowest holds where targets always
+        recording: the recording.
+        task: the task that replays it.
+        speeds: lowest and highest possible speed, m/s; the lowest holds where targets always
             move, see :class:`.LogFormat`.
 
     Returns:
-        What is noteworthy, a line each.
+        Notes, one line each.
 
     Raises:
-        ValueError: for the first episode that cannot be true.
+        ValueError: for the first episode with impossible values.
     """
     world: Any = task.world  # a RecordedWorld
-    # Latitude and longitude have a known unit, and their receiver may stand.
+    # Latitude and longitude have a known unit, and their receiver may stand still.
     known_unit = "latitude" in recording.columns
     log_format = find_companion(task, LogFormat)
     moving = log_format is not None and log_format.targets_move and not known_unit
@@ -354,7 +359,7 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
 
 
 def limit_notes(notes: list[str]) -> list[str]:
-    """Return as many notes as somebody reads, and count the rest."""
+    """Return the first ``MOST_NOTES`` notes and the number of the others."""
     more = [f"and {len(notes) - MOST_NOTES:,} more notes"] * (len(notes) > MOST_NOTES)
     return [*notes[:MOST_NOTES], *more]
 
@@ -376,7 +381,7 @@ def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) ->
 
 
 def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.ndarray) -> None:
-    """Raise ValueError if the truth is nowhere near what was measured."""
+    """Raise ValueError if the truth is far from the measurements."""
     known = numpy.isfinite(truth).all(axis=1)
     if not known.any():
         return
@@ -400,11 +405,11 @@ def _check_scale(
     check_speed(time, position, speeds, float(numpy.median(sigma)), moving)
     if len(time) < FEWEST or known_unit:
         return
-    # From end to end: from one to the next a speed may be all noise.
+    # From first to last position: between neighbours the speed may be mostly noise.
     speed = float(_length(position[-1] - position[0]) / (time[-1] - time[0]))
     noise = 1.4826 * float(numpy.median(numpy.abs(_deviations(time, position))))
     stated = float(numpy.median(sigma)) / math.sqrt(position.shape[1])
-    if noise > SMALLEST_STATED * stated:
+    if noise > LARGEST_SCATTER_RATIO * stated:
         raise ValueError(
             f"positions scatter by {noise:.3g} m where {stated:.2g} m are stated: are the deviations metres? else "
             "leave them out, and they are fitted"
@@ -419,17 +424,17 @@ def _check_scale(
 def _notes(
     time: numpy.ndarray, position: numpy.ndarray, sigma: numpy.ndarray, number: numpy.ndarray, moving: bool
 ) -> list[str]:
-    """Return what is noteworthy of the measured positions of one episode.
+    """Return notes on the measured positions of one episode.
 
     Args:
         time: s, ``(n,)``.
         position: m, ``(n, k)``.
-        sigma: stated, m, ``(n,)``.
-        number: of each measurement.
-        moving: whether a target that stands still cannot be.
+        sigma: stated standard deviation, m, ``(n,)``.
+        number: number of each measurement.
+        moving: whether the target cannot stand still.
 
     Raises:
-        ValueError: if the clock jumped, and not the target.
+        ValueError: if the clock jumped and the target did not.
     """
     moved, steps = _length(numpy.diff(position, axis=0)), numpy.diff(time)
     step, error, notes = float(numpy.median(steps)), float(numpy.median(sigma)), []
@@ -440,7 +445,7 @@ def _notes(
     if moving and len(position) >= FEWEST and extent > 0.0 and still:
         notes.append(
             f"all positions lie within {extent:.3g} m, where errors of {error:.3g} m are stated: the target stands "
-            "still, and this log tells nothing of how it moves"
+            "still, and this log contains no information about its motion"
         )
     for gap in numpy.flatnonzero(steps > max(10.0 * step, 60.0)).tolist():
         where = f"between measurements {number[gap]} and {number[gap + 1]}"
@@ -451,14 +456,14 @@ def _notes(
                 "change, as in daylight saving time? Write times in UTC, or cut it there"
             )
         notes.append(f"nothing was received for {steps[gap]:,.0f} s {where}")
-    # What is usual nearby: noise is not the same everywhere.
+    # Compared with nearby steps, because noise varies along the track.
     around = numpy.pad(moved, (5, 4), mode="edge")
     nearby = numpy.median(numpy.lib.stride_tricks.sliding_window_view(around, 10), axis=1)
 
     def reach(elapsed: numpy.ndarray) -> numpy.ndarray:
         usual = numpy.maximum(nearby[: len(elapsed)], nearby[-len(elapsed) :])
         return numpy.asarray(
-            5.0 * usual * (elapsed / step).clip(1.0) + 20.0 * error + 0.5 * HARDEST * elapsed**2
+            5.0 * usual * (elapsed / step).clip(1.0) + 20.0 * error + 0.5 * LARGEST_ACCELERATION * elapsed**2
         )
 
     alone = find_outliers(time, position, reach)
@@ -477,6 +482,5 @@ def _notes(
 
 
 def _list_measurements(numbers: numpy.ndarray) -> str:
-    """Name some measurements, and count them."""
     shown = ", ".join(map(str, numbers[:5].tolist())) + ", ..." * (len(numbers) > 5)
     return f"measurement {shown} is" if len(numbers) == 1 else f"{len(numbers):,} measurements ({shown}) are"

@@ -1,4 +1,4 @@
-"""What a user gives in the place of a scenario: files of flights or of recorded measurements, and their fields."""
+"""Readers of files of flights or measurements that a user gives in place of a scenario."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -29,29 +29,30 @@ def read_recording(
     sort: bool = False,
     **keywords: Any,
 ) -> Recording:
-    """Read recorded measurements, and check whether they can be true (:mod:`.plausibility`).
+    """Read recorded measurements, and check their plausibility (:mod:`.plausibility`).
 
     Args:
-        path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
-            NetCDF, Parquet, JSON) with the columns that the environment knows, :class:`.LogFormat`, or of a log of
+        path: a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; a table (CSV,
+            NetCDF, Parquet, JSON) with the columns of the environment, :class:`.LogFormat`; or a log of
             a receiver (:mod:`.receiver_logs`), ``.pos``, ``.nmea``, ``.ulg`` or ``.bag``, for ManeuveringTarget. A
-            folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files are one recording, and a
-            broken one is left out and named in the notes.
-        environment: id of the environment that it is for; default: what the file says.
-        speeds: m/s; a recording whose median speed is outside is refused. The lowest holds in ManeuveringTarget only.
-        truth: path of the truth in a file of its own, a table or a log of a receiver, matched by time; a note says how
-            much of the recording has one. For tables.
-        truth_offset: s, added to the times of that file.
-        rename: what columns of a table are, where they have other names, such as ``{"t": "time", "pos": "x"}``; one
-            column may be several, ``{"accuracy": ["sigma_x", "sigma_y"]}``, and ``{"speed": "-"}`` ignores one.
-        sort: sort the rows of tables by time; a note says how many stood after later ones.
-        **keywords: parameters of the environment that win over those of the file.
+            folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files make one recording, and
+            the notes name a broken file, which is skipped.
+        environment: id of the environment; default: the one in the file.
+        speeds: limits of the median speed, m/s, outside which a recording is an error. The lowest holds in
+            ManeuveringTarget only.
+        truth: path of a separate file of the truth, a table or a log of a receiver, matched by time; a note gives the
+            number of rows with a truth. For tables.
+        truth_offset: offset added to the times of that file, s.
+        rename: names for columns of a table that have others, such as ``{"t": "time", "pos": "x"}``; one
+            column may have several, ``{"accuracy": ["sigma_x", "sigma_y"]}``, and ``{"speed": "-"}`` ignores one.
+        sort: sort the rows of tables by time; a note gives the number of rows that were out of order.
+        **keywords: parameters of the environment that override those of the file.
 
     Returns:
-        What can be given as scenario: every episode replays one recording.
+        A recording for the argument ``scenario``: every episode replays one track.
 
     Raises:
-        ValueError: if it cannot be read, or does not fit the environment.
+        ValueError: if the file cannot be read, or does not fit the environment.
     """
     several = list(path) if isinstance(path, list | tuple) else [path]
     if not several:
@@ -67,7 +68,7 @@ def read_recording(
         try:
             found.append(_read_recording(file, cls, speeds, keywords, true, rename, sort))
             cls = cls or task_class(found[0].environment)
-        except Exception as error:  # readers raise whatever a broken file makes them stumble over
+        except Exception as error:  # readers raise any error for a broken file
             reason = " ".join(str(error).split()) or type(error).__name__
             if len(files) == 1:
                 raise ValueError(f"recording {file}: {reason}") from error
@@ -90,7 +91,6 @@ def _read_recording(
     rename: Mapping[str, str | Sequence[str]] | None,
     sort: bool,
 ) -> Recording:
-    """Read one file."""
     if not file.exists():
         raise ValueError("there is no such file")
     if names_environment(file):
@@ -104,7 +104,7 @@ def _read_recording(
         recording = read_netcdf(file, task_class, None if cls is None else cls.id, keywords)
     elif cls is None:
         raise ValueError(
-            "it does not say of which environment it is: give its id, as the argument environment or before --recording"
+            "it does not name its environment: give its id, as the argument environment or before --recording"
         )
     else:
         recording = read_columns(file, cls, keywords, truth, rename, sort)

@@ -1,4 +1,4 @@
-"""Logs of receivers in formats of their own, as columns by the names that tables have.
+"""Readers of receiver logs, which return columns with the names of tables.
 
 * RTKLIB's ``.pos``: geodetic or Earth-fixed positions or baselines in metres, with standard deviations.
 * NMEA 0183, ``.nmea``: positions of GGA and RMC, standard deviations of GST.
@@ -7,10 +7,10 @@
 * Bags of ROS 1, ``.bag``, and of ROS 2, ``.db3`` or ``.mcap``: ``NavSatFix``, with ``Odometry`` for a second sensor, or
   positions of ``Odometry`` or of poses.
 
-What each becomes is a table with ``time``, ``latitude``, ``longitude``, ``altitude``, ``sigma_x``, ``sigma_y``, as far
-as the log knows them, or ``x`` and ``y`` of a baseline. Libraries that read the last four are imported when such a
-file is read. A file is data and nothing more: no code, type or path that it holds is used, and what is too large is
-refused before it fills the memory.
+Each becomes a table with those of ``time``, ``latitude``, ``longitude``, ``altitude``, ``sigma_x`` and ``sigma_y`` that
+the log contains, or with ``x`` and ``y`` of a baseline. The libraries for the last four are imported when such a file
+is read. The readers use files as data only, never code, types or paths in them, and reject a file that is too large
+before it fills the memory.
 """
 
 import datetime
@@ -31,25 +31,25 @@ if TYPE_CHECKING:
     import pandas
 
 LONGEST_LINE = 4096
-"""Bytes; what goes on is taken for another line."""
+"""Longest line, bytes; the rest counts as another line."""
 MOST_BROKEN = 0.5
-"""Share of lines that may be broken: more is a file of another kind."""
+"""Largest share of broken lines: a file with more is of another kind."""
 EXTRA = "pip install 'filtergym[logs]'"
 DAY = 86400.0
 WEEK = 7 * DAY
 
 
 class ReceiverLog(NamedTuple):
-    """What was read of a log."""
+    """Columns and notes from a log."""
 
     columns: Mapping[str, Any]
-    """By name, of one length."""
+    """Columns by name, all of the same length."""
     notes: tuple[str, ...] = ()
-    """What is to be told of the reading, a line each."""
+    """Notes on the reading, one line each."""
 
 
 def count_of(count: int, what: str, plural: str = "") -> str:
-    """Say how many there are of something; its plural is with s, or as it is given."""
+    """Return a count with its noun; the plural is formed with s unless given."""
     return f"{count:,} {what if count == 1 else plural or what + 's'}"
 
 
@@ -73,18 +73,18 @@ def _read_lines(file: Path) -> Iterator[bytes]:
 # --- RTKLIB
 
 QUALITY = ("none", "fixed", "float", "SBAS", "DGPS", "single", "PPP")
-"""Of a solution, by its number."""
+"""Quality of a solution, by its number."""
 
 
 def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
     """Read a solution of RTKLIB, as its manual 2.4.2, B.1, describes it.
 
     Args:
-        file: its path.
-        most_rows: that it may have.
+        file: path of the log.
+        most_rows: largest number of rows.
 
     Raises:
-        ValueError: if it is none, or larger.
+        ValueError: if the file is no solution, or has more rows.
     """
     names: list[str] = []
     system, rows, broken = "", [], 0
@@ -107,7 +107,7 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
                 "it lacks RTKLIB's line with the names of its columns, such as % GPST latitude(deg) longitude(deg)"
             )
         try:
-            # What newer versions append, such as velocities, has names of its own.
+            # Newer versions append further named columns, such as velocities.
             rows.append((*_rtklib_time(cells), *map(float, cells[2 : 2 + len(names)])))
             if len(rows[-1]) != 2 + len(names):
                 rows.pop()
@@ -120,8 +120,8 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
         raise ValueError("it holds no solution of RTKLIB")
     written, seconds, *values = zip(*rows, strict=True)
     found = dict(zip(names, map(numpy.array, values), strict=True))
-    columns, said = _rtklib_positions(found)
-    notes += said
+    columns, position_notes = _rtklib_positions(found)
+    notes += position_notes
     if "Q" in found:
         counted = Counter(QUALITY[int(q)] if 0 <= q < len(QUALITY) else f"{q:g}" for q in found["Q"].tolist())
         notes += (f"quality: {', '.join(f'{count:,} {name}' for name, count in counted.most_common())}",)
@@ -131,14 +131,14 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _rtklib_time(cells: Sequence[str]) -> tuple[str, float]:
-    """Date and time as they are written; or of a week and its seconds, seconds since 1980 and no date."""
+    """Return date and time as written; or, for a GPS week and its seconds, no date and the seconds since 1980."""
     if "/" in cells[0]:
         return f"{cells[0]} {cells[1]}", 0.0
     return "", WEEK * int(cells[0]) + float(cells[1])
 
 
 def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Positions and deviations, and what is to be told of them."""
+    """Return positions and standard deviations, and notes on them."""
     if {"latitude", "longitude"} <= {*found}:
         columns = {"latitude": found["latitude"], "longitude": found["longitude"]}
         if "height" in found:
@@ -165,24 +165,24 @@ def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any
             columns |= _rotate_sigmas(sigmas, float(latitude[0]), float(longitude[0]))
         return columns, ()
     raise ValueError(
-        f"RTKLIB wrote {', '.join(found)}; what is read are latitude and longitude, x-ecef and so on, or e-baseline "
+        f"RTKLIB wrote {', '.join(found)}; needed are latitude and longitude, x-ecef and so on, or e-baseline "
         "and so on"
     )
 
 
 def _rotate_sigmas(sigmas: numpy.ndarray, latitude: float, longitude: float) -> dict[str, numpy.ndarray]:
-    """Deviations east and north of Earth-fixed ones.
+    """Return the standard deviations east and north from Earth-fixed ones.
 
     Args:
-        sigmas: of x, y, z, and roots of their covariances xy, yz, zx with the signs of these, ``(6, n)``.
-        latitude: rad, likewise what follows.
-        longitude: of where east and north are.
+        sigmas: standard deviations of x, y, z, and signed roots of the covariances xy, yz, zx, m, ``(6, n)``.
+        latitude: of the origin, rad.
+        longitude: of the origin, rad.
     """
     xx, yy, zz, xy, yz, zx = numpy.sign(sigmas) * sigmas**2
     covariance = numpy.array([[xx, xy, zx], [xy, yy, yz], [zx, yz, zz]])
     rotation = east_north_up(latitude, longitude)
     variance = numpy.einsum("ij,jkn,ik->in", rotation, covariance, rotation)
-    # Rounded as they are written, covariances of little deviations may not be positive.
+    # Covariances of small deviations may not be positive, because the file rounds them.
     east, north, _ = numpy.sqrt(numpy.maximum(variance, 1e-8))
     return {"sigma_x": east, "sigma_y": north}
 
@@ -193,7 +193,7 @@ SENTENCE = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GST),[^\r\n$]*")
 
 
 class _Epoch:
-    """What sentences say of one time."""
+    """Contents of the sentences of one time."""
 
     def __init__(self, time: float) -> None:
         self.time = time
@@ -202,18 +202,18 @@ class _Epoch:
         self.altitude = math.nan
         self.sigmas: tuple[float, float] | None = None
         self.positioned = False
-        """Whether a sentence that gives positions was there."""
+        """Whether a sentence with a position has been read."""
 
 
 def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
-    """Read GGA, RMC and GST of NMEA 0183; other sentences are passed over.
+    """Read GGA, RMC and GST of NMEA 0183, and skip other sentences.
 
     Args:
-        file: its path; lines may begin with something else, such as a time of the logger.
-        most_rows: that it may have.
+        file: path of the log; lines may begin with other text, such as a time of the logger.
+        most_rows: largest number of rows.
 
     Raises:
-        ValueError: if it holds none, or more.
+        ValueError: if the file has none of these sentences, or more rows.
     """
     try:
         import pynmea2
@@ -243,7 +243,7 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
         columns |= _fill_sigmas([epoch.sigmas for epoch in epochs])
     else:
         notes += (
-            "no GST sentence says how large errors are: HDOP tells how satellites stand, and no metres",
+            "no GST sentence gives the size of errors: HDOP describes the geometry of the satellites, not metres",
         )
     missing = int(numpy.isnan(places[:, 0]).sum())
     if missing:
@@ -252,11 +252,11 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
-    """Add what a sentence says to the epoch of its time.
+    """Add the contents of a sentence to the epoch of its time.
 
     Raises:
-        ValueError: for what is no number or no time.
-        AttributeError: likewise.
+        ValueError: if a field is no number, or there is no position.
+        AttributeError: if the sentence has no time.
     """
     clock: datetime.time = message.timestamp
     time = 3600.0 * clock.hour + 60.0 * clock.minute + clock.second + 1e-6 * clock.microsecond
@@ -266,7 +266,7 @@ def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
         sigmas = float(message.std_dev_longitude), float(message.std_dev_latitude)
     elif message.gps_qual > 0 if kind == "GGA" else message.status == "A":
         if not message.lat or not message.lon:
-            raise ValueError("a position that is none")
+            raise ValueError("the position is empty")
         place = float(message.latitude), float(message.longitude)
         if kind == "GGA" and message.altitude is not None:
             altitude = float(message.altitude) + float(message.geo_sep or 0.0)
@@ -282,11 +282,11 @@ def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
 
 
 def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
-    """Date of every epoch, of which some say it; None if none does."""
+    """Return the date of every epoch from those that contain one; None if none does."""
     known = next((i for i, epoch in enumerate(epochs) if epoch.date), None)
     if known is None:
         return [None] * len(epochs)
-    # Midnight lies where a time of day comes back by more than half a day.
+    # At midnight the time of day decreases by more than half a day.
     steps = numpy.diff([epoch.time for epoch in epochs]) < -0.5 * DAY
     nights = numpy.append(0, numpy.cumsum(steps))
     first: Any = epochs[known].date
@@ -299,17 +299,19 @@ def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
 
 
 def _format_time(time: float, day: datetime.date | None) -> str:
-    """Time of day, with its date where it is known."""
+    """Return the time of day as text, with its date if known."""
     clock = (datetime.datetime.min + datetime.timedelta(seconds=time)).time().isoformat()
     return clock if day is None else f"{day.isoformat()}T{clock}Z"
 
 
 def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, numpy.ndarray]:
-    """Deviations east and north; where none are said, those said before, and at first those said next."""
+    """Return the standard deviations east and north, with gaps filled forward, then backward."""
     import pandas
 
-    said = pandas.DataFrame([pair or (math.nan, math.nan) for pair in sigmas], columns=["sigma_x", "sigma_y"])
-    return {str(name): values.to_numpy() for name, values in said.ffill().bfill().items()}
+    stated = pandas.DataFrame(
+        [pair or (math.nan, math.nan) for pair in sigmas], columns=["sigma_x", "sigma_y"]
+    )
+    return {str(name): values.to_numpy() for name, values in stated.ffill().bfill().items()}
 
 
 # --- ULog
@@ -318,20 +320,20 @@ def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, nump
 def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
     """Read positions of the receiver from a log of PX4.
 
-    Reading: ``eph`` is the deviation of the distance in the plane, so that of each axis is ``eph / sqrt(2)``.
+    Reading: ``eph`` is the standard deviation of the distance in the plane, so that of each axis is ``eph / sqrt(2)``.
 
     Args:
-        file: its path.
-        most_rows: that it may have.
+        file: path of the log.
+        most_rows: largest number of rows.
 
     Raises:
-        ValueError: if it holds none, or more.
+        ValueError: if the log has no positions, or more rows.
     """
     log = parse_apart("ulog", file, EXTRA, rows_limit=most_rows)
     data = log["fields"]
 
     def column(*names: tuple[str, float]) -> Any:
-        """Return the first of some fields, in units of so much."""
+        """Return the first of some fields that the log has, times its unit."""
         return next((data[name] * unit for name, unit in names if name in data), None)
 
     places = {
@@ -343,7 +345,7 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
         raise ValueError(
             f"its {log['topic']} has no latitude and longitude; it has {', '.join(log['names'][:20])}"
         )
-    # From 2 on a fix has a position in the plane.
+    # A fix of type 2 and above has a position in the plane.
     fixed = data["fix_type"] >= 2 if "fix_type" in data else numpy.ones(len(data["timestamp"]), dtype=bool)
     columns = {"time": 1e-6 * data["timestamp"]}
     columns |= {name: numpy.where(fixed, v, math.nan) for name, v in places.items() if v is not None}
@@ -364,12 +366,19 @@ DATAFLASH_SUFFIXES = (".bin", ".BIN")
 def read_dataflash(file: Path, most_rows: int) -> ReceiverLog:
     """Read positions of the first receiver from a log of ArduPilot.
 
-    Reading: ``HAcc`` of ``GPA`` is a deviation as ``eph`` is, of :func:`read_ulog`. Altitudes are above the sea: some
-    tens of metres move a position in the plane by 1e-5 of its distance. Arguments and errors as of :func:`read_ulog`.
+    Reading: ``HAcc`` of ``GPA`` is the standard deviation of the distance in the plane. Altitudes are above the sea:
+    some tens of metres move a position in the plane by 1e-5 of its distance.
+
+    Args:
+        file: path of the log.
+        most_rows: largest number of rows.
+
+    Raises:
+        ValueError: if the log has no positions, or more rows.
     """
     found = parse_apart("dataflash", file, EXTRA, rows_limit=most_rows)
     time, latitude, longitude, altitude, status = found["GPS"]
-    fixed = status >= 2.0  # from then on a fix has a position in the plane
+    fixed = status >= 2.0  # such a fix has a position in the plane
     columns = {"time": 1e-6 * time, "altitude": altitude}
     columns |= {"latitude": numpy.where(fixed, latitude, math.nan)}
     columns |= {"longitude": numpy.where(fixed, longitude, math.nan)}
@@ -389,17 +398,17 @@ UNKNOWN_COVARIANCE, NO_FIX = 0, -1
 
 
 def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
-    """Read positions from a bag of ROS 1 or a storage file of ROS 2, those of the topic that has the most.
+    """Read positions from a bag of ROS 1 or a storage file of ROS 2, of the topic with the most messages.
 
-    Messages ``NavSatFix``, and beside them displacements of ``Odometry`` for a second sensor; else positions of
+    The positions are ``NavSatFix``, with displacements of ``Odometry`` for a second sensor; without them, positions of
     ``Odometry`` or of poses, metres in their own frame.
 
     Args:
-        file: its path.
-        most_rows: that it may have.
+        file: path of the bag.
+        most_rows: largest number of rows.
 
     Raises:
-        ValueError: if it holds none, or more.
+        ValueError: if the bag has no positions, or more rows.
     """
     bag = parse_apart("bag", file, EXTRA, rows_limit=most_rows)
     if bag["kind"] != NAVSAT:
@@ -409,7 +418,7 @@ def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Columns of messages, of which there are ``values`` as :func:`.parse_bag` returns them, ``(8, n)``."""
+    """Return the columns of ``NavSatFix`` messages from the values ``(8, n)`` of :func:`.parse_bag`."""
     time, status, latitude, longitude, altitude, east, north, covariance_type = values
     fixed = status != NO_FIX
     columns = {"time": time, "altitude": altitude}
@@ -417,7 +426,7 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
     columns["longitude"] = numpy.where(fixed, longitude, math.nan)
     notes = [f"positions are of the topic {topic}"]
     if (covariance_type == UNKNOWN_COVARIANCE).any():
-        notes.append("messages do not say how large errors are")
+        notes.append("messages do not contain the size of errors")
     else:
         columns["sigma_x"] = numpy.sqrt(numpy.maximum(east, 0.0))
         columns["sigma_y"] = numpy.sqrt(numpy.maximum(north, 0.0))
@@ -427,18 +436,18 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Columns of messages, of which there are ``values`` as :func:`.parse_bag` returns them, ``(5, n)``."""
+    """Return the columns of poses from the values ``(5, n)`` of :func:`.parse_bag`."""
     time, x, y, *variances = values
     columns = {"time": time, "x": x, "y": y}
     notes = (f"positions are of the topic {topic}, metres in its own frame",)
     if not (numpy.array(variances) > 0.0).all():
-        return ReceiverLog(columns, (*notes, "messages do not say how large errors are"))
+        return ReceiverLog(columns, (*notes, "messages do not contain the size of errors"))
     sigma_x, sigma_y = numpy.sqrt(variances)
     return ReceiverLog({**columns, "sigma_x": sigma_x, "sigma_y": sigma_y}, notes)
 
 
 def _add_odometry(log: ReceiverLog, values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Add displacements since the row before, of poses ``(5, n)`` as :func:`.parse_bag` returns them."""
+    """Add displacements since the previous row from poses ``(5, n)`` of :func:`.parse_bag`."""
     order = numpy.argsort(values[0], kind="stable")
     time, x, y, *_ = values[:, order]
     now = log.columns["time"]
@@ -461,25 +470,25 @@ RECEIVER_READERS: Mapping[str, Callable[[Path, int], ReceiverLog]] = {
     ".db3": read_rosbag,
     ".mcap": read_rosbag,
 }
-"""By the end of a file's name."""
+"""Readers by the suffix of a file."""
 
 
 def receiver_columns(file: Path, suffix: str, most_rows: int) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Return the columns of a log of a receiver, and what is to be told of the reading.
+    """Return the columns of a receiver log, and notes on the reading.
 
     Args:
-        file: its path.
-        suffix: among ``RECEIVER_READERS``.
-        most_rows: that it may have.
+        file: path of the log.
+        suffix: one of ``RECEIVER_READERS``.
+        most_rows: largest number of rows.
 
     Raises:
-        ValueError: if it cannot be read.
+        ValueError: if the log cannot be read.
     """
     import pandas
 
     try:
         found = RECEIVER_READERS[suffix](file, most_rows)
-    except Exception as error:  # libraries raise whatever a broken file makes them stumble over
+    except Exception as error:  # libraries raise any error for a broken file
         if isinstance(error, ValueError) and not isinstance(error, UnicodeError):
             raise
         raise ValueError(

@@ -1,8 +1,8 @@
-"""Tables of what sensors really said, made into recordings.
+"""Readers that turn tables of real measurements into recordings.
 
-An environment says which columns it knows and makes measurements of them (:class:`.LogFormat`). What every table has
-in common is here: times, missing values, rows that come twice, several recordings in one file, latitude and longitude,
-and true values, ``truth_NAME`` for the components of the environment.
+An environment declares its columns and makes measurements of them (:class:`.LogFormat`). This module handles the
+parts common to all tables: times, missing values, duplicate rows, several recordings in one file, latitude and
+longitude, and true values, ``truth_NAME`` for the components of the environment.
 """
 
 import difflib
@@ -31,33 +31,33 @@ from .flight_tables import (
     seconds,
     sort_by_time,
 )
-from .plausibility import LOUD, check_degrees, check_interval, limit_notes, unknown_column_notes
+from .plausibility import WARNING_PREFIX, check_degrees, check_interval, limit_notes, unknown_column_notes
 from .truth_files import match_truth, offset_note, read_truth
 
 if TYPE_CHECKING:
     import pandas
 
 GEODETIC = ("latitude", "longitude", "altitude")
-"""Columns, of which the last may lack; they may be called as in flights."""
+"""Columns of a geodetic position, the last optional; the aliases of flights are accepted."""
 LEFT_OUT = "-"
-"""What a column that is to be ignored is renamed to."""
+"""New name of a column that is to be ignored."""
 TURN_SHARE = 0.05
-"""Of a turn, by which a jump of an angle may differ from a whole one."""
+"""Largest difference of a jump of an angle from a whole turn, as a share of a turn."""
 MOST_TWICE = 0.1
-"""Share of rows that may have the time of the row before and say something else."""
+"""Largest share of rows that may have the time of the previous row and other values."""
 UNEVEN = 0.01
-"""Share of the sampling interval by which a time may be off where measurements must be regular."""
+"""Largest deviation of a time of regular measurements, as a share of the sampling interval."""
 
 
 class Columns:
     """Columns of one recording, in the order of its times.
 
     Args:
-        name: of the recording.
-        table: numbers by the names of the columns, missing where a cell is empty, with ``time`` in seconds. Its index
+        name: name of the recording.
+        table: numbers by column name, NaN where a cell is empty, with ``time`` in seconds. Its index
             counts the rows of the file.
-        given: parameters that the user has named.
-        log_time: times as they stand in the file, numbers or words, ``(rows,)``; default: those of the table.
+        given: parameters that the user has set.
+        log_time: times as written in the file, numbers or text, ``(rows,)``; default: those of the table.
     """
 
     def __init__(
@@ -72,42 +72,43 @@ class Columns:
         self.given = given
         self.log_time: numpy.ndarray = self.time if log_time is None else log_time
         self.notes: list[str] = []
-        """What was done to the table, a line each."""
+        """Changes that were made to the table, one line each."""
         self.origin: PlaneOrigin | None = None
-        """Around which latitude and longitude were made metres east and north; None where these were given."""
+        """Origin of x (east) and y (north); None where the table has x and y itself."""
 
     def has(self, *names: str) -> bool:
-        """Whether all of these columns are there."""
+        """Return whether the table has all of these columns."""
         return {*names} <= {*self.table}
 
     @property
     def time(self) -> numpy.ndarray:
-        """Times, s, ``(rows,)``."""
+        """Return the times, s, ``(rows,)``."""
         return self["time"]
 
     @property
     def true(self) -> list[str]:
-        """Names of the columns that say what is true."""
+        """Return the names of the columns with true values."""
         return [name for name in self.table if name.startswith(TRUTH)]
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Column, NaN where a cell is empty."""
+        """Return the column, NaN where a cell is empty."""
         return self.table[name].to_numpy()
 
     def place(self, number: int) -> str:
-        """Row of the file that one of these rows is."""
+        """Return the place of a row in the file, such as ``row 12``."""
         return f"row {self.table.index[number]}"
 
     def only(self, rows: numpy.ndarray) -> "Columns":
-        """Some rows of the same."""
+        """Return the columns with some of the rows only."""
         return Columns(self.name, self.table[rows], self.given, self.log_time[rows])
 
     def drop_duplicates(self) -> None:
-        """Join rows of one time of which each says what the other does not, as of several sensors; leave out all others
-        that have the time of the row before, and say so.
+        """Merge rows of one time that fill each other's empty cells, as rows of several sensors do.
+
+        The method drops all other rows with the time of the previous row, and notes how many.
 
         Raises:
-            ValueError: if many of them say something else than the row before.
+            ValueError: if many of them have other values than the previous row.
         """
         self._join_rows()
         same = numpy.append(False, numpy.diff(self.time) == 0.0)
@@ -130,7 +131,6 @@ class Columns:
         self.table, self.log_time = kept, self.log_time[~same]
 
     def _join_rows(self) -> None:
-        """Join rows of one time that supply each other."""
         begins = numpy.append(True, numpy.diff(self.time) != 0.0)
         if begins.all():
             return
@@ -151,14 +151,15 @@ class Columns:
         self.table, self.log_time = whole[kept], self.log_time[kept]
 
     def project_to_plane(self, plane: tuple[str, ...]) -> None:
-        """Make metres east and north of latitude and longitude, in the plane that touches the ellipsoid at the first
-        position, and say where that is.
+        """Convert latitude and longitude to metres east and north, and note the origin.
+
+        The plane touches the ellipsoid at the first position.
 
         Args:
-            plane: names of the columns to make, see :attr:`.LogFormat.plane`.
+            plane: names of the new columns, see :attr:`.LogFormat.plane`.
 
         Raises:
-            ValueError: if one of them is there already, or an angle is none.
+            ValueError: if the table has one of them already, or an angle is out of range.
         """
         for true, names in (("", plane[:2]), (TRUTH, plane[2:])):
             latitude, longitude, altitude = (true + name for name in GEODETIC)
@@ -167,7 +168,7 @@ class Columns:
             for name in (latitude, longitude):
                 if not self.has(name):
                     raise ValueError(
-                        f"it lacks the column {name}, which belongs to {latitude} and {longitude}"
+                        f"it lacks the column {name}: {latitude} and {longitude} are needed together"
                     )
             for name in names:
                 if self.has(name):
@@ -198,10 +199,10 @@ class Columns:
             self.table = self.table.assign(**dict(zip(names, found, strict=True)))
 
     def note_turns(self, angles: Collection[str]) -> None:
-        """Note true values that jump by a whole turn, as angles do, of components that are not declared angles.
+        """Note true values that jump by a whole turn although their component is not a declared angle.
 
         Args:
-            angles: columns of those that are.
+            angles: columns of the declared angles.
         """
         for name in (name for name in self.true if name not in angles):
             steps = numpy.abs(numpy.diff(self[name]))
@@ -214,7 +215,7 @@ class Columns:
                     )
 
     def _drop_null_positions(self, latitude: str, longitude: str) -> None:
-        """Empty the positions at latitude 0 and longitude 0, which many receivers write without a fix."""
+        """Clear the positions at latitude 0 and longitude 0, which many receivers write without a fix."""
         null = ((self.table[latitude] == 0.0) & (self.table[longitude] == 0.0)).to_numpy()
         if not null.any():
             return
@@ -228,7 +229,7 @@ class Columns:
         )
 
     def note_offset(self, plane: tuple[str, ...]) -> None:
-        """Say which offset of its clock would bring the truth nearer to what was measured.
+        """Note the clock offset of the truth that would reduce its distance to the measurements, if there is one.
 
         Args:
             plane: names of the columns, see :attr:`.LogFormat.plane`.
@@ -239,13 +240,12 @@ class Columns:
             self.notes += [found] * bool(found)
 
     def _usual_height(self, name: str) -> float:
-        """Median of a column of heights, m; zero where there is none."""
         height = self[name] if self.has(name) else numpy.zeros(0)
         there = numpy.isfinite(height)
         return float(numpy.median(height[there])) if there.any() else 0.0
 
     def whole(self, *names: str) -> numpy.ndarray:
-        """Columns without an empty cell, ``(rows, columns)``.
+        """Return the columns without an empty cell, ``(rows, columns)``.
 
         Raises:
             ValueError: if there is one.
@@ -254,12 +254,12 @@ class Columns:
             missing = self.table[name].isna()
             if missing.any():
                 raise ValueError(
-                    f"{name} has no value in row {missing.idxmax()}, and here nothing may be missing"
+                    f"{name} has no value in row {missing.idxmax()}, and this column must not have empty cells"
                 )
         return numpy.ascontiguousarray(self.table[[*names]].to_numpy())
 
     def sigmas(self, *names: str) -> numpy.ndarray:
-        """Standard deviations without an empty cell, ``(rows, columns)``.
+        """Return the standard deviations without an empty cell, ``(rows, columns)``.
 
         Raises:
             ValueError: if one is not above zero.
@@ -270,20 +270,20 @@ class Columns:
         return found
 
     def interval(self) -> float:
-        """Sampling interval, s: the one that the user has named, or the median of those in the table."""
+        """Return the sampling interval, s: the one that the user has set, or the median of the table."""
         if "sampling_interval" in self.given:
             return float(self.given["sampling_interval"])
-        # Rounded as times are: files of one sensor have the same then.
+        # Rounded as times are, so that files of one sensor have the same interval.
         return float(f"{numpy.median(numpy.diff(self.time)):.6g}")
 
     def regular(self, why: str) -> float:
-        """Sampling interval of measurements that must be regular, s.
+        """Return the sampling interval, s, of measurements that must be regular.
 
         Args:
-            why: who needs that, at the end of the sentence.
+            why: reason, for the error message.
 
         Raises:
-            ValueError: if they are not.
+            ValueError: if the times are not regular.
         """
         interval = self.interval()
         steps = numpy.diff(self.time)
@@ -302,7 +302,7 @@ class TruthFile(NamedTuple):
 
     path: Path
     offset: float = 0.0
-    """Added to its times, s."""
+    """Offset added to its times, s."""
     sort: bool = False
     """Whether its rows are sorted by time."""
 
@@ -315,32 +315,31 @@ def read_columns(
     rename: Mapping[str, str | Sequence[str]] | None = None,
     sort: bool = False,
 ) -> Recording:
-    """Read a table of what sensors said.
+    """Read a table of measurements.
 
     Args:
-        path: of a file.
+        path: path of a file.
         cls: the environment.
-        keywords: parameters of it.
-        truth: in a file of its own.
-        rename: what some columns of the file are, in the environment's names; one column may be several, and one
-            that is ``LEFT_OUT`` is ignored.
+        keywords: parameters of the environment.
+        truth: separate file of the truth.
+        rename: new names for columns of the file; one column may have several, and the name ``LEFT_OUT`` ignores it.
         sort: sort the rows by time.
 
     Raises:
-        ValueError: if it cannot be read, or lacks what the environment needs.
+        ValueError: if the file cannot be read, or lacks columns that the environment needs.
     """
     import pandas
 
     log_format = find_companion(cls, LogFormat)
     if log_format is None:
-        measure_once(cls(cls.Parameters(**keywords)))  # says what a closed loop is
+        measure_once(cls(cls.Parameters(**keywords)))  # raises for a closed loop
         raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
     known = {*TIME, RECORDING, *log_format.columns}
     if log_format.plane:
         known |= {true + alias for true in ("", TRUTH) for name in GEODETIC for alias in COLUMNS[name]}
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
-    # All that begin with truth_, because components follow from the parameters.
+    # All columns with the prefix truth_, because components depend on the parameters.
     renamed = [
         (old.lower(), each.lower())
         for old, new in (rename or {}).items()
@@ -366,8 +365,8 @@ def read_columns(
         raise ValueError("it has no rows below its columns, and a recording needs several")
     if sort:
         group = pandas.factorize(_names_of_rows(read[RECORDING]))[0] if RECORDING in read else None
-        read, told = sort_by_time(read, read[time_name], group)
-        notes = (*notes, *told)
+        read, added = sort_by_time(read, read[time_name], group)
+        notes = (*notes, *added)
     table = read.drop(columns=[*TIME, RECORDING], errors="ignore")
     for name in table:
         table[name] = numbers(name, table[name])
@@ -379,8 +378,8 @@ def read_columns(
     table.insert(0, "time", seconds(read[time_name]))
     components = cls(cls.Parameters(**keywords)).components
     if truth is not None:
-        table, told = _add_truth(table, read[time_name], log_format, components, truth)
-        notes = (*notes, *told)
+        table, added = _add_truth(table, read[time_name], log_format, components, truth)
+        notes = (*notes, *added)
     parts = []
     angles = {TRUTH + one.name for one in components if one.period is not None}
     log_time = _times_as_written(read[time_name])
@@ -414,7 +413,7 @@ def _add_truth(
     components: Sequence[Component],
     truth: TruthFile,
 ) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Add the truth of a file of its own to the rows of a log, and say how many have one.
+    """Add the truth of a separate file to the rows of a log, and return it with notes.
 
     Raises:
         ValueError: if it cannot be read or matched, or the log has a truth already.
@@ -434,27 +433,24 @@ def _add_truth(
 def _rename(
     read: "pandas.DataFrame", names: list[str], renamed: Sequence[tuple[str, str]], known: ColumnNames
 ) -> tuple["pandas.DataFrame", list[tuple[str, str]]]:
-    """Call columns as a user says.
+    """Return the renamed columns, and the old and new name of all columns of the file.
 
     Args:
-        read: columns.
-        names: of all columns of the file.
-        renamed: pairs of a column of the file and of what it is; one column may be in several pairs.
-        known: names that are read.
-
-    Returns:
-        The columns by what they are, and for all columns of the file its name there and what it is.
+        read: the columns.
+        names: names of all columns of the file.
+        renamed: pairs of old and new name; one column may be in several.
+        known: names that the environment reads.
 
     Raises:
-        ValueError: for what the file has not, what nobody reads, or what is there twice then.
+        ValueError: for a missing column, a new name that is not read, or a name that occurs twice.
     """
     for old, new in renamed:
         if old not in names:
-            what = "left out" if new == LEFT_OUT else new
-            raise ValueError(f"it has no column {old}, which was to be {what}; it has {list_names(names)}")
+            fate = "be left out" if new == LEFT_OUT else f"become {new}"
+            raise ValueError(f"it has no column {old}, which was to {fate}; it has {list_names(names)}")
         if new not in known and new != LEFT_OUT:
             raise ValueError(
-                f"{old} was to be {new}, which is not read: choose from {list_names(sorted(known))}, or "
+                f"{old} was to become {new}, which is not read: choose from {list_names(sorted(known))}, or "
                 f"{old}={LEFT_OUT} to ignore the column"
             )
     meanings = {name: [new for old, new in renamed if old == name] or [name] for name in names}
@@ -462,14 +458,14 @@ def _rename(
     called = [new for _, new in pairs]
     twice = next((new for _, new in renamed if called.count(new) > 1), None)
     if twice is not None:
-        raise ValueError(f"two columns would be {twice}: leave one of them out")
+        raise ValueError(f"two columns would become {twice}: leave one of them out")
     there = [(old, new) for old, new in pairs if old in read and (old != new or new in known)]
     found = read[[old for old, _ in there]].set_axis([new for _, new in there], axis=1)
     return found, pairs
 
 
 def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str]) -> str:
-    """What to type where the columns of a file have names of their own."""
+    """Return a hint with the option ``--rename`` for columns with other names."""
     wanted, pairs = [*first, *columns], []
     for name in names:
         free = [each for each in wanted if each not in names]
@@ -481,15 +477,15 @@ def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str])
             wanted.remove(close[0])
     if not names:
         return ""
-    return f"; say which is which, such as --rename '{','.join(pairs or [f'NAME={wanted[0]}'])}'"
+    return f"; name the columns, such as --rename '{','.join(pairs or [f'NAME={wanted[0]}'])}'"
 
 
 def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:
-    """Call latitude, longitude and altitude by these names, and leave out what further names they have.
+    """Rename aliases to latitude, longitude and altitude, and drop further aliases.
 
     Args:
-        read: columns.
-        names: of all columns of the file.
+        read: the columns.
+        names: names of all columns of the file.
     """
     renamed: dict[str, str] = {}
     for true in ("", TRUTH):
@@ -501,7 +497,7 @@ def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas
 
 
 def _times_as_written(values: "pandas.Series") -> numpy.ndarray:
-    """Times as they stand in a table: numbers, or what is written of dates."""
+    """Return the times as written in a table: numbers, or text of dates."""
     try:
         return numbers("time", values).to_numpy()
     except ValueError:
@@ -509,14 +505,12 @@ def _times_as_written(values: "pandas.Series") -> numpy.ndarray:
 
 
 def _by_recording(table: "pandas.DataFrame", names: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
-    """Rows of every recording of a table, in their order."""
     if names is None:
         return {"": table}
     return {str(name): rows for name, rows in table.groupby(_names_of_rows(names), sort=False)}
 
 
 def _names_of_rows(names: "pandas.Series") -> "pandas.Series":
-    """Name of the recording of each row; empty where none is given."""
     return names.astype(object).where(names.notna(), "").astype(str)
 
 
@@ -535,12 +529,10 @@ def _side_by_side(
     keywords: Mapping[str, Any],
     parts: list[tuple[Columns, TrackLog]],
     names: list[str],
-    said: Iterable[str],
+    reading_notes: Iterable[str],
     original: Mapping[str, str],
 ) -> Recording:
-    """Put the recordings of a file, whose columns have these names, side by side; ``said`` was told of its reading, and
-    ``original`` gives what some columns are called in the file.
-    """
+    """Put the recordings of a file side by side; ``original`` gives the names of renamed columns in the file."""
     first, known = parts[0][0], parts[0][1].parameters
     task = cls(cls.Parameters(**{**known, **keywords}))
     true = _true_columns(task, first)
@@ -548,8 +540,8 @@ def _side_by_side(
     places = [TRUTH + name for name in GEODETIC if log_format.plane]
     components = [TRUTH + component.name.lower() for component in task.components]
     read = [*TIME, RECORDING, *log_format.columns, *components, *places]
-    notes = [*said, *unknown_column_notes(names, read, log_format.noise_hint)]
-    notes.sort(key=lambda note: not note.startswith(LOUD))
+    notes = [*reading_notes, *unknown_column_notes(names, read, log_format.noise_hint)]
+    notes.sort(key=lambda note: not note.startswith(WARNING_PREFIX))
     unknown = [component.name for component, name in zip(task.components, true, strict=True) if not name]
     if any(true) and unknown:
         notes.append(f"no truth of {', '.join(unknown)}: errors and NEES are of the other components")
@@ -591,10 +583,10 @@ def _side_by_side(
 
 
 def _true_columns(task: Task, columns: Columns) -> list[str]:
-    """Names of the columns with the truth of every component; empty where it has none.
+    """Return the names of the columns with the truth of every component; empty where it has none.
 
     Raises:
-        ValueError: if a table has a part of a position only, say, or nothing that is a component.
+        ValueError: if a table has only a part of a position, for example, or true values of no component.
     """
     names = [TRUTH + component.name.lower() for component in task.components]
     found = [name if columns.has(name) else "" for name in names]
@@ -612,12 +604,12 @@ def _true_columns(task: Task, columns: Columns) -> list[str]:
 
 
 def _take_rows(values: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
-    """Values ``(T, ...)`` of the rows that measurements are of; NaN, or no word, where they are of none."""
+    """Return the values ``(T, ...)`` of the measurements' rows; NaN or empty text for a measurement without a row."""
     shaped = (rows >= 0).reshape(-1, *[1] * (values.ndim - 1))
     return numpy.where(shaped, values[rows], "" if values.dtype.kind == "U" else numpy.nan)
 
 
 def _truth_of_rows(columns: Columns, rows: numpy.ndarray, names: list[str]) -> numpy.ndarray:
-    """Truth of every component, ``(T, C)``; NaN where it is not known."""
+    """Return the truth of every component, ``(T, C)``; NaN where it is unknown."""
     unknown = numpy.full(len(columns.time), numpy.nan)
     return _take_rows(numpy.stack([columns[name] if name else unknown for name in names], axis=1), rows)

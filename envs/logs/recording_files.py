@@ -1,9 +1,9 @@
 """Files of recordings: NetCDF with the names of the environment's own measurements.
 
-Dimensions ``episode``, ``time``, ``component``, ``other_component`` and what further axes a measurement has. Variables:
+Dimensions ``episode``, ``time``, ``component``, ``other_component`` and further axes of a measurement. Variables:
 every array of the environment's ``Measurement`` by its name, ``(episode, time, ...)``; ``seconds`` ``(episode, time)``,
 NaN where an episode has no measurement; ``length`` ``(episode)``; optionally ``truth`` ``(episode, time, component)``;
-and what everyone is told of the start of the track, ``initial_mean``, ``initial_covariance`` and so on. Attributes:
+and the initial estimate of every filter, ``initial_mean``, ``initial_covariance`` and so on. Attributes:
 ``environment``, ``parameters`` (JSON), ``source``, ``licence``.
 """
 
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
     import xarray
 
 OWN = ("seconds", "length", "truth", "started")
-"""Variables that are no measurements."""
+"""Variables other than measurements."""
 
 
 def is_recording(path: Any) -> bool:
-    """Whether this is the path of a NetCDF file that says of which environment it holds measurements."""
+    """Return whether this is the path of a NetCDF file that names the environment of its measurements."""
     try:
         return names_environment(Path(path))
-    except Exception:  # whatever it is, it is for somebody else to say what is wrong with it
+    except Exception:  # the reader of this kind of file reports the error
         return False
 
 
 def names_environment(path: Path) -> bool:
-    """Whether a file is NetCDF that says of which environment it holds measurements.
+    """Return whether a file is NetCDF and names the environment of its measurements.
 
     Raises:
-        Exception: whatever, for a file whose name says that it is NetCDF and that is none.
+        Exception: any, for a file with the suffix of NetCDF and other contents.
     """
     if path.suffix != ".nc":
         return False
@@ -48,10 +48,10 @@ def names_environment(path: Path) -> bool:
 
 
 def read_dataset(data: "xarray.Dataset", name: str) -> dict[str, Any]:
-    """Return the fields of a :class:`Recording` that a dataset holds; ``initial`` may lack.
+    """Return the fields of a :class:`Recording` from a dataset; ``initial`` may be missing.
 
     Raises:
-        ValueError: for what is no recording.
+        ValueError: if the dataset is no recording.
     """
     total = sum(variable.size for variable in data.variables.values())
     if total > MOST_NUMBERS:
@@ -112,13 +112,13 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
     """Read a recording from a NetCDF file.
 
     Args:
-        path: of the file.
-        cls_of: returns the task of an environment id.
-        environment: that it must be of; None: what the file says.
-        keywords: parameters that win over those of the file.
+        path: path of the file.
+        cls_of: function from an environment id to its task.
+        environment: required id; None: the one in the file.
+        keywords: parameters that override those of the file.
 
     Raises:
-        ValueError: if it cannot be read, or is of another environment.
+        ValueError: if the file cannot be read, or belongs to another environment.
     """
     with open_netcdf(path, decode_times=False) as data:
         attrs = data.attrs
@@ -145,7 +145,7 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
 
 
 def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any]) -> None:
-    """Let the tracks start from their first measurements."""
+    """Start the tracks from their first measurements."""
     log_format = find_companion(cls, LogFormat)
     if log_format is None:
         raise ValueError(

@@ -9,7 +9,7 @@ are of pandas, by time in s: inertial measurements with the columns ``gyro_x`` t
    rotation of the Earth are the bias of the gyroscopes. The heading is the course of the first motion less the angle
    turned until then.
 2. **Aiding.** From there fixes correct position, velocity, attitude and the biases of gyroscopes and accelerometers.
-3. **Free running.** From a state of that filter, which knows nothing later, the INS runs without fixes.
+3. **Free running.** From a state of that filter, which has used no later data, the INS runs without fixes.
 """
 
 import warnings
@@ -23,28 +23,28 @@ import numpy
 from ...filters.geodesy import east_north
 
 LEAST_STANDSTILL = 5.0
-"""For the alignment, s: the bias of the gyroscopes is the mean over it."""
+"""Shortest standstill for the alignment, s: the bias of the gyroscopes is the mean over it."""
 BEFORE_MOTION = 1.0
 """The standstill ends this long before the first speed above the limit, s."""
 GRAVITY = 9.80665
 """Standard gravity, m/s^2."""
 GRAVITY_TOLERANCE = 0.05
-"""Relative; gravity varies by 0.6 % over the Earth's surface, and cheap accelerometers are off by 0.2 m/s^2."""
+"""Relative tolerance of gravity, which varies by 0.6 % over the Earth; cheap accelerometers err by 0.2 m/s^2."""
 LARGEST_TILT = 45.0
-"""Of the vehicle at rest, degrees: beyond it the axes are other ones than forward, right and down."""
+"""Largest tilt of the vehicle at rest, degrees: beyond it the axes are not forward, right and down."""
 LARGEST_RATE = 0.1
-"""Mean rate at rest, rad/s; cheap gyroscopes have a bias of 0.02 rad/s."""
+"""Largest mean rate at rest, rad/s; cheap gyroscopes have a bias of 0.02 rad/s."""
 SLOPES = (0.3, 3.0)
-"""Of turns and changes of speed by the fixes over those by the IMU, within which these go together; hills and a
-tilted IMU make 0.6 of 1."""
+"""Limits of the slope of turns and speed changes by the fixes against those by the IMU; hills and a tilted IMU reduce
+it from 1 to 0.6."""
 LEVEL_SIGMA, HEADING_SIGMA = 2.0, 10.0
-"""Of the attitude after the alignment, degrees."""
+"""Standard deviations of the attitude after the alignment, degrees."""
 STANDING_SIGMA = 0.05
-"""Of velocity, m/s, and least of position, m, at the standstill."""
+"""Standard deviation of velocity, m/s, and smallest of position, m, at the standstill."""
 AIDING_STEP = 0.25
-"""Over which the covariance is predicted at most, s."""
+"""Longest step of the prediction of the covariance, s."""
 DEVIATION_STEP = 0.1
-"""Fixes whose deviations differ by less than this, relatively, count as equally good."""
+"""Relative difference below which standard deviations of fixes count as equal."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class InertialErrors:
     gyroscope_noise: float = 0.05
     """Root density of white noise, degrees/s^0.5."""
     accelerometer_noise: float = 0.015
-    """Likewise, m/s^1.5."""
+    """Root density of white noise, m/s^1.5."""
     gyroscope_bias: float = 0.1
     """Standard deviation of the bias left after the standstill, degrees/s."""
     accelerometer_bias: float = 0.2
-    """Likewise, m/s^2."""
+    """Standard deviation of the bias, m/s^2."""
     gyroscope_walk: float = 0.0001
-    """Root density of its random walk, degrees/s^1.5."""
+    """Root density of the random walk of the bias, degrees/s^1.5."""
     accelerometer_walk: float = 0.001
-    """Likewise, m/s^2.5."""
+    """Root density of the random walk of the bias, m/s^2.5."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Alignment:
     start: Any
     """Position, velocity and attitude, a series of pyins named by its time."""
     increments: Any
-    """Rotation vectors (rad) and velocity increments (m/s) since then, less the gyroscopes' bias of the standstill."""
+    """Later rotation vectors (rad) and velocity increments (m/s), without the gyroscopes' bias of the standstill."""
 
 
 @dataclass(frozen=True)
@@ -82,15 +82,15 @@ class AidedInertial:
     trajectory: Any
     """Latitude, longitude (degrees), altitude, velocity and attitude; a table of pyins by time."""
     biases: Any
-    """Of gyroscopes (rad/s) and accelerometers (m/s^2), columns as those of the increments; a table by time."""
+    """Biases of gyroscopes (rad/s) and accelerometers (m/s^2), with the columns of the increments; a table by time."""
     increments: Any
-    """Rotation vectors (rad) and velocity increments (m/s), less the gyroscopes' bias of the standstill."""
+    """Rotation vectors (rad) and velocity increments (m/s), without the gyroscopes' bias of the standstill."""
     innovations: Any
-    """By kind of measurement, tables of innovations over their standard deviations."""
+    """Tables of innovations over their standard deviations, by kind of measurement."""
 
 
 def check_pyins() -> None:
-    """Raise ValueError where pyins is not installed."""
+    """Raise ValueError if pyins is not installed."""
     try:
         import pyins  # noqa: F401
     except ImportError as error:
@@ -132,7 +132,7 @@ def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0)
     inertial = inertial[(inertial.index >= begin) & (inertial.index <= fixes.index[-1])].copy()
 
     if not len(inertial):
-        raise ValueError("the IMU says nothing between the standstill and the last fix")
+        raise ValueError("the IMU has no samples between the standstill and the last fix")
     first = fixes.iloc[int(numpy.argmax(speed > moving))]
     before = inertial.index < first.name
     turned = numpy.trapezoid(inertial.gyro_z[before] - bias.gyro_z, inertial.index[before])
@@ -145,7 +145,7 @@ def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0)
         ]
     )
     start = pandas.Series([*position, 0.0, 0.0, 0.0, *attitude], util.TRAJECTORY_COLS, name=inertial.index[0])
-    # What a standing gyroscope measures is its bias and the rotation of the Earth.
+    # At rest a gyroscope measures its bias and the rotation of the Earth.
     bias -= transform.mat_from_rph(attitude).T @ earth.rate_n(position[0])
     inertial[util.GYRO_COLS] -= bias
     return Alignment(start, strapdown.compute_increments_from_imu(inertial, "rate"))
@@ -182,16 +182,16 @@ def check_rest(rates: numpy.ndarray, force: numpy.ndarray) -> None:
 
 
 def check_motion(alignment: Alignment, fixes: Any, moving: float, interval: float) -> None:
-    """Raise ValueError unless the IMU turns and speeds up as the fixes do.
+    """Raise ValueError unless turns and speed changes of the IMU agree with those of the fixes.
 
     Turns of the course and changes of speed from fix to fix are regressed on the integrals of the down rate and of the
     forward acceleration; both slopes should be one.
 
     Args:
-        alignment: of :func:`align`.
-        fixes: with velocities.
+        alignment: result of :func:`align`.
+        fixes: fixes with velocities.
         moving: speed from which the course is the heading, m/s.
-        interval: between the fixes that are compared, s.
+        interval: time between the compared fixes, s.
     """
     increments = alignment.increments
     fixes = fixes[fixes.VN.notna() & fixes.VE.notna() & (fixes.index >= increments.index[0])]
@@ -218,8 +218,9 @@ def check_motion(alignment: Alignment, fixes: Any, moving: float, interval: floa
 
 
 def slope_of(x: numpy.ndarray, y: numpy.ndarray) -> tuple[float, float]:
-    """Slope of the straight line through points ``(n,)`` by least squares, and its standard deviation; infinite where
-    they have none.
+    """Return the slope of the least-squares line through points ``(n,)``, and its standard deviation.
+
+    The standard deviation is infinite if the slope is not determined.
     """
     if len(x) < 3 or numpy.ptp(x) == 0.0:
         return 1.0, numpy.inf
@@ -239,12 +240,12 @@ def aid(
     """Aid the INS by fixes from the end of the standstill on.
 
     Args:
-        alignment: of :func:`align`.
+        alignment: result of :func:`align`.
         fixes: positions, and velocities.
         position_sigma: standard deviation of each fix, of every axis, m, ``(n,)``.
-        velocity_sigma: of velocities, m/s; None: they are not used.
-        lever: from the IMU to the antenna, forward, right, down, m.
-        errors: of the IMU; default: those of a consumer IMU.
+        velocity_sigma: standard deviation of velocities, m/s; None: velocities are not used.
+        lever: lever arm from the IMU to the antenna, forward, right, down, m.
+        errors: errors of the IMU; default: those of a consumer IMU.
     """
     import pandas
     from pyins import filters, inertial_sensor, measurements, util
@@ -283,7 +284,7 @@ def aid(
 
 @contextmanager
 def _no_deprecations() -> Iterator[None]:
-    """Keep quiet of a keyword that pyins 1.0.1 uses and pandas 4 will not have."""
+    """Suppress the warning about a keyword that pyins 1.0.1 uses and pandas 4 will not have."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The copy keyword is deprecated")
         yield
@@ -292,13 +293,14 @@ def _no_deprecations() -> Iterator[None]:
 def free_inertial(
     navigation: AidedInertial, times: numpy.ndarray, lever: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> Any:
-    """Return latitude, longitude (degrees) and altitude (m) of the antenna at times, s, where the INS comes from the
-    first of them on without fixes; columns of a table.
+    """Return latitude, longitude (degrees) and altitude (m) of the antenna at times, s, as columns of a table.
+
+    The INS runs without fixes from the first of the times.
     """
     import pandas
     from pyins import strapdown, transform, util
 
-    # From the last sample before the start, with the biases as the fix at the start leaves them.
+    # From the last sample before the start, with the biases after the fix at the start.
     number = int(numpy.searchsorted(navigation.trajectory.index, times[0], side="right")) - 1
     start = navigation.trajectory.iloc[number]
     bias = navigation.biases[navigation.biases.index <= start.name].iloc[-1]
@@ -319,14 +321,14 @@ def free_windows(
     site: tuple[float, float],
     lever: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> numpy.ndarray:
-    """Positions of the INS that runs free in windows of K times, ``(E, K, 2)``, m east and north of a site.
+    """Return the positions of the free-running INS in windows of K times, ``(E, K, 2)``, m east and north of a site.
 
     Args:
         navigation: the aided INS.
         windows: E times ``(K,)``, s.
-        beginnings: where each window begins, m, ``(E, 2)``; NaN: where the aided INS is.
+        beginnings: initial position of each window, m, ``(E, 2)``; NaN: that of the aided INS.
         site: latitude and longitude, rad.
-        lever: from the IMU to the antenna, forward, right, down, m.
+        lever: lever arm from the IMU to the antenna, forward, right, down, m.
     """
     tracks = []
     for times, beginning in zip(windows, beginnings, strict=True):
@@ -337,6 +339,6 @@ def free_windows(
 
 
 def tangent_plane(positions: Any, site: tuple[float, float]) -> numpy.ndarray:
-    """Coordinates east and north of a site (rad) of a table of latitudes, longitudes and altitudes, ``(2, n)``, m."""
+    """Return the coordinates ``(2, n)``, m east and north of a site (rad), of a table of geodetic positions."""
     latitude, longitude = numpy.radians(positions[["lat", "lon"]].to_numpy().T)
     return east_north(latitude, longitude, positions["alt"].to_numpy(), site)

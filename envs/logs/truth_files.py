@@ -1,7 +1,7 @@
-"""The truth of a log in a file of its own, matched by time.
+"""Truth of a log in a separate file, matched by time.
 
-Times of both files are what they say: nothing is shifted but by the offset that a user names. Between two true
-positions that are close in time the truth is interpolated; elsewhere it is not known.
+The times of both files are used as written; only the user's offset shifts them. The truth is interpolated between two
+true positions that are close in time, and unknown elsewhere.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,28 +27,28 @@ if TYPE_CHECKING:
     import pandas
 
 LONGEST_GAP = 1.5
-"""s between two rows of the truth, up to which it is interpolated: one a second, with some jitter."""
+"""Longest time between two rows of the truth for interpolation, s: one row a second, with some jitter."""
 SAME_TIME = 1e-3
-"""s, within which times are the same."""
+"""Largest difference of equal times, s."""
 OFFSETS = numpy.arange(-30.0, 30.01, 0.1)
-"""s, among which an offset between the clocks is looked for, to be told."""
-BETTER = 0.7
-"""Part of the distance between positions and truth that an offset must leave, to be told."""
-AGREE = 0.3
-"""s, within which both halves of a log must have the same offset."""
+"""Clock offsets that are tried for a note, s."""
+LARGEST_REMAINDER = 0.7
+"""Largest share of the distance between positions and truth that an offset must leave to be noted."""
+OFFSET_TOLERANCE = 0.3
+"""Largest difference between the offsets of both halves of a log, s."""
 
 
 class TruthTable(NamedTuple):
     """True values by time."""
 
     clock: str
-    """What the times are: dates, times of day, or seconds."""
+    """Kind of the times: dates, times of day, or seconds."""
     time: numpy.ndarray
-    """s by that clock, ``(n,)``, increasing."""
+    """Times by that clock, s, ``(n,)``, increasing."""
     columns: Mapping[str, numpy.ndarray]
-    """By the names that they have beside measurements, ``truth_...``, ``(n,)``; NaN where a cell is empty."""
+    """Values by their names ``truth_...``, ``(n,)``; NaN where a cell is empty."""
     notes: tuple[str, ...]
-    """What is to be told of the reading, a line each."""
+    """Notes on the reading, one line each."""
 
 
 def read_truth(
@@ -62,15 +62,15 @@ def read_truth(
     """Read a file of true positions: a table, or a log of a receiver.
 
     Args:
-        path: of the file, with a time and x and y (m), latitude and longitude (degrees), or components by their names.
-        log_format: of the environment.
-        components: names of what is estimated.
-        prefix: before the names of true columns.
-        times: names that the column of times may have.
+        path: path of the file, with a time and x and y (m), latitude and longitude (degrees), or components.
+        log_format: the environment's format.
+        components: names of the estimated components.
+        prefix: prefix of the names of true columns.
+        times: accepted names of the column of times.
         sort: sort the rows by time.
 
     Raises:
-        ValueError: if it cannot be read.
+        ValueError: if the file cannot be read.
     """
     geodetic = {alias: name for name in ("latitude", "longitude", "altitude") for alias in COLUMNS[name]}
     meant = {name: prefix + name for name in components}
@@ -83,8 +83,8 @@ def read_truth(
     table, names, notes = read_table(path, {*times, *meant})
     time_name = next((name for name in times if name in table), None)
     if sort and time_name is not None:
-        table, told = sort_by_time(table, table[time_name])
-        notes = (*notes, *told)
+        table, added = sort_by_time(table, table[time_name])
+        notes = (*notes, *added)
     found: dict[str, numpy.ndarray] = {}
     for name in table:
         if name in meant and meant[name] not in found:
@@ -108,13 +108,13 @@ def _wanted(log_format: LogFormat) -> str:
 def match_truth(
     truth: TruthTable, times: "pandas.Series", offset: float, periods: Mapping[str, float]
 ) -> tuple[dict[str, numpy.ndarray], str]:
-    """Return the truth at the times of a log, NaN where it is not known, and a sentence on how many have one.
+    """Return the truth at the times of a log, NaN where unknown, and a note on the number of rows with a truth.
 
     Args:
-        truth: of :func:`read_truth`.
-        times: of the log, as they are written.
-        offset: added to the times of the truth, s.
-        periods: of the columns that are angles, which are interpolated the shorter way round.
+        truth: result of :func:`read_truth`.
+        times: times of the log, as written.
+        offset: offset added to the times of the truth, s.
+        periods: periods of the columns that are angles, which are interpolated the shorter way round.
 
     Raises:
         ValueError: if both clocks differ, or no time has a truth.
@@ -157,19 +157,19 @@ def match_truth(
 
 
 def offset_note(time: numpy.ndarray, position: numpy.ndarray, truth: numpy.ndarray) -> str:
-    """Say which constant offset of the clocks would bring positions nearer to the truth; empty if none does.
+    """Return a note on a constant clock offset that would bring positions nearer to the truth; empty if none does.
 
     Args:
-        time: of the log, s, ``(n,)``.
-        position: measured, m, ``(n, k)``; NaN where there is none.
-        truth: likewise, at these times.
+        time: times of the log, s, ``(n,)``.
+        position: measured positions, m, ``(n, k)``; NaN where there is none.
+        truth: true positions at these times, m, ``(n, k)``; NaN where unknown.
     """
     known = numpy.isfinite(truth).all(axis=1)
     if known.sum() < 2:
         return ""
 
     def distances(rows: slice) -> numpy.ndarray:
-        """Median distance at each offset, m; infinite where few times are common."""
+        """Return the median distance at each offset, m; infinite where few times are common."""
         found = []
         for offset in OFFSETS:
             at = [
@@ -188,7 +188,7 @@ def offset_note(time: numpy.ndarray, position: numpy.ndarray, truth: numpy.ndarr
     one, other = (OFFSETS[part.argmin()] for part in parts)
     whole = distances(slice(None))
     best, now = whole.argmin(), whole[len(OFFSETS) // 2]
-    if abs(one - other) > AGREE or whole[best] > BETTER * now:
+    if abs(one - other) > OFFSET_TOLERANCE or whole[best] > LARGEST_REMAINDER * now:
         return ""
     return (
         f"positions are {now:.3g} m from the truth in the median, and would be {whole[best]:.3g} m if "

@@ -1,4 +1,4 @@
-"""RadarEsmTracking: everything of one environment; ``task.py`` names it all."""
+"""Environment RadarEsmTracking; begin with ``task.py``."""
 
 ID = "filtergym/RadarEsmTracking-v0"
-"""Known before anything else is imported."""
+"""Id of the environment, available without further imports."""

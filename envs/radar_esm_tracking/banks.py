@@ -1,6 +1,6 @@
-"""The filters of RadarEsmTracking that are steered: one for each class, weighed by the radar and the ESM.
+"""Banks of RadarEsmTracking: a filter for each class, weighted by radar and ESM.
 
-Equations and their numbers stand in ``filters/class_fusion.py``.
+Equation numbers are those of ``filters/class_fusion.py``.
 """
 
 import functools
@@ -35,54 +35,54 @@ from .parameters import RadarEsmTrackingParameters
 from .problem import RadarEsmProblem
 from .world import Measurement, Start
 
-TIME_SHOWN = 60.0
-"""Seconds of track that the clock in the observation shows as one."""
-COUNT_SHOWN = 10.0
-"""Decisions that a count in the observation shows as one."""
+TIME_UNIT = 60.0
+"""Unit of the clock in the observation, s."""
+COUNT_UNIT = 10.0
+"""Unit of the counts in the observation, decisions."""
 
 
 class Filters(NamedTuple):
     """M Kalman filters, one for each class, and the ESM decisions so far."""
 
     mean: Array
-    """After the radar update (and mixing), ``(3, M, N)``."""
+    """Means after the radar update (and mixing), ``(3, M, N)``."""
     covariance: Array
-    """``(3, 3, M, N)``."""
+    """Covariances after the radar update (and mixing), ``(3, 3, M, N)``."""
     log_predicted: Array
     """Log-probability of the classes given the radar, before the ESM, up to a constant, ``(M, N)``."""
     innovation: Array
-    """Whitened, ``(2, M, N)``."""
+    """Whitened innovations of range and range rate, ``(2, M, N)``."""
     log_squared: Array
     """log(1 + normalised innovation squared), ``(M, N)``."""
     log_likelihood: Array
-    """Of this scan's radar measurement, ``(M, N)``."""
+    """Log-likelihood of this scan's radar measurement, ``(M, N)``."""
     average_innovation: Array
-    """Exponential average, ``(2, M, N)``."""
+    """Exponential average of the innovations, ``(2, M, N)``."""
     average_log_squared: Array
     """Exponential average of ``log_squared``, ``(M, N)``."""
     accumulated: Array
     """Sum of the log-likelihoods since the start, ``(M, N)``."""
     used: Array
-    """Whether there is an ESM decision at this scan that the gate (6) lets pass, ``(N,)`` of booleans."""
+    """Whether there is an ESM decision at this scan within the gate (6), ``(N,)`` of booleans."""
     used_counts: Array
-    """Decisions for each type so far that could be used, ``(J, N)``."""
+    """Number of decisions for each type within the gate so far, ``(J, N)``."""
     refused_counts: Array
-    """Decisions for each type so far that the gate refused, ``(J, N)``."""
+    """Number of decisions for each type outside the gate so far, ``(J, N)``."""
     probabilities: Array
     """Weights in force, ``(M, N)``."""
     believed: Array
-    """Probabilities of the classes that the next scan starts from, ``(M, N)``: Bayes' own under ``evidence``, otherwise
-    the weights in force."""
+    """Probabilities of the classes at the start of the next scan, ``(M, N)``: those of Bayes' rule alone under
+    ``evidence``, otherwise the weights in force."""
     expected: Array
-    """Those that this scan has started from, ``(M, N)``."""
+    """Probabilities of the classes at the start of this scan, ``(M, N)``."""
 
 
 @functools.lru_cache(8)  # an evaluation makes the same bank for every competitor, on numbers and on symbols
 def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: int) -> class_fusion.Channels:
-    """Gains and innovation statistics of the classes' filters for every scan of an episode.
+    """Return the gains and innovation statistics of the classes' filters for every scan of an episode.
 
     Args:
-        content: shape and numbers of the arrays of the models, and of the covariances at the start.
+        content: shape and numbers of the arrays of the models, and of the initial covariances.
         scans: the last scan.
     """
     *models, start = (numpy.frombuffer(numbers).reshape(shape) for shape, numbers in content)
@@ -90,7 +90,7 @@ def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: in
 
 
 def bearing_gate(p: RadarEsmTrackingParameters) -> float:
-    """Return the largest difference of bearings that the paper takes for one target, degrees."""
+    """Return the gate of the difference of bearings, degrees, within which the paper assumes one target."""
     return class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
 
 
@@ -113,16 +113,16 @@ def decision_blocks(task: RadarEsmProblem) -> tuple[Block, Block]:
 
 def clock_block(task: RadarEsmProblem) -> Block:
     """Return the block of the time since the start of the track."""
-    xp, factor = task.xp, task.parameters.sampling_interval / TIME_SHOWN
+    xp, factor = task.xp, task.parameters.sampling_interval / TIME_UNIT
     return Block(
         "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * factor,
-        f"time since the start of the track over {TIME_SHOWN:g} s",
+        f"time since the start of the track over {TIME_UNIT:g} s",
         shown=within(0.0, (task.parameters.horizon + 1) * factor),
     )  # fmt: skip
 
 
 class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
-    """Every control: one Kalman filter for each class; with class transitions they mix on their weights."""
+    """Bank of every control: one Kalman filter for each class, mixed by their weights if classes change."""
 
     parameters: RadarEsmTrackingParameters
 
@@ -148,19 +148,19 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """One class, or a number for each."""
+        """Return the action space: one class, or a number for each."""
         return bank_action_space(self.control, self.task.classes)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Innovations and likelihoods of each class's filter, ESM decisions, last weights and the clock."""
+        """Return innovations and likelihoods of each class's filter, ESM decisions, last weights and the clock."""
         xp, p, classes = self.xp, self.parameters, self.task.modes
         none = self.task.types
         types = tuple(str(j) for j in range(none))
         decision, bearing_difference = decision_blocks(self.task)
         average = f"exponential average over {p.averaging_measurements:g} scans"
-        count = f"decisions for this emitter type so far over {COUNT_SHOWN:g}"
-        counted = within(0.0, (self.last_scan + 1) / COUNT_SHOWN)
+        count = f"decisions for this emitter type so far over {COUNT_UNIT:g}"
+        counted = within(0.0, (self.last_scan + 1) / COUNT_UNIT)
 
         return (
             innovation_block(
@@ -193,9 +193,9 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
                 lambda f, measurement: xp.astype((measurement.decision < none) & ~f.used, xp.float64),
                 "1 where the bearing gate refuses the decision", shown=SHARE, over_interval="mean",
             ),
-            Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_SHOWN), f"used {count}", types, counted),
+            Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_UNIT), f"used {count}", types, counted),
             Block(
-                "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_SHOWN), f"refused {count}", types, counted
+                "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_UNIT), f"refused {count}", types, counted
             ),
             bearing_difference,
             last_weight_block(classes),
@@ -205,7 +205,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     # --- the clock
 
     def start(self, initial: Start) -> Filters:
-        """Start all filters on the first radar measurement, and weigh them by the first ESM decision."""
+        """Start all filters on the first radar measurement, and weight them by the first ESM decision."""
         xp = self.xp
         mean = xp.stack([initial.mean] * self.task.classes, axis=1)
         zeros = 0.0 * mean[:2]
@@ -233,7 +233,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Predict by one scan and take in the radar measurement; the ESM decision only counts so far."""
+        """Predict by one scan and update with the radar measurement; the ESM decision is only counted."""
         xp, models, f = self.xp, self.task.models, state
         if self.mixes:
             mean, covariance, log_predicted, innovation, log_likelihood = class_fusion.advance(
@@ -270,13 +270,12 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         )
 
     def _average(self, old: Array, new: Array) -> Array:
-        """Exponential average with a new value taken in."""
         return self.forgetting * old + (1.0 - self.forgetting) * new
 
     def _count_decisions(
         self, used_counts: Array, refused_counts: Array, measurement: Measurement
     ) -> tuple[Array, Array, Array]:
-        """Whether the gate (6) lets this scan's decision pass, and the counts with it."""
+        """Return whether this scan's decision is within the gate (6), and the updated counts."""
         xp, decision = self.xp, measurement.decision
         decided = one_hot(decision, self.task.types, xp)
         used = (decision < self.task.types) & (xp.abs(measurement.bearing_difference) <= self.gate)
@@ -284,7 +283,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         return used, used_counts + accepted, refused_counts + (decided - accepted)
 
     def _esm_log_likelihood(self, used: Array, measurement: Measurement) -> Array:
-        """Logarithm of pi(rho | s) of a decision that may be used, otherwise 0, ``(M, N)``."""
+        """Return log pi(rho | s) of a decision within the gate, otherwise 0, ``(M, N)``."""
         usable = self.xp.where(used, measurement.decision, self.task.types)
         return self.xp.take(self.log_esm, usable, axis=1)
 
@@ -296,21 +295,21 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         believed = imm.mode_posterior(log_predicted, esm) if control == "evidence" else probabilities
         return state._replace(probabilities=probabilities, believed=believed)
 
-    # --- what comes out
+    # --- estimates
 
     def mean(self, state: Filters) -> Array:
-        """Combination of the filters (11), ``(3, N)``."""
+        """Return the combination of the filters (11), ``(3, N)``."""
         return weighted_sum(state.probabilities, state.mean)
 
     def covariance(self, state: Filters) -> Array:
-        """Covariance (12), with the spread of the filters."""
+        """Return the covariance (12), including the spread of the filters, ``(3, 3, N)``."""
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Weights, NIS, and the log-density of the radar measurement as the filters predict it.
+        """Return the weights, NIS, and the predictive log-density of the radar measurement.
 
-        The NIS of the bank is the mean over the classes by their probability given the radar; where these are
-        calibrated its expectation is 2, that of the true class's filter.
+        The NIS of the bank is the mean over the classes by their probability given the radar. If these are
+        calibrated, its expectation is 2, that of the true class's filter.
         """
         squared = ordered_sum(state.innovation * state.innovation)
         nis = weighted_sum(imm.softmax(state.log_predicted), squared)
@@ -324,5 +323,5 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
 
 
 def one_hot(index: Array, count: int, xp: ModuleType) -> Array:
-    """Rows of which the one with the index is 1, ``(count, N)``."""
+    """Return the one-hot encoding of indices ``(N,)``, ``(count, N)``."""
     return xp.astype(xp.arange(count, device=index.device)[:, None] == index, xp.float64)

@@ -1,4 +1,4 @@
-"""What makes a track of RadarEsmTracking costly: each class, a change of it, silence, a second emitter, outliers."""
+"""Causes of costs of RadarEsmTracking: each class, a change of it, silence, a second emitter, outliers."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,9 +8,9 @@ from ..contract.observation import Array
 from .world import DISTURBANCES
 
 AFTERMATH = 20.0
-"""Scans after a change of class: 10 s."""
+"""Scans that count as after a change of class: 10 s."""
 RANGE_EDGES = (50.0, 100.0)
-"""km."""
+"""Edges of the classes of range, km."""
 
 
 def _is_of_class(number: int) -> Callable[[Moment], Array | None]:
@@ -36,10 +36,10 @@ def _has_second_emitter(moment: Moment) -> Array | None:
 
 
 def causes_of(classes: Sequence[str]) -> tuple[Cause, ...]:
-    """Return the causes, one for each class among them.
+    """Return the causes, with one for each class.
 
     Args:
-        classes: their names.
+        classes: names of the classes.
     """
     return (
         *(

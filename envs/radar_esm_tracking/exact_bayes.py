@@ -1,27 +1,27 @@
 r"""Bayes' rule over class, change of class, emitter types, silences and a second emitter of RadarEsmTracking.
 
-A hypothesis is a class, and since when: from the start, or since one of B onsets, or longer ago. Each has a Kalman
-filter of its own, updated with the class's model. The ESM is weighed by the forward recursion of
-:mod:`~filtergym.filters.emitter_association`. With s the class, o the onset, j the type and e what is not known of the
-second emitter and of the target's silences,
+A hypothesis is a class and its onset: the start, one of B onsets, or an older one. Each has its own Kalman
+filter, updated with the class's model. The forward recursion of :mod:`~filtergym.filters.emitter_association` weights
+the ESM decisions. With s the class, o the onset, j the type and e the unknowns of the second emitter and of the
+target's silences,
 
     P(s, j, e)     = v(s) P(j | s) P(i(e) | s) T0(j, e)      for targets whose class has not changed            (1)
     P(s, o, j, e)  = w(s, o, j) T1(j, e)                     for targets whose class has changed               (2)
 
-where T0 is the likelihood of all decisions, v and w hold the radar's, and T1 sums to one over e. (1) is exact on the
-grid of e: as long as no class changes, this is Bayes' rule. (2) supposes that, given the type of now, the time of the
-change tells nothing about the second emitter and the silences. What else is approximate:
+where T0 is the likelihood of all decisions, v and w contain that of the radar, and T1 sums to one over e. (1) is exact
+on the grid of e: as long as no class changes, this is Bayes' rule. (2) assumes that, given the present type, the time
+of the change is independent of the second emitter and the silences. Further approximations:
 
-* Classes change at one scan of every ``spacing`` (the scans at which the ESM looks), and an onset that is older than B
-  of these is merged, by its moments, with all older ones of its class.
-* Where a change begins, the filters of the classes before are one Gaussian with their mean and covariance.
-* Rates of silence, and the share of looks at which the second emitter is heard, lie on a few points each; its bearing
-  on a few points on either side.
+* Classes change at one scan of every ``spacing`` (the scans at which the ESM looks). An onset older than B of these is
+  merged, by its moments, with all older ones of its class.
+* At a change the filters of the previous classes are merged to one Gaussian with their mean and covariance.
+* Rates of silence, and the share of looks at which the ESM receives the second emitter, lie on a few points each; its
+  bearing on a few points on either side.
 * The radar's coloured errors have one strength and one correlation time for all targets.
-* Outliers, where the prior has any, are weighed by each filter on its own.
+* Each filter weights outliers separately, if the prior has any.
 
-It is the estimator ``exact-bayes`` of the baselines, and the control ``hypotheses`` multiplies its settings by factors
-f at each scan. Before the radar is taken in,
+This is the estimator ``exact-bayes`` of the baselines. The control ``hypotheses`` multiplies its settings by factors
+f at each scan. Before the radar update,
 
     P(s, h) <- P(s, h) f(s) f4^changed(h),    T(j, e) <- T(j, e) f5^disturbed(e)    normalised again by Bayes' rule
     Q <- f6 Q,    R <- f7 R
@@ -47,53 +47,53 @@ from ..contract.observation import Array
 from .problem import RadarEsmProblem
 from .world import Measurement, Start
 
-LEAST_NUMBER = 1e-200
-"""Of a probability, before all are normalised: an outlier of many sigma leaves more than one hypothesis at zero, whose
-share among themselves would be none."""
+SMALLEST_PROBABILITY = 1e-200
+"""Smallest probability before the normalisation: otherwise an outlier of many sigma would set several hypotheses to
+zero, and their ratios would be lost."""
 
 
 class ClassPrior(NamedTuple):
-    """What the filter expects before it has seen anything; times in s."""
+    """Prior of the filter; times in s."""
 
     change_rate: float = 0.0077
-    """Changes of class expected in a second."""
+    """Expected number of changes of class per second."""
     change: tuple[float, float] = (5.0, 55.0)
-    """When the class may change."""
+    """Limits of the time at which the class may change, s."""
     again: bool = False
-    """Whether it may change more than once."""
+    """Whether the class may change more than once."""
     onsets: int = 2
-    """B, times of a change that are told apart."""
+    """B, the number of onsets with their own hypothesis."""
     redrawn: float = 0.0
     """Probability that the type is drawn anew for every decision."""
     second_emitter: tuple[float, ...] = (0.127, 0.473)
-    """Shares of the looks at which a second emitter is heard, all equally probable."""
+    """Shares of the looks at which a second emitter is received, all equally probable."""
     silence_start: tuple[float, ...] = (0.25,)
     """Probabilities at a look that the target falls silent, all equally probable."""
     silence_end: tuple[float, ...] = (0.525,)
-    """That it radiates again, likewise."""
+    """Probabilities at a look that a silent target radiates again, all equally probable."""
     separation: tuple[float, float] = (2.0, 20.0)
     """Limits of the second emitter's distance in bearing, degrees, to either side."""
     sides: int = 3
-    """Points of it on either side."""
+    """Grid points of the separation on either side."""
     calm: float = 1.0 / 6.0
     """Probability of a target without change of class and second emitter."""
     outliers: float = 0.0
     """Probability of an outlier of the radar."""
     outlier_factor: float = 5.0
-    """Its standard deviation over that of the others."""
+    """Standard deviation of an outlier over that of other errors."""
     coloured: float = 0.3
-    """Standard deviation of the radar's coloured errors, in units of the white ones; zero: they are not modelled."""
+    """Standard deviation of the radar's coloured errors over that of the white ones; zero: not modelled."""
     correlation_time: float = 6.0
-    """Of these errors."""
+    """Correlation time of these errors, s."""
 
 
 TRAINING = ClassPrior()
-"""Of ``random``: a change between 5 and 55 s in a third of the disturbed episodes; the second emitter's share is
-uniform from 0 to 0.6, of which these are the two points of Gauss and Legendre; rates of silence at their means. Four
-points of the share, four of the rates, eight onsets and a fourth point of the bearing change the cost by less than
+"""Prior of the scenario ``random``: a change between 5 and 55 s in a third of the disturbed episodes; the second
+emitter's share is uniform from 0 to 0.6, with the two points of Gauss and Legendre; rates of silence at their means.
+Four points of the share, four of the rates, eight onsets and a fourth point of the bearing change the cost by less than
 0.03 %."""
 FEW = TRAINING._replace(onsets=1, second_emitter=(0.3,), sides=1)
-"""For whoever has little time: one onset, and of the second emitter the mean share and one distance on either side."""
+"""Prior with little computing time: one onset, the mean share of the second emitter and one distance on either side."""
 VAGUE = ClassPrior(
     change_rate=0.004,
     change=(0.0, math.inf),
@@ -105,17 +105,17 @@ VAGUE = ClassPrior(
     outliers=0.02,
     coloured=0.2,
 )
-"""Ours, for targets of which little is known: the class may change at any time and again, types may be drawn anew, and
-measurements of the radar may be outliers."""
+"""Prior for targets of which little is known (ours): the class may change at any time and repeatedly, types may be
+drawn anew, and radar measurements may be outliers."""
 
 
 class ClassTracks(NamedTuple):
-    """Hypotheses; S classes, M = B + 2 hypotheses each (unchanged, B onsets, older), J labels of emitters."""
+    """Hypotheses of S classes with M = B + 2 each (unchanged, B onsets, older), and J labels of emitters."""
 
     mean: Array
-    """``(3, S, M, N)``."""
+    """Means, ``(3, S, M, N)``."""
     covariance: Array
-    """Packed, ``(6, S, M, N)``."""
+    """Packed covariances, ``(6, S, M, N)``."""
     weights: Array
     """Probabilities of the hypotheses, ``(S, M, N)``."""
     unchanged: Array
@@ -125,27 +125,27 @@ class ClassTracks(NamedTuple):
     first: Array
     """T0, ``(J, 2, V, N)``."""
     later: Array
-    """T1, likewise."""
+    """T1, ``(J, 2, V, N)``."""
 
 
 class ClassState(NamedTuple):
     """State of the filter."""
 
     mean: Array
-    """Of all hypotheses together, ``(3, N)``."""
+    """Mean of all hypotheses together, ``(3, N)``."""
     covariance: Array
-    """``(3, 3, N)``."""
+    """Covariance of all hypotheses together, ``(3, 3, N)``."""
     tracks: ClassTracks
     likelihood: Likelihood
 
 
 class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
-    """Filter.
+    """Bayes filter over classes, changes of class and emitters.
 
     Args:
         task: the problem.
-        prior: what it expects.
-        changed: fields of the prior that are otherwise.
+        prior: the prior.
+        changed: fields of the prior with other values.
     """
 
     def __init__(self, task: RadarEsmProblem, prior: ClassPrior = TRAINING, **changed: Any) -> None:
@@ -170,7 +170,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         self.deviation: float = math.hypot(p.radar_bearing_sigma, p.esm_bearing_sigma)
         recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
         redrawn = class_fusion.decision_probabilities(recognition, composition)
-        # Labels of the target: its type, or the class whose types are drawn anew.
+        # Labels of the target: its type, or the class if types are drawn anew.
         labels = numpy.concatenate(
             [(1.0 - prior.redrawn) * composition, prior.redrawn * numpy.eye(self.classes)], axis=1
         )
@@ -197,12 +197,12 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         self.grid = emitters.Surroundings(grid.other_type, *(task.constant(part) for part in grid[1:]))
 
     def start(self, initial: Start) -> ClassState:
-        """Start on the first radar measurement, and weigh the classes by the first look."""
+        """Start on the first radar measurement, and weight the classes by the first look."""
         unknown = Likelihood.unknown(initial.mean[0])
         return ClassState(initial.mean, initial.covariance, self.start_tracks(initial), unknown)
 
     def start_tracks(self, initial: Start) -> ClassTracks:
-        """Hypotheses at the start."""
+        """Return the initial hypotheses."""
         xp, p, M = self.xp, self.prior, self.prior.onsets + 2
         none = 0.0 * initial.mean[0]
         state = xp.concat([initial.mean, xp.zeros((self.states - 3, 1)) + none])
@@ -210,7 +210,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         covariance = self.start_covariance + xp.zeros((1, 1, 1, M, 1)) + none
         table = self.start_table + none
         nothing = xp.zeros((self.classes, p.onsets + 1, table.shape[0], 1)) + LEAST_PROBABILITY + none
-        return self.weigh(
+        return self.normalise(
             mean,
             packed_covariance.pack(covariance),
             self.prior_of_class + none,
@@ -220,12 +220,12 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
 
     def look(self, measurement: Measurement) -> Array:
-        """Likelihood of this scan's look, ``(J, 2, V, N)``."""
+        """Return the likelihood of the ESM look of this scan, ``(J, 2, V, N)``."""
         look = emitters.Look(measurement.looked, measurement.decision, measurement.bearing_difference)
         return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
 
-    def of_classes(self, table: Array, points: list[list[int]]) -> Array:
-        """Sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``; over some points of the grid for each type."""
+    def class_likelihoods(self, table: Array, points: list[list[int]]) -> Array:
+        """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, at some grid points of each type."""
         both = table[:, 0] + table[:, 1]
         sums = [ordered_sum(both[:, v] for v in some) for some in points if some]
         types = [i for i, some in enumerate(points) if some]
@@ -240,10 +240,10 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             ]
         )  # fmt: skip
 
-    def weigh(
+    def normalise(
         self, mean: Array, covariance: Array, unchanged: Array, changed: Array, first: Array, later: Array
     ) -> ClassTracks:
-        """Normalise everything: T0 and T1 sum to one, and the probabilities of the hypotheses do."""
+        """Normalise T0, T1 and the probabilities of the hypotheses to sums of one."""
         xp = self.xp
         total = ordered_sum(ordered_sum(ordered_sum(first)))
         first, unchanged = first / total, unchanged * total
@@ -251,7 +251,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         later = xp.stack([part / total for part, total in zip(later, sums, strict=True)])
         weights = xp.concat(
             [
-                (unchanged * self.of_classes(first, self.by_type))[:, None],
+                (unchanged * self.class_likelihoods(first, self.by_type))[:, None],
                 ordered_sum(changed[:, :, j] for j in range(changed.shape[2])),
             ],
             axis=1,
@@ -268,7 +268,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
 
     def apply_factors(self, memory: ClassTracks, logarithms: Array) -> ClassTracks:
-        """Multiply the probabilities of classes, of changes and of a second emitter by factors of these logarithms."""
+        """Multiply the probabilities of classes, changes and a second emitter by factors, given as logarithms."""
         xp, S = self.xp, self.classes
         classes, changed = xp.exp(logarithms[:S]), xp.exp(logarithms[S])
         second_emitter = xp.exp(self.disturbed * logarithms[S + 1])
@@ -290,7 +290,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         """Predict all hypotheses to the next scan.
 
         Args:
-            memory: hypotheses after a scan.
+            memory: hypotheses after the previous scan.
             process: factor on the covariance of the process noise, ``(N,)`` or a number.
 
         Returns:
@@ -300,7 +300,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return kalman.predict(memory.mean, P, self.F, process * self.Q)
 
     def update(self, state: ClassState, given: FilterInput) -> ClassState:
-        """One cycle: motion and radar, change of class, ESM. Its likelihood is that of the radar."""
+        """Update with a scan: motion and radar, change of class, ESM; the likelihood is that of the radar."""
         xp, prior, memory, measurement = self.xp, self.prior, state.tracks, given.measurement
         process, variance = 1.0, self.variance
         if given.action is not None:
@@ -328,8 +328,8 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             mean=radar.mean,
             covariance=packed_covariance.pack(radar.covariance),
             weights=weights / seen,
-            unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, LEAST_NUMBER, None),
-            changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], LEAST_NUMBER, None),
+            unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, SMALLEST_PROBABILITY, None),
+            changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], SMALLEST_PROBABILITY, None),
         )
         moved = self.change(moved, measurement.scan)
         looked = measurement.looked
@@ -338,8 +338,10 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
         look = self.look(measurement)
         first, later = first * look, later * look
-        told = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
-        memory = self.weigh(moved.mean, moved.covariance, moved.unchanged, moved.changed * told, first, later)
+        marginal = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
+        memory = self.normalise(
+            moved.mean, moved.covariance, moved.unchanged, moved.changed * marginal, first, later
+        )
         n, size = self.states, self.classes * (prior.onsets + 2)
         P = packed_covariance.unpack(memory.covariance, n)
         estimate, covariance = imm.combine(
@@ -352,7 +354,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return ClassState(estimate, mirror_lower(covariance), memory, likelihood)
 
     def change(self, m: ClassTracks, scan: Array) -> ClassTracks:
-        """Let the class change, at one scan of every ``spacing``."""
+        """Apply the change of class, at one scan of every ``spacing``."""
         xp, prior, B, others = self.xp, self.prior, self.prior.onsets, self.classes - 1
         p, S, n = self.parameters, range(self.classes), self.states
         seconds = p.sampling_interval * scan
@@ -360,8 +362,8 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         hazard = xp.where(may, 1.0 - math.exp(-prior.change_rate * self.spacing * p.sampling_interval), 0.0)
         again = hazard if prior.again else 0.0 * hazard
 
-        # What leaves each class, and its filter.
-        leaving = hazard * m.unchanged * self.of_classes(m.first, self.disturbed_by_type)
+        # The share that leaves each class, and its filter.
+        leaving = hazard * m.unchanged * self.class_likelihoods(m.first, self.disturbed_by_type)
         states, P = m.mean[:, :, 0], packed_covariance.unpack(m.covariance, self.states)
         spreads = P[:, :, :, 0]
         if prior.again:
@@ -422,7 +424,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return ClassTracks(everything[:n], everything[n:], m.weights, m.unchanged, changed, first, later)
 
     def change_tables(self, m: ClassTracks, hazard: Array, again: Array, born: Array) -> tuple[Array, Array]:
-        """T0 without what has left, T1 with it."""
+        """Return T0 without the changed share, and T1 with it."""
         xp, J, grid = self.xp, m.first.shape[0], self.grid
         classes, types = range(self.classes), self.others.shape[1]
         joint = [

@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the estimator ``exact-bayes`` with settings that an action multiplies."""
+"""Control ``hypotheses``: the action multiplies settings of the estimator ``exact-bayes``."""
 
 import math
 from collections.abc import Sequence
@@ -33,33 +33,33 @@ LEAST = 1e-9
 
 
 class HypothesesState(NamedTuple):
-    """The filter at one moment; S classes."""
+    """State of the filter, with S classes."""
 
     own: ClassState
-    """After the last action."""
+    """State of the estimator after the last action."""
     likelihood: Likelihood
-    """Of the radar measurement as the estimator predicts it."""
+    """Likelihood of the radar measurement under the estimator's prediction."""
     action: Array
     """Last action, ``(S + 4, N)``."""
     innovation: Array
-    """Of all hypotheses together, whitened, ``(2, N)``."""
+    """Whitened innovation of all hypotheses together, ``(2, N)``."""
     prior: Array
     """Logarithm of the predicted sigma of range and range rate over the radar's, ``(2, N)``."""
     predicted: Array
     """Probabilities before the scan, at least :data:`LEAST`, of classes that have not changed, then of those that have,
     ``(2 S, N)``."""
     probability: Array
-    """The same after the scan, if the action is zero."""
+    """The same probabilities after the scan under the action zero, ``(2 S, N)``."""
     second_emitter: Array
-    """Probability then of a second emitter if the class has not changed, ``(N,)``."""
+    """Probability of a second emitter given an unchanged class, after the scan under the action zero, ``(N,)``."""
     entropy: Array
-    """Of the hypotheses then, over the largest possible, ``(N,)``."""
+    """Entropy of the hypotheses, after the scan under the action zero, over the largest possible, ``(N,)``."""
     mean: Array
     """Estimate of each class after the last action, ``(3, S, N)``."""
     probabilities: Array
     """Probabilities of the classes after the last action, ``(S, N)``."""
     used: Array
-    """Whether there is an ESM decision at this scan, ``(N,)`` of booleans; all are used."""
+    """Whether there is an ESM decision at this scan, ``(N,)`` of booleans; every decision is used."""
 
 
 class HypothesesBank(SettingsBank):
@@ -76,7 +76,7 @@ class HypothesesBank(SettingsBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Innovation, its likelihood, probabilities of classes and of a second emitter, the ESM, and the clock."""
+        """Return innovation, likelihood, probabilities of classes and of a second emitter, the ESM, and the clock."""
         xp, p = self.xp, self.parameters
         unit = math.log(2.0 * math.pi * p.range_sigma * p.range_rate_sigma)
         return (
@@ -107,7 +107,7 @@ class HypothesesBank(SettingsBank):
         )  # fmt: skip
 
     def start(self, initial: Start) -> HypothesesState:
-        """Start where the estimator starts."""
+        """Return the estimator at its initial state."""
         xp, own, none = self.xp, self.own.start(initial), 0.0 * initial.mean[0]
         groups = self.group(own.tracks.weights)
         return HypothesesState(
@@ -125,12 +125,12 @@ class HypothesesBank(SettingsBank):
         )
 
     def group(self, weights: Array) -> Array:
-        """Probabilities of unchanged and of changed classes, ``(2 S, N)``, of those of hypotheses, ``(S, M, N)``."""
+        """Return the probabilities of unchanged and changed classes, ``(2 S, N)``, from hypotheses ``(S, M, N)``."""
         changed = ordered_sum(weights[:, h] for h in range(1, weights.shape[1]))
         return self.xp.concat([weights[:, 0], changed])
 
     def class_estimates(self, own: ClassState) -> dict[str, Array]:
-        """Mean and probability of each class."""
+        """Return the mean ``(3, S, N)`` and probability ``(S, N)`` of each class."""
         tracks, hypotheses = own.tracks, range(own.tracks.weights.shape[1])
         probabilities = ordered_sum(tracks.weights[:, h] for h in hypotheses)
         total = ordered_sum(tracks.weights[:, h] * tracks.mean[:3, :, h] for h in hypotheses)
@@ -140,7 +140,7 @@ class HypothesesBank(SettingsBank):
         }
 
     def look(self, state: HypothesesState, found: ClassState, measurement: Measurement) -> HypothesesState:
-        """Show the innovation of all hypotheses together, and probabilities before and after the scan."""
+        """Compute the joint innovation and the probabilities before and after the scan."""
         xp, bank, tracks = self.xp, self.own, state.own.tracks
         size = tracks.weights.shape[0] * tracks.weights.shape[1]
         mean, P = bank.predict_motion(tracks)
@@ -153,7 +153,7 @@ class HypothesesBank(SettingsBank):
         noise = xp.stack([xp.stack([R[0] + none, none]), xp.stack([none, R[1] + none])])
         after = found.tracks
         disturbed, every = (
-            ordered_sum(after.unchanged * bank.of_classes(after.first, points))
+            ordered_sum(after.unchanged * bank.class_likelihoods(after.first, points))
             for points in (bank.disturbed_by_type, bank.by_type)
         )
         p = xp.reshape(after.weights, (size, -1))
@@ -169,7 +169,7 @@ class HypothesesBank(SettingsBank):
         )
 
     def act(self, state: HypothesesState, measurement: Measurement, action: Array) -> HypothesesState:
-        """Update with the settings multiplied."""
+        """Update with the settings multiplied by the action's factors."""
         after = super().act(state, measurement, action)
         return after._replace(**self.class_estimates(after.own))
 

@@ -1,18 +1,18 @@
-r"""The filters of RadarEsmTracking that a recurrent network steers from inside: the learned estimator ``kalman-net``.
+r"""The learned estimator ``kalman-net`` of RadarEsmTracking: a recurrent network sets noises and gains of the filters.
 
-The paper's algorithm, whose Kalman filters of the classes have two covariances each: that of the errors, P, and the one
-that the gain is computed from, M. At every scan the network answers with numbers in [-1, 1]: evidence of every class
-as under control ``evidence``, then a_0 for the acceleration and a_i for the radar's range and range rate, and as many
-again, b_0 and b_i; they are the same for all classes:
+This is the paper's algorithm with two covariances for the Kalman filter of each class: P of the errors, and M, from
+which the gain is computed. At every scan the network returns numbers in [-1, 1]: evidence of every class as under
+control ``evidence``, then a_0 for the acceleration and a_i for the radar's range and range rate, then b_0 and b_i
+like them. They are the same for all classes:
 
     noise    Q(s) = noise_range^(2 a_0) Q(s),  R_i = noise_range^(2 a_i) R_i,  P' = Phi P Phi^T + Q(s)
     gain     M' = Phi M Phi^T + caution^(2 b_0) Q(s),  K = M' H^T (H M' H^T + diag(caution^(2 b_i) R_i))^-1,
              M = (I - K H) M'
     update   x = x' + K Delta,  P = (I - K H) P' (I - K H)^T + K R K^T                              (Joseph form)
 
-The likelihoods of the classes are of P' and R under the answer to the scan before. All zero is the paper's algorithm. M
-follows the Riccati equation of noises between limits, so that the filters are stable whatever is answered. References
-and reading stand in ``maneuvering_target/kalman_net.py``.
+The likelihoods of the classes use P' and R of the previous scan's output. All zero is the paper's algorithm. M follows
+the Riccati equation of noises between limits, so that the filters are stable for any output. References and reading are
+in ``maneuvering_target/kalman_net.py``.
 """
 
 import math
@@ -32,23 +32,23 @@ from .problem import RadarEsmProblem
 from .world import Measurement, Start
 
 EVIDENCE = 12.0
-"""Nats that an answer of one adds to the logarithm of a class's probability: here nobody explores."""
+"""Nats that an output of one adds to the log-probability of a class; larger than for policies, which explore."""
 NOISE_RANGE = 3.0
 """Largest factor and divisor of the deviations of accelerations and radar errors."""
 CAUTION = 3.0
-"""Likewise in the gain alone."""
+"""Largest factor and divisor of these deviations in the gain alone."""
 MEASURED = (0, 1)
 """Range and range rate."""
 NOISES = ("acceleration", "range", "range_rate")
 
 
 class NetFilters(NamedTuple):
-    """As :class:`~.banks.Filters`, with packed covariances, that of the gain and the last answer."""
+    """Fields of :class:`~.banks.Filters` with packed covariances, the covariance of the gain and the last output."""
 
     mean: Array
-    """After the action, predicted between :meth:`KalmanNetBank.predict` and the action, ``(3, M, N)``."""
+    """Means, ``(3, M, N)``; between :meth:`KalmanNetBank.predict` and the action predicted."""
     covariance: Array
-    """Likewise, and then without process noise, ``(6, M, N)``."""
+    """Packed covariances, ``(6, M, N)``; between ``predict`` and the action predicted without process noise."""
     log_predicted: Array
     innovation: Array
     log_squared: Array
@@ -65,11 +65,11 @@ class NetFilters(NamedTuple):
     gain_covariance: Array
     """M after an action, ``(6, M, N)``."""
     action: Array
-    """``(A, N)``."""
+    """Last output of the network, ``(A, N)``."""
 
 
 class KalmanNetBank(ClassBank):
-    """The paper's filters, whose noises, gains and weights the action sets."""
+    """Bank of the paper's filters with noises, gains and weights from the action."""
 
     def __init__(self, task: RadarEsmProblem, control: str) -> None:
         super().__init__(task, control)
@@ -87,12 +87,12 @@ class KalmanNetBank(ClassBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Evidence, noises, and what the gain alone takes for them."""
+        """Return the space of evidence, noises, and their factors in the gain alone."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Also how sure the filters are of the range, and the last answer."""
+        """Return the blocks of the bank, with the predicted deviation of the range and the last output."""
         unit, place = 1.0 / self.radar_variances[0], packed_covariance.position(3, 0, 0)
         return (
             *super().blocks,
@@ -107,20 +107,20 @@ class KalmanNetBank(ClassBank):
         )
 
     def start(self, initial: Start) -> Any:
-        """Start as the paper's algorithm, as :class:`NetFilters`."""
+        """Return the initial state of the paper's algorithm as :class:`NetFilters`."""
         fields = super().start(initial)._asdict()
         fields["covariance"] = covariance = packed_covariance.pack(fields["covariance"])
         action = self.xp.stack([0.0 * initial.mean[0]] * len(self.answers))
         return NetFilters(**fields, gain_covariance=covariance, action=action)
 
     def noises(self, action: Array) -> tuple[Array, list[Array]]:
-        """Factor on the process noise, ``(N,)``, and variances of the radar, each ``(N,)``."""
+        """Return the factor on the process noise, and the variances of range and range rate, ``(N,)`` each."""
         classes = self.task.classes
         scale = self.xp.exp(2.0 * math.log(NOISE_RANGE) * action[classes : classes + len(NOISES)])
         return scale[0], [scale[1 + i] * variance for i, variance in enumerate(self.radar_variances)]
 
     def predict(self, state: Any, measurement: Measurement) -> Any:
-        """Predict by one scan, and compare the radar measurement with what is expected."""
+        """Predict by one scan, and compute the innovation statistics of the radar measurement."""
         xp, f = self.xp, state
         mean = apply(self.task.models.Phi[..., None], f.mean)
         covariance = apply(self.propagator, f.covariance)
@@ -153,7 +153,7 @@ class KalmanNetBank(ClassBank):
         )
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
-        """Update by the gains that were answered, let the class change, and weigh the filters."""
+        """Update with the gains of the output, apply the class transition, and weight the filters."""
         xp, classes, f = self.xp, self.task.classes, state
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         process, radar = self.noises(a)
@@ -195,6 +195,6 @@ class KalmanNetBank(ClassBank):
         )
 
     def covariance(self, state: Any) -> Array:
-        """Covariance (12), with the spread of the filters."""
+        """Return the covariance (12), including the spread of the filters, ``(3, 3, N)``."""
         each = packed_covariance.unpack(state.covariance, 3)
         return imm.combine(state.mean, each, state.probabilities)[1]

@@ -1,4 +1,4 @@
-"""Radar and ESM as they speak, as measurements of RadarEsmTracking; columns as of :mod:`.logs`."""
+"""Live measurements of radar and ESM for RadarEsmTracking, with the columns of :mod:`.logs`."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,15 +12,15 @@ from .world import Measurement, Start
 
 
 class ScanInput(LiveInput):
-    """Range and range rate at every scan, and a decision of the ESM where it heard something.
+    """Reader of range and range rate at every scan, and of the decision of the ESM where there is one.
 
-    The first scan starts the track: it is what :meth:`start` is given, in place of mean and covariance.
+    The first scan starts the track: :meth:`start` takes it in place of mean and covariance.
     """
 
     counter = "scan"
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return columns of a log, also for the start."""
+        """Return the descriptions of the columns of a log, also for the start."""
         texts = {name: column.live_text for name, column in COLUMNS.items()}
         return texts, texts
 
@@ -37,13 +37,12 @@ class ScanInput(LiveInput):
         return Start(**initial, first=first), {"time": time, "count": self.same_of_all(0.0)}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Take a scan."""
+        """Return the measurement of a scan and the memory."""
         scan = memory["count"] + 1.0
         found = self._scan(numpy.atleast_1d(scan), values)
         return found if self.lanes else map_arrays(_first, found), {"time": time, "count": scan}
 
     def _scan(self, scan: numpy.ndarray, values: Mapping[str, Any]) -> Measurement:
-        """Scan of its numbers, ``(N,)``, also of one track."""
         radar = self.read_all(values, ("range", "range_rate"), "at every scan").reshape(2, -1)
         found = read_decisions(LiveValues(self, values), scan, self.parameters)
         return Measurement(scan=scan.astype(numpy.int64), radar=radar, **found)

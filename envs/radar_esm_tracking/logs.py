@@ -1,7 +1,7 @@
-"""Ranges, range rates, bearings and type decisions as measurements of RadarEsmTracking.
+"""Log format of RadarEsmTracking: ranges, range rates, bearings and type decisions.
 
-The first row is scan 0, which starts the track. A decision is the number of an emitter type, empty where the ESM heard
-nothing; beside one stand both bearings, or their difference.
+The first row is scan 0, which starts the track. A decision is the number of an emitter type, empty where the ESM
+received nothing. A row with a decision contains both bearings, or their difference.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ COLUMNS = {
     "range": Column("m"),
     "range_rate": Column("m/s, below zero where the target comes nearer"),
     "decision": Column(
-        "emitter type that the ESM decides for, counted from 0; empty where it heard nothing; optional"
+        "emitter type that the ESM decides for, counted from 0; empty where it received nothing; optional"
     ),
     "radar_bearing": Column("degrees, of the radar; with every decision"),
     "esm_bearing": Column("degrees, of the ESM, counted as the radar's; with every decision"),
@@ -30,10 +30,10 @@ COLUMNS = {
 
 
 def read_log(columns: Columns) -> TrackLog:
-    """Make measurements of one track.
+    """Return the measurements of one track.
 
     Raises:
-        ValueError: for what lacks or cannot be.
+        ValueError: if a column is missing or a value is not possible.
     """
     for name in ("range", "range_rate"):
         if not columns.has(name):
@@ -67,7 +67,7 @@ def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarra
         p: parameters.
 
     Raises:
-        ValueError: if there is no second one.
+        ValueError: if there is no second measurement.
     """
     if measurements["radar"].shape[1] < 2:
         raise ValueError("the first measurement starts the track, and a recording needs a second one")
@@ -84,27 +84,26 @@ def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarra
 
 
 def _start_variances(p: Any) -> list[float]:
-    """Of range, range rate and acceleration at the start; the last is what one of unknown class adds, as in (12)."""
+    """Return the initial variances of range, range rate and acceleration; the last as in (12) for an unknown class."""
     acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
     return [p.range_sigma**2, p.range_rate_sigma**2, acceleration]
 
 
 def _numbers(p: Any) -> dict[str, float]:
-    """Numbers that the reading of a row needs."""
     variances = {f"variance_{i}": variance for i, variance in enumerate(_start_variances(p))}
     return {"types": len(p.recognition), "esm_period": p.esm_period, "horizon": p.horizon, **variances}
 
 
 def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str, numpy.ndarray]:
-    """Make of what radar and ESM report at some scans the arrays of a measurement beside ``scan`` and ``radar``.
+    """Return the arrays of a measurement other than ``scan`` and ``radar`` from the reports of radar and ESM.
 
     Args:
-        readings: rows of a table, or values that come live; n of them.
-        scans: their numbers, ``(n,)``.
+        readings: n rows of a table, or live values.
+        scans: numbers of the scans, ``(n,)``.
         p: parameters.
 
     Raises:
-        ValueError: for a decision that is none, or lacks a bearing.
+        ValueError: for a decision that is no emitter type, or lacks a bearing.
     """
     types, count = len(p.recognition), len(scans)
     decision = optional(readings, "decision", count)
@@ -137,7 +136,7 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
 
 
 def predict_radar(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Range and range rate that an estimate predicts by its acceleration, and those of the radar, ``(2, N)`` each."""
+    """Return the predicted range and range rate, and those of the radar, ``(2, N)`` each."""
     T = parameters.sampling_interval
     distance, rate, acceleration = mean
     predicted = numpy.stack([distance + T * rate + 0.5 * T**2 * acceleration, rate + T * acceleration])

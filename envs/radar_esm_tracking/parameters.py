@@ -1,4 +1,4 @@
-"""Every constant of RadarEsmTracking, with its limits."""
+"""Constants of RadarEsmTracking, with their limits."""
 
 from dataclasses import dataclass
 
@@ -13,20 +13,20 @@ from ..contract.parameters import (
 )
 
 STANDARD_GRAVITY = 9.81
-"""m/s^2."""
+"""Standard gravity, m/s^2."""
 
 
 @dataclass(frozen=True)
 class RadarEsmTrackingParameters(TaskParameters):
-    """Every constant of the task; each is a keyword of ``gym.make``."""
+    """Constants of the task; each is a keyword of ``gym.make``."""
 
     sampling_interval: float = parameter(0.5, above=0.0, at_most=86400.0)
     """Radar revisit time T, s (paper)."""
     horizon: int = parameter(120, at_least=1)
-    """Scans acted on in one episode (ours: 60 s; the paper does not say)."""
+    """Scans with an action in one episode (ours: 60 s; the paper gives none)."""
     decision_interval: int = parameter(4, at_least=1)
-    """Scans for which one action holds (ours: from one ESM decision to the next. What a single scan owes to its weights
-    is lost in the noise: plain PPO found too little in 200,000 decisions of one scan)."""
+    """Scans for which one action holds (ours: from one ESM decision to the next. The noise hides the effect of
+    the weights of a single scan: plain PPO learned too little in 200,000 decisions of one scan)."""
     esm_period: int = parameter(4, at_least=1)
     """Scans from one ESM decision to the next, W (paper: 2 s)."""
     manoeuvrability: tuple[float, ...] = parameter((0.025, 0.033, 0.1), above=0.0)
@@ -45,8 +45,8 @@ class RadarEsmTrackingParameters(TaskParameters):
     range_rate_sigma: float = parameter(20.0, above=0.0)
     """Radar error of the radial velocity, m/s (paper)."""
     radar_bearing_sigma: float = parameter(15.0, above=0.0)
-    """Radar error of the bearing, degrees (as the paper prints it; 1.5 is believable and matters only where
-    there is a second emitter)."""
+    """Radar error of the bearing, degrees (as printed in the paper; 1.5 is plausible and matters only with
+    a second emitter)."""
     esm_bearing_sigma: float = parameter(3.0, above=0.0)
     """ESM error of the bearing, degrees (paper)."""
     association_error: float = parameter(0.1, above=0.0, below=1.0)
@@ -62,7 +62,7 @@ class RadarEsmTrackingParameters(TaskParameters):
         ((0.05, 0.05, 0.85, 0.05), (0.15, 0.70, 0.10, 0.05), (0.45, 0.15, 0.05, 0.35)),
         at_least=0.0, at_most=1.0, stochastic=True,
     )  # fmt: skip
-    """Probability of every emitter type (column) in every class (row) (ours: the paper calls it known and
+    """Probability of every emitter type (column) in every class (row) (ours: the paper assumes it known and
     does not give it)."""
     prior: tuple[float, ...] = parameter(
         (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0), at_least=0.0, at_most=1.0, stochastic=True
@@ -74,9 +74,9 @@ class RadarEsmTrackingParameters(TaskParameters):
     """Class transition probabilities q that the *bank* assumes, row = from, column = to (paper (2): a
     constant class). Anything but the identity makes the filters mix on the weights."""
     evidence_scale: float = parameter(1.5, above=0.0)
-    """Nats that an evidence of one adds to a class's log-posterior (ours: a new policy explores with a deviation of
-    about one, and with more nats the median episode pays for what is won where a class is mistaken; who explores less
-    may ask for 12, enough against a posterior that is sure of a class which has changed)."""
+    """Nats that an evidence of one adds to a class's log-posterior (ours: a new policy explores with a standard
+    deviation of about one. With more nats its gain on mistaken classes costs more in the median episode. A policy that
+    explores less may use 12, enough to correct a posterior that is certain of a class which has changed)."""
     averaging_measurements: float = parameter(10.0, at_least=1.0)
     """Time constant of the exponential averages in the observation, scans (ours)."""
     range_scale: float = parameter(3000.0, above=0.0)
@@ -96,44 +96,46 @@ class RadarEsmTrackingParameters(TaskParameters):
     class_change: tuple[float, float] | None = parameter(None, ascending=True)
     """Limits of the time at which the class changes once, s, later than the first scan; None: never (ours)."""
     class_change_probability: float = parameter(1.0, at_least=0.0, at_most=1.0)
-    """That it changes in an episode, where there are such limits (ours)."""
+    """Probability that the class changes in an episode, if ``class_change`` is given (ours)."""
     silence_start: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, at_most=1.0, ascending=True)
     """Limits of the probability, at each ESM look, that a radiating target falls silent; drawn for each episode
     (ours)."""
     silence_end: tuple[float, float] = parameter((1.0, 1.0), at_least=0.0, at_most=1.0, ascending=True)
-    """Limits of the probability, at each ESM look, that a silent target radiates again; likewise (ours)."""
+    """Limits of the probability, at each ESM look, that a silent target radiates again; drawn for each episode
+    (ours)."""
     second_emitter_probability: tuple[float, float] = parameter(
         (0.0, 0.0), at_least=0.0, at_most=1.0, ascending=True
     )
-    """Limits of the probability that the ESM hears a second emitter, of another class, instead of the target;
-    likewise (ours)."""
+    """Limits of the probability that the ESM receives a second emitter, of another class, instead of the target;
+    drawn for each episode (ours)."""
     second_emitter_separation: tuple[float, float] = parameter(
         (2.0, 20.0), above=0.0, at_most=180.0, ascending=True
     )
-    """Limits of its distance in bearing, degrees, to either side (ours)."""
+    """Limits of the distance of the second emitter in bearing, degrees, to either side (ours)."""
     glint_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That both radar errors of a scan are those of glint, each scan on its own; nobody says so (ours)."""
+    """Probability of glint in both radar errors of a scan, independent for each scan and unreported (ours)."""
     glint_factor: float = parameter(5.0, above=0.0)
-    """Their standard deviation over that of the others (ours)."""
+    """Standard deviation of errors with glint over that of the others (ours)."""
     radar_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
-    """Limits of the stationary standard deviation of coloured errors (first-order Gauss-Markov) of range and of range
-    rate, beside the white ones and in units of theirs; drawn for each episode, one for both (ours)."""
+    """Limits of the stationary standard deviation of coloured errors (first-order Gauss-Markov) of range and range
+    rate, in addition to the white ones and over their standard deviation; drawn for each episode, equal for both
+    (ours)."""
     radar_correlation_time: tuple[float, float] = parameter((10.0, 10.0), above=0.0, ascending=True)
-    """Limits of their correlation time, s; likewise (ours)."""
+    """Limits of the correlation time of the coloured errors, s; drawn for each episode (ours)."""
     radar_correlation: tuple[float, float] = parameter((0.0, 0.0), above=-1.0, below=1.0, ascending=True)
     """Limits of the correlation of the white errors of range and range rate, as of a pulse with frequency modulation,
-    whose range shifts with the Doppler frequency; likewise (ours)."""
+    whose range shifts with the Doppler frequency; drawn for each episode (ours)."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """Probability of an episode without second emitter, change of class, and coloured and correlated radar errors
     (ours). Silences have the law of other episodes."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Names of the classes."""
+        """Return the names of the classes."""
         return tuple(f"S{s}" for s in range(len(self.manoeuvrability)))
 
     def check(self) -> None:
-        """Check what concerns several fields together."""
+        """Raise ValueError for fields that contradict each other."""
         classes, types = len(self.manoeuvrability), len(self.recognition)
         if classes < 2:
             raise ValueError(f"manoeuvrability must name at least two classes, got {self.manoeuvrability!r}")
@@ -152,5 +154,5 @@ class RadarEsmTrackingParameters(TaskParameters):
         check("class_change", self.class_change, tuple[float, float] | None, after_a_scan)
         if self.silence_start[0] + self.silence_end[0] == 0.0:
             raise ValueError(
-                "silence_start and silence_end must not both be 0: who radiates would be undefined"
+                "silence_start and silence_end must not both be 0: the share of silent targets would be undefined"
             )

@@ -1,4 +1,4 @@
-"""Picture of RadarEsmTracking: the acceleration, what the ESM says, class probabilities and errors."""
+"""Picture of RadarEsmTracking: acceleration, ESM decisions, class probabilities and errors."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,15 +30,15 @@ DECISIONS = (0.105, 0.075, 0.395, 0.38)
 LARGEST_SIGMAS = 2.0
 """Height of the acceleration panel at the start, in the true class's standard deviations."""
 LEAST_HEIGHT = 15.0
-"""m/s^2; less would cut off the noise of the agile class's filter on a quiet target."""
+"""Smallest height of the acceleration panel, m/s^2; less would cut off the noise of the agile class's filter."""
 TYPE_NAMES = ("advanced\nfighter", "fighter", "early\nwarning", "missile")
-"""Of the paper's four emitter types."""
+"""Names of the paper's four emitter types."""
 CLASS_ROW = -1.0
-"""Where the true class is drawn below the types."""
+"""Row of the true class below the types."""
 
 
 class RadarEsmTrackingPicture(Picture):
-    """Acceleration by truth, filters and estimate; ESM decisions; probabilities; errors."""
+    """Panels of the acceleration by truth, filters and estimate, ESM decisions, probabilities and errors."""
 
     clock = "scan"
     strips_left: float = 0.56
@@ -54,7 +54,7 @@ class RadarEsmTrackingPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Accelerations, weights, true class and type, and the decision of this scan."""
+        """Return the accelerations, weights, true class and type, and the decision of this scan."""
         filters, truth, decision = state.filter, state.truth, state.measurement.decision[0]
         decided, used = decision < self.task.types, filters.used[0]
         nothing = float("nan")
@@ -70,7 +70,7 @@ class RadarEsmTrackingPicture(Picture):
         }
 
     def begin(self, state: Episode) -> None:
-        """Note when the class changes, and how large accelerations will be."""
+        """Store the time of the class change and the scale of accelerations."""
         truth, p = state.truth, self.task.parameters
         change = int(truth.change_scan[0])
         classes = [int(truth.target_class[0])]
@@ -84,7 +84,7 @@ class RadarEsmTrackingPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Weights and the three errors."""
+        """Return the strips of the weights and the three errors."""
         weights = {mode: f"weight.{s}" for s, mode in enumerate(self.task.modes)}
         limits = {"range": 2000.0, "range_rate": 30.0, "acceleration": 20.0}
         return [
@@ -100,17 +100,17 @@ class RadarEsmTrackingPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """No: the strips say it in the filter's terms."""
+        """Return False: the strips show it in the filter's terms."""
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Scans after the class has changed."""
+        """Return the interval of scans after the change of class."""
         return [] if self.change is None else [(self.change, self.task.horizon + 0.5)]
 
     # --- panels
 
     def open(self, figure: Figure) -> None:
-        """Make both panels."""
+        """Create both panels."""
         top = self.acceleration = figure.add_axes(ACCELERATION)
         bottom = self.decisions = figure.add_axes(DECISIONS)
         legend: dict[str, Any] = {
@@ -160,7 +160,7 @@ class RadarEsmTrackingPicture(Picture):
             [], [], linestyle="", marker="x", markersize=6, markeredgewidth=1.6, color=VERMILLION,
             label="refused by the gate", zorder=3,
         )[0]  # fmt: skip
-        # The colours are those of the weights, whose legend stands beside.
+        # The colours are those of the weights, whose legend is next to this panel.
         self.classes: list[Line2D] = [
             bottom.plot([], [], linestyle="", marker="s", markersize=4, color=color, zorder=3)[0]
             for _, (color, _) in zip(self.task.modes, CURVES, strict=False)
@@ -168,11 +168,11 @@ class RadarEsmTrackingPicture(Picture):
         bottom.legend(ncols=3, **legend)
 
     def arrange(self) -> None:
-        """Limits for this episode's class."""
+        """Set the limits for this episode's class."""
         self.acceleration.set_ylim(-self.height, self.height)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Draw what has been acted on."""
+        """Draw the scans so far."""
         empty = numpy.empty(0)
         times = numpy.arange(1, len(history.get("true", empty)) + 1)
 

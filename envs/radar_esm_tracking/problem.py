@@ -1,4 +1,4 @@
-"""What world, filters and picture of RadarEsmTracking use of their task: counts and models of the classes."""
+"""The part of RadarEsmTracking that world, filters and picture use: counts and models of the classes."""
 
 import numpy
 
@@ -14,7 +14,7 @@ class RadarEsmProblem(Task):
     parameters: RadarEsmTrackingParameters
 
     def set_up(self) -> None:
-        """Count classes and types, and make the models of the classes."""
+        """Count classes and types, and compute the models of the classes."""
         p = self.parameters
         self.classes: int = len(p.manoeuvrability)
         self.types: int = len(p.recognition)
@@ -23,7 +23,7 @@ class RadarEsmProblem(Task):
 
     @staticmethod
     def design_models(p: RadarEsmTrackingParameters) -> tuple[class_fusion.Models, numpy.ndarray]:
-        """Models of the classes and the covariances that the track starts with, ``(3, 3, M)``."""
+        """Return the models of the classes and the initial covariances of the track, ``(3, 3, M)``."""
         T = p.sampling_interval
         Q = []
         for alpha, sigma in zip(p.manoeuvrability, p.acceleration_sigma, strict=True):

@@ -1,6 +1,6 @@
 """Scenarios of RadarEsmTracking: the paper's experiment, the training distribution, and held-out targets.
 
-Windows are scan numbers, first and last included; at 0.5 s a scan they are 0.5-10, 10-30 and 30-60 s.
+Windows are scan numbers, inclusive; at 0.5 s a scan they are 0.5-10, 10-30 and 30-60 s.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ _ANY_TARGET: dict[str, Any] = {
     "silence_start": (0.1, 0.1),
     "silence_end": (0.3, 0.3),
 }
-"""What the held-out targets share (ours)."""
+"""Common parameters of the held-out targets (ours)."""
 
 SCENARIOS: Mapping[str, Scenario] = {
     scenario.name: scenario
@@ -83,7 +83,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "glint",
-            "One scan in ten has radar errors five times as large; no training episode holds any.",
+            "One scan in ten has radar errors five times as large; no training episode has any.",
             {**_ANY_TARGET, "glint_probability": 0.1},
             _WINDOWS,
         ),

@@ -2,7 +2,7 @@
 
 Source: S. L. Ivanov and D. V. Seliverstov, on the joint processing of an airborne radar and an electronic
 support measures (ESM) station with recognition of the target's class (in Russian). Equation numbers are
-theirs; the mathematics stands in ``filters/class_fusion.py`` and ``filters/singer.py``.
+theirs; the equations are in ``filters/class_fusion.py`` and ``filters/singer.py``.
 """
 
 from typing import Any, ClassVar
@@ -26,14 +26,14 @@ from .world import RadarEsmWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return what draws an episode; imported here, because it brings matplotlib."""
+    """Return the class of the picture; imported here, because it imports matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Report the variances, and the weight of the true class where there are weights."""
+    """Return the variances, and the weight of the true class if there are weights."""
     task: Any = model.task
     covariance = model.covariance(episode)
     own = {f"variance_{c.name}": covariance[i, i] for i, c in enumerate(task.components)}
@@ -50,45 +50,45 @@ class RadarEsmTracking(RadarEsmProblem):
 
     A fighter's radar measures range and range rate of one air target every 0.5 s, with errors of 3000 m and
     20 m/s. The target may be anything from an early-warning aircraft (class S0) to an agile fighter or a
-    missile (S2), and the manoeuvre model of the right class is what makes the filter good: on an S0 target
+    missile (S2), and the filter needs the manoeuvre model of the right class: on an S0 target
     the filter for S2 is 4.5 times worse in acceleration. A bank runs one Kalman filter with Singer's
-    manoeuvre model for each class. Every 2 s the electronic support measures (ESM) station, which listens to
-    the target's own emissions, decides for an emitter type; types are distributed differently in the
-    classes. A gate on the difference of the radar's and the ESM's bearings decides whether the two mean one
-    target and the decision may be used.
+    manoeuvre model for each class. Every 2 s the electronic support measures (ESM) station, which receives
+    the target's own emissions, decides for an emitter type; the classes have different distributions of
+    types. A gate on the difference of the radar's and the ESM's bearings decides whether both have one
+    target and the decision is used.
 
-    The agent sees the innovations of the filters and the ESM decisions, and weighs the classes. Zero
+    The agent observes the innovations of the filters and the ESM decisions, and weights the classes. Zero
     ``evidence`` is the paper's algorithm. In order (8)-(10): every filter predicts and updates with the radar
     measurement under the class at the previous scan; the weights in force times the radar likelihoods go
-    through the class transition, and the filters mix on them; the agent is shown the result; the ESM
+    through the class transition, and the filters mix on them; the agent observes the result; the ESM
     decision is the last factor, and the action gives P(s(k)) given everything to k. Evidence is added to the
-    weights of this scan only: Bayes' rule goes on from what it found itself. ``mode`` and ``weights`` replace
-    it, and what they set meets the next transition and mixing at the next scan.
+    weights of this scan only: Bayes' rule continues from its own posterior. ``mode`` and ``weights`` replace
+    the posterior, and the next transition and mixing start from their weights.
 
     With a constant class (``class_transition`` the identity, the default) nothing mixes: the action decides
-    only which combination of the filters is reported now. The filters never feel it, and the problem is
-    myopic: a discount of 0 suffices. Under ``evidence`` it is so whatever the transition.
+    only which combination of the filters is reported now. It does not affect the filters, and the problem is
+    myopic: a discount of 0 suffices. Under ``evidence`` this holds for any transition.
 
     `paper` redraws the emitter type for every decision, which is the assumption behind (8) and makes it
     exactly Bayesian for the radar and the decisions that pass the gate. A real target has one type: in
-    `fixed-type` and all other scenarios the same rule counts one fact again and again and grows sure of a
+    `fixed-type` and all other scenarios the same rule counts one fact repeatedly and becomes certain of a
     wrong class.
 
     Everything is linear, so range and speed of the target have no influence on any error.
 
     ## Action Space
 
-    What each control means stands in ``Actions``. Values outside the box are taken at its edge. An action holds for
+    ``Actions`` describes each control. Values outside the box are clipped to it. An action holds for
     ``decision_interval`` scans, four by default: from one ESM decision to the next.
 
     ## Observation Space
 
     A flat `Box` of float64; `env.unwrapped.observation_fields` lists name, unit and scale of every component.
-    For each class: the whitened innovations of range and range rate (the second is what the first does not
+    For each class: the whitened innovations of range and range rate (the second is the part that the first does not
     explain; their squares add to the normalised innovation squared), log(1 + that square),
     exponential averages of these, the radar log-likelihood of this scan and its sum since the start, both
-    relative to the largest. Of the ESM: the decision (one-hot, or "none"; "refused by the gate" is shown
-    beside the decision it refuses), counts of used and of refused decisions, the bearing difference
+    relative to the largest. Of the ESM: the decision (one-hot, or "none"; "refused by the gate" appears
+    together with the decision), counts of used and of refused decisions, the bearing difference
     over the gate. The last weights and the time. Large values are compressed by y = sign(x) log(1 + |x|), the sum
     of the log-likelihoods, which grows without limit, by y / (1 + |y| / 8).
     Only differences between measurements and predictions enter: range and speed themselves do not.
@@ -98,7 +98,7 @@ class RadarEsmTracking(RadarEsmProblem):
     By default ("log-relative") `log(1 + x0) - log(1 + x)`, x the mean of three squared errors (range over
     `range_scale`, range rate over `range_rate_scale`, acceleration over `acceleration_scale`) in units of 0.05, and
     x0 that of the action zero on the same noise. Most scans cost more than 0.05, so the reward is about the logarithm
-    of a ratio: a few mistaken classes do not rule it. "cost" is `-30 log(1 + x / 30)` in units of 0.3, the mean cost of
+    of a ratio: a few mistaken classes do not dominate it. "cost" is `-30 log(1 + x / 30)` in units of 0.3, the mean cost of
     the paper's algorithm.
 
     ## Starting State
@@ -106,7 +106,7 @@ class RadarEsmTracking(RadarEsmProblem):
     The first radar measurement (scan 0) starts all filters: its range and range rate, no acceleration, with
     variances `range_sigma`^2, `range_rate_sigma`^2, `acceleration_sigma`^2 of the class. The true
     acceleration is drawn with the latter variance. The ESM decides at scan 0 too: that decision multiplies
-    the prior, and the first observation, of scan 1, holds it in the counts and in the last weights.
+    the prior, and the first observation, of scan 1, contains it in the counts and in the last weights.
 
     ## Episode End
 
@@ -115,8 +115,8 @@ class RadarEsmTracking(RadarEsmProblem):
 
     ## Arguments
 
-    Every field of `RadarEsmTrackingParameters` is a keyword of `gym.make`, beside `control`, `scenario`,
-    `reward` and `render_mode`.
+    Every field of `RadarEsmTrackingParameters` is a keyword of `gym.make`, in addition to `control`,
+    `scenario`, `reward` and `render_mode`.
 
     ## Version History
 
@@ -140,8 +140,8 @@ class RadarEsmTracking(RadarEsmProblem):
         Component("acceleration", "m/s^2"),
     )
     modes: tuple[str, ...] = ("S0", "S1", "S2")
-    # The noise of the track is most of the cost, and no weight changes it; a logarithm, because a few mistaken classes
-    # would hide what an action changes in all other episodes.
+    # The noise of the track is most of the cost, and no weight changes it. The reward is logarithmic, because a few
+    # mistaken classes would hide the effect of actions in all other episodes.
     reward: ClassVar[Reward] = Reward(
         "mean of the squared errors of range, range rate and acceleration over range_scale, range_rate_scale "
         "and acceleration_scale",
@@ -158,7 +158,7 @@ class RadarEsmTracking(RadarEsmProblem):
         Actions(
             {
                 "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
-                "mode": "the class that is believed",
+                "mode": "the class whose filter is used",
                 "weights": "class probabilities, normalised; all zero is uniform",
                 "hypotheses": "factors r^a in Bayes' rule over class, its change and emitters at every scan: probability of "
                 "each class (r = 1.15), odds that the class has changed (1.3) and of a second emitter (2), process noise "
@@ -175,7 +175,7 @@ class RadarEsmTracking(RadarEsmProblem):
     )
 
     def set_up(self) -> None:
-        """Name the classes, and with them the paper's action and the causes of cost."""
+        """Set the names of the classes, the paper's action and the causes of cost."""
         super().set_up()
         self.modes = self.parameters.class_names
         self.companions = (Causes(causes_of(self.modes)), *type(self).companions)

@@ -1,4 +1,4 @@
-"""The target of RadarEsmTracking, the radar that measures it and the ESM station that listens to it."""
+"""Target, radar and ESM station of RadarEsmTracking."""
 
 import math
 from typing import Any, NamedTuple
@@ -15,11 +15,11 @@ from .parameters import RadarEsmTrackingParameters
 from .problem import RadarEsmProblem
 
 DISTURBANCES: tuple[type[Disturbance], ...] = (Glint,)
-"""Of the radar, beside its correlated and coloured errors; a further one comes last, so that episodes stay."""
+"""Disturbances of the radar other than correlated and coloured errors; add new ones last to keep episodes equal."""
 
 
 class Truth(NamedTuple):
-    """The target and what radiates around it."""
+    """State of the target, its emitters and the radar errors."""
 
     scan: Array
     """Number of the current scan, integer, ``(N,)``; 0 starts the track."""
@@ -32,68 +32,67 @@ class Truth(NamedTuple):
     change_scan: Array
     """Scan from which the next class governs, ``(N,)``."""
     next_class: Array
-    """``(N,)``."""
+    """Index of the class after the change, ``(N,)``."""
     next_type: Array
-    """``(N,)``."""
+    """Index of the type after the change, ``(N,)``."""
     radiating: Array
-    """Whether the target is heard at ESM looks, ``(N,)`` of booleans."""
+    """Whether the target radiates, ``(N,)`` of booleans."""
     other_class: Array
     """Class of the second emitter, ``(N,)``."""
     other_type: Array
-    """``(N,)``."""
+    """Emitter type of the second emitter, ``(N,)``."""
     separation: Array
-    """Its bearing minus the target's, degrees, ``(N,)``."""
+    """Bearing of the second emitter minus the target's, degrees, ``(N,)``."""
     silence_start: Array
     """Probability at each look that the target falls silent, ``(N,)``."""
     silence_end: Array
     """Probability at each look that a silent target radiates again, ``(N,)``."""
     second_emitter: Array
-    """Probability that the second emitter is heard instead of the target, ``(N,)``."""
+    """Probability that the ESM receives the second emitter instead of the target, ``(N,)``."""
     radar_coloured: Array
-    """Stationary deviation of the radar's coloured errors, in units of the white ones', ``(N,)``."""
+    """Stationary standard deviation of the radar's coloured errors over that of the white ones, ``(N,)``."""
     radar_decay: Array
-    """What is left of them from one scan to the next, ``(N,)``."""
+    """Factor of the coloured errors from one scan to the next, ``(N,)``."""
     radar_kick: Array
-    """Standard deviation of what they gain, in the same units, ``(N,)``."""
+    """Standard deviation of the innovations of the coloured errors, in the same units, ``(N,)``."""
     radar_correlation: Array
-    """Of the white errors of range and range rate, ``(N,)``."""
+    """Correlation of the white errors of range and range rate, ``(N,)``."""
     radar_error: Array
     """Coloured errors of range and range rate now, in the same units, ``(2, N)``."""
     disturbances: dict[str, Any]
-    """State of each by its name, of those that the world has."""
+    """States of the disturbances of the world, by their names."""
 
 
 class Measurement(NamedTuple):
-    """What radar and ESM say at one scan; the radar measures at every scan."""
+    """Measurement of radar and ESM at one scan; the radar measures at every scan."""
 
     scan: Array
     """Scans since the start of the track, integer, ``(N,)``; one scan is ``sampling_interval`` seconds."""
     radar: Array
     """Range (m) and range rate (m/s), ``(2, N)``; errors of ``range_sigma`` and ``range_rate_sigma``."""
     looked: Array
-    """Whether the ESM listened at this scan, ``(N,)`` of booleans; it may have heard nothing."""
+    """Whether the ESM looked at this scan, ``(N,)`` of booleans; it may have received nothing."""
     decision: Array
-    """Index of the emitter type that the ESM decides for, or the number of types where it heard nothing or did not
-    listen, ``(N,)``."""
+    """Index of the emitter type that the ESM decides for, or the number of types without a decision, ``(N,)``."""
     bearing_difference: Array
-    """Radar bearing minus ESM bearing, degrees, wrapped to [-180, 180), ``(N,)``; 0 where there is no decision, where
-    an estimator gets NaN. Reading: the difference and not the two bearings, because the zero of each is the true one
-    here."""
+    """Radar bearing minus ESM bearing, degrees, wrapped to [-180, 180), ``(N,)``; 0 without a decision, where
+    an estimator gets NaN. Reading: the difference and not the two bearings, because each is measured from the true
+    bearing here."""
 
 
 class Start(NamedTuple):
     """The initial estimate given to every filter."""
 
     mean: Array
-    """Range (m) and range rate (m/s) as first measured, acceleration 0, ``(3, N)``."""
+    """First measured range (m) and range rate (m/s), acceleration 0, ``(3, N)``."""
     covariance: Array
-    """``(3, 3, N)``: of the radar, and of the acceleration of a target of unknown class."""
+    """Covariance of the radar, and of the acceleration of a target of unknown class, ``(3, 3, N)``."""
     first: Measurement
-    """The measurement of scan 0; its ESM decision is not yet taken in."""
+    """Measurement of scan 0; the estimate does not include its ESM decision."""
 
 
 class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
-    """A target of one class on one range channel, seen by a radar and heard by an ESM station."""
+    """A target of one class on one range channel, measured by a radar and an ESM station."""
 
     parameters: RadarEsmTrackingParameters
     reading_field = "radar"
@@ -105,7 +104,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         self.radar_is_coloured: bool = p.radar_coloured[1] > 0.0
         further = 2 if self.radar_is_coloured else 0
         self.own_initial_normals, self.own_normals = 5 + further, 7 + further
-        """Normal numbers that come before those of the disturbances."""
+        """Numbers of normal variables before those of the disturbances."""
         self.initial_normals: int = self.own_initial_normals + self.disturbances.initial_normals
         self.normals: int = self.own_normals + self.disturbances.normals
         self.row_uniforms: int = 4 + self.disturbances.row_uniforms
@@ -121,7 +120,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         self.cost_factors: Array = constant(
             [[1.0 / scale] for scale in (p.range_scale, p.range_rate_scale, p.acceleration_scale)]
         )
-        # Thresholds of category, a column for each class or type that lanes look up.
+        # Thresholds of categories, a column for each class or type, which lanes index.
         known = numpy.eye(task.classes)
         share = p.prior if p.true_class == "random" else known[p.class_names.index(p.true_class)]
         self.class_thresholds: Any = _thresholds([share])[:, 0].tolist()
@@ -134,7 +133,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     # --- the target and its emissions
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
-        """Draw the target and its surroundings, measure it and listen to it once."""
+        """Draw the target and its surroundings, and make the measurement of scan 0."""
         xp, p, own = self.xp, self.parameters, self.own_initial_normals
         distance = draws.uniform("initial_range", p.initial_range)
         closing_speed = draws.uniform("closing_speed", p.closing_speed)
@@ -197,20 +196,19 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return truth, Start(mean, self.start_covariance + zero, first)
 
     def _types_of(self, target_class: Array) -> Array:
-        """Thresholds of the emitter types of a class."""
         return self.xp.take(self.type_thresholds, target_class, axis=1)
 
     def _another_class(self, draws: Draws, name: str, target_class: Array) -> Array:
-        """A class other than the given one, all equally probable."""
+        """Return another class than the given one, all equally probable."""
         step = draws.integer(name, (1, self.task.classes - 1))
         return (target_class + self.xp.astype(step, self.xp.int64)) % self.task.classes
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Fly one scan under the class at the previous one, let the class change and fall silent, and measure.
+        """Move by one scan under the previous class, apply class change and silence, and measure.
 
         A row of noise: 3 normal numbers for the motion, 2 for the radar, 2 for the bearings, 2 for the radar's coloured
-        errors where there are any; uniform ones for the type, the decision, the source and falling silent. Those of the
-        disturbances follow on both.
+        errors if there are any; uniform ones for the type, the decision, the source and the silence. Those of the
+        disturbances follow in both groups.
         """
         xp, p = self.xp, self.parameters
         scan, uniforms = truth.scan + 1, noise[self.normals :]
@@ -254,13 +252,13 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     def _measure(
         self, truth: Truth, errors: Array, bearings: Array, uniforms: Array
     ) -> tuple[Truth, Measurement]:
-        """Measure and listen.
+        """Return the measurement of radar and ESM.
 
         Args:
-            truth: at this scan.
-            errors: what makes the radar's white errors of range and range rate, normal numbers, ``(2, N)``.
-            bearings: of the radar's bearing and of the ESM's, likewise.
-            uniforms: for the type, the decision and the source, ``(3, N)``.
+            truth: truth at this scan.
+            errors: normal numbers for the radar's white errors of range and range rate, ``(2, N)``.
+            bearings: normal numbers for the bearings of radar and ESM, ``(2, N)``.
+            uniforms: uniform numbers for the type, the decision and the source, ``(3, N)``.
         """
         xp, p = self.xp, self.parameters
         if p.radar_correlation != (0.0, 0.0):
@@ -296,43 +294,43 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         )
         return truth._replace(disturbances=states), measurement
 
-    # --- how good an estimate is
+    # --- costs and readings
 
     def error_factor(self, truth: Truth) -> Array:
-        """Deviation of this scan's white radar errors over the nominal one, ``(N,)``: not 1 where there is glint."""
+        """Return the ratio of this scan's white radar errors to nominal, ``(N,)``; not 1 with glint."""
         return truth.disturbances.get("glint", self.xp.ones_like(truth.separation))
 
     def state(self, truth: Truth) -> Array:
-        """Range, range rate and acceleration, ``(3, N)``."""
+        """Return the range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Those of range and range rate."""
+        """Return the standard deviations of range and range rate."""
         p = self.parameters
         return self.task.constant([[p.range_sigma], [p.range_rate_sigma]]) + 0.0 * measurement.radar
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
-        """Difference of bearings NaN where the ESM decided nothing."""
+        """Return the measurement with NaN as the difference of bearings without an ESM decision."""
         decided = measurement.decision < self.task.types
         difference = self.xp.where(decided, measurement.bearing_difference, math.nan)
         return measurement._replace(bearing_difference=difference)
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """Range and range rate; nothing of the acceleration."""
+        """Return the readings of range and range rate, and NaN for the acceleration."""
         return self.xp.concat([measurement.radar, measurement.radar[:1] * math.nan])
 
     def component_deviations(self, measurement: Measurement) -> Array:
-        """Those of range and range rate."""
+        """Return the standard deviations of range and range rate."""
         p, once = self.parameters, self.xp.ones_like(measurement.radar[0])
         return self.xp.stack([p.range_sigma * once, p.range_rate_sigma * once, math.nan * once])
 
     def error_cost(self, error: Array) -> Array:
-        """Mean of the three squared errors over their scales."""
+        """Return the mean of the three squared errors over their scales."""
         scaled = error * self.cost_factors
         return ordered_sum(scaled * scaled) * (1.0 / 3.0)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """True class and type, and the time."""
+        """Return the true class and type, and the time."""
         xp = self.xp
         return {
             **self.disturbances.records(truth.disturbances),
@@ -342,9 +340,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Class and type of the target now, when they change (scan) and to what, the second emitter, the radar's errors
-        beside the white ones, and whether the target is silent now.
-        """
+        """Return class and type of the target, their change, the second emitter, further radar errors, and silence."""
         p, xp = self.parameters, self.xp
         never = 0 * truth.change_scan - 1
         changes = (p.class_change is not None) & (truth.change_scan <= p.horizon + 1)
@@ -371,5 +367,5 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
 
 
 def _thresholds(rows: object) -> numpy.ndarray:
-    """Cumulative probabilities that a uniform number is compared with, ``(columns - 1, rows)``."""
+    """Return the cumulative probabilities as thresholds of a uniform number, ``(columns - 1, rows)``."""
     return numpy.cumsum(numpy.array(rows), axis=1)[:, :-1].T

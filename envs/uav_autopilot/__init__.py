@@ -1,4 +1,4 @@
-"""UavAutopilot: everything of one environment; ``task.py`` names it all."""
+"""Environment UavAutopilot; begin with ``task.py``."""
 
 ID = "filtergym/UavAutopilot-v0"
-"""Known before anything else is imported."""
+"""Id of the environment, available without further imports."""

@@ -1,4 +1,4 @@
-"""The Kalman filters of UavAutopilot that are steered; equations (10) to (12), packed as ``packed_covariance``."""
+"""Banks of UavAutopilot: Kalman filters by equations (10) to (12), packed as in ``packed_covariance``."""
 
 import math
 from collections.abc import Sequence
@@ -33,45 +33,45 @@ MODES = ("nominal", "wide-band", "raw-sensors", "over-smoothed")
 FLOORED_LOG = Compression(
     "log of ", lambda value, xp: xp.log(xp.clip(value, 0.01, None)), numpy.exp, (math.log(0.01), LARGEST_LOG)
 )
-"""The logarithm of squares, which may be zero; less than a hundredth of their expectation says no more."""
+"""Logarithm of squares, with a floor of a hundredth of their expectation, because squares may be zero."""
 
 
 class KalmanState(NamedTuple):
-    """N Kalman filters."""
+    """State of N Kalman filters."""
 
     mean: Array
-    """After ``predict`` predicted, after ``act`` updated, ``(n, N)``."""
+    """Mean, predicted after ``predict`` and updated after ``act``, ``(n, N)``."""
     covariance: Array
-    """Packed triangle; after ``predict`` it is ``F P F^T``, without process noise."""
+    """Packed triangle of the covariance; after ``predict`` it is ``F P F^T``, without process noise."""
     estimate: Array
-    """What the autopilot uses and the task reports, ``(n, N)``."""
+    """Estimate that the autopilot uses and the task reports, ``(n, N)``."""
     estimate_covariance: Array
-    """Packed triangle of its covariance."""
+    """Packed triangle of the covariance of ``estimate``."""
     scale: Array
     """Factor on the process noise in the last update, ``(N,)``."""
     action: Array
-    """Last action as shown, ``(A, N)``."""
+    """Last action as observed, ``(A, N)``."""
     innovation: Array
-    """Over sigma; 0 in a dropout, ``(m, N)``."""
+    """Innovation over its sigma; 0 in a dropout, ``(m, N)``."""
     nis: Array
     """Normalised innovation squared per available reading, ``(N,)``."""
     log_likelihood: Array
-    """Log-density of the available readings as predicted, ``(N,)``."""
+    """Log-density of the available readings under their prediction, ``(N,)``."""
     mean_innovation: Array
     """Short average of the innovation, ``(m, N)``."""
     mean_square: Array
-    """Short average of its square, ``(m, N)``."""
+    """Short average of the squared innovation, ``(m, N)``."""
     mean_nis: Array
     """Short average of the NIS, ``(N,)``."""
 
 
 class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
-    """What all controls share: the innovations that are shown, and what comes with them."""
+    """Base of all controls: the observation blocks and the innovation statistics."""
 
     parameters: UavAutopilotParameters
     action_block: Any
     no_action: tuple[float, ...]
-    """What is shown as the last action before the first."""
+    """Observed last action before the first one."""
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -83,7 +83,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What the filter and the autopilot know, scaled; sigmas are the filter's before it is acted on."""
+        """Return the scaled blocks of filter and autopilot; sigmas are those of the filter before the action."""
         sensors, horizon = self.task.sensors, self.task.horizon
         unit = 1.0 / self.task.output_sigma
         return (
@@ -142,7 +142,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Readings and command as they are."""
+        """Return the readings and the command without scaling."""
         sigmas, unit = self.parameters.value("sensor_sigmas"), self.task.output_sigma
         return (
             Quantity(
@@ -160,17 +160,17 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def log_trace(self, state: Any) -> Array:
-        """Log of the predicted covariance's trace."""
+        """Return the log of the trace of the predicted covariance, ``(N,)``."""
         raise NotImplementedError
 
     def compare(self, state: Any, measurement: Measurement, readings: Array, S: Array) -> Any:
-        """Return the state with innovations, and their averages, of readings as predicted.
+        """Return the state with the innovations of readings, and their averages.
 
         Args:
-            state: before the measurement.
-            measurement: that arrives.
-            readings: predicted, ``(m, N)``.
-            S: covariance of their innovations if all sensors answer, ``(m, m, N)``.
+            state: state before the measurement.
+            measurement: the new measurement.
+            readings: predicted readings, ``(m, N)``.
+            S: covariance of the innovations of all sensors, ``(m, m, N)``.
         """
         xp, available, m = self.xp, measurement.available, len(self.task.sensors)
         residual = available * (measurement.reading - readings)
@@ -191,8 +191,10 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
-        """NIS with the number of its readings, their log-density (both NaN in a dropout of all sensors), and the
-        innovation over its sigma of the output's sensor (of the first where the output is not measured).
+        """Return NIS and log-density of the readings, their number, and the innovation of the output over its sigma.
+
+        NIS and log-density are NaN in a dropout of all sensors. The innovation is that of the first sensor if the
+        output is not measured.
         """
         task, xp = self.task, self.xp
         count = ordered_sum(measurement.available)
@@ -206,7 +208,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
 
 
 class _KalmanBank(AutopilotBank):
-    """One Kalman filter: a subclass says what an action does to its noises."""
+    """One Kalman filter; subclasses define the effect of an action on its noises."""
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -223,16 +225,16 @@ class _KalmanBank(AutopilotBank):
         self.diagonal: list[int] = packed_covariance.diagonal(n)
 
     def scaled_noise(self, scale: Array, entries: list[int]) -> Array:
-        """Process noise under a scale ``(N,)``, at some packed entries, ``(entries, N)``."""
+        """Return the process noise under a scale ``(N,)`` at some packed entries, ``(entries, N)``."""
         return scale * self.process_noise[entries]
 
     def log_trace(self, state: KalmanState) -> Array:
-        """Log of the predicted covariance's trace, with the process noise of the last action."""
+        """Return the log of the trace of the predicted covariance under the last action, ``(N,)``."""
         variances = state.covariance[self.diagonal] + self.scaled_noise(state.scale, self.diagonal)
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
     def start(self, initial: Start) -> KalmanState:
-        """Start at the initial estimate, with averages as a consistent filter has them."""
+        """Start at the initial estimate, with the averages of a consistent filter."""
         xp = self.xp
         zeros = 0.0 * self.task.readings_of(initial.mean)
         one = zeros[0] + 1.0
@@ -253,7 +255,7 @@ class _KalmanBank(AutopilotBank):
         )
 
     def predict(self, state: KalmanState, measurement: Measurement) -> KalmanState:
-        """Equation (10), and the innovations, with the process noise of the last action."""
+        """Predict by equation (10), and compute the innovations with the process noise of the last action."""
         m = len(self.task.sensors)
         mean = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         covariance = self.xp.matmul(self.propagator, state.covariance)
@@ -263,21 +265,21 @@ class _KalmanBank(AutopilotBank):
         return compared._replace(mean=mean, covariance=covariance)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Return the action as shown, ``(A, N)``, and the factor on the process noise, ``(N,)``."""
+        """Return the action as observed, ``(A, N)``, and the factor on the process noise, ``(N,)``."""
         raise NotImplementedError
 
     def sensor_variances(self, shown: Array) -> Any:
-        """Variances of the readings that the update takes, of each sensor, numbers or ``(m, N)``."""
+        """Return the variance of each sensor's reading in the update, numbers or ``(m, N)``."""
         return self.task.sensor_variances
 
     def autopilot_estimate(
         self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
     ) -> tuple[Array, Array]:
-        """Return what the autopilot uses, and its packed covariance."""
+        """Return the estimate of the autopilot and its packed covariance."""
         return update.mean, update.covariance
 
     def act(self, state: KalmanState, measurement: Measurement, action: Array) -> KalmanState:
-        """Equations (12), (11) with the noises that the action asks for."""
+        """Update by equations (12) and (11) with the noises of the action."""
         shown, scale = self.decode_action(action)
         update = packed_covariance.update_coordinates(
             state.mean,
@@ -298,11 +300,11 @@ class _KalmanBank(AutopilotBank):
         )
 
     def mean(self, state: KalmanState) -> Array:
-        """What the autopilot uses, ``(n, N)``."""
+        """Return the estimate of the autopilot, ``(n, N)``."""
         return state.estimate
 
     def covariance(self, state: KalmanState) -> Array:
-        """Covariance reported for it, ``(n, n, N)``."""
+        """Return the reported covariance, ``(n, n, N)``."""
         return packed_covariance.unpack(state.estimate_covariance, len(self.task.components))
 
 
@@ -314,16 +316,16 @@ class GainBank(_KalmanBank):
     no_action: tuple[float, ...] = (0.0,)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Scale by ``10 ** (gain_decades a)``."""
+        """Return the action and the factor ``10 ** (gain_decades a)``."""
         xp = self.xp
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
 
     def covariance(self, state: KalmanState) -> Array:
-        """Covariance of the filter, when it is steered times the short average of the NIS where that is above one.
+        """Return the covariance of the filter, ``(n, n, N)``, times the short average of the NIS where above one.
 
-        Whether the action is right about the noise, only the innovations tell. Left alone, it is the paper's filter
-        with the paper's covariance.
+        The factor applies only under nonzero actions, because only the innovations show whether the action fits the
+        noise. Under the action zero it is the paper's filter with the paper's covariance.
         """
         factor = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
         return super().covariance(state) * factor
@@ -339,29 +341,29 @@ class NoiseBank(_KalmanBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """The process noise, then each sensor."""
+        """Return a box for the process noise, then each sensor."""
         return gymnasium.spaces.Box(-1.0, 1.0, (1 + len(self.task.sensors),), numpy.float32)
 
     @property
     def action_block(self) -> Block:
-        """Last action."""
+        """Return the block of the last action."""
         return last_action_block(("process", *self.task.sensors), name="action")
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Scale the process noise by ``10 ** (noise_reach process_decades a)``."""
+        """Return the action and the factor ``10 ** (noise_reach process_decades a)`` on the process noise."""
         xp, p = self.xp, self.parameters
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         return shown, xp.exp(shown[0] * (p.noise_reach * p.process_decades * math.log(10.0)))
 
     def sensor_variances(self, shown: Array) -> Array:
-        """Nominal ones times ``10 ** (2 noise_reach sensor_decades a)``."""
+        """Return the nominal variances times ``10 ** (2 noise_reach sensor_decades a)``, ``(m, N)``."""
         p = self.parameters
         scale = self.xp.exp(shown[1:] * (2.0 * p.noise_reach * p.sensor_decades * math.log(10.0)))
         return self.nominal_variances * scale
 
 
 class ModeBank(_KalmanBank):
-    """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, behind which the filter runs on."""
+    """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, under which the filter also continues."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(len(MODES))
     action_block: Any = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES, SHARE)
@@ -369,15 +371,15 @@ class ModeBank(_KalmanBank):
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
-        # Of raw readings it is the covariance of their nominal noise; a coordinate without a sensor, taken as
-        # zero, has the stationary variance of the nominal loop.
+        # The covariance of raw readings is that of their nominal noise; a coordinate without a sensor, estimated
+        # as zero, has the stationary variance of the nominal loop.
         d = task.design
         unmeasured = numpy.where(d.H.any(axis=0), 0.0, numpy.diag(d.state_covariance))
         raw = d.H.T @ d.R @ d.H + numpy.diag(unmeasured)
         self.raw_covariance: Array = task.constant(packed_covariance.pack(raw)[:, None])
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Scale by ``wide_band_scale`` in mode "wide-band", by ``over_smoothed_scale`` in "over-smoothed"."""
+        """Return the mode, and ``wide_band_scale`` in mode "wide-band", ``over_smoothed_scale`` in "over-smoothed"."""
         xp, p = self.xp, self.parameters
         shown = xp.stack([xp.astype(action == i, xp.float64) for i in range(len(MODES))])
         wide, smooth = (p.wide_band_scale - 1.0) * shown[1], (p.over_smoothed_scale - 1.0) * shown[3]
@@ -386,7 +388,7 @@ class ModeBank(_KalmanBank):
     def autopilot_estimate(
         self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
     ) -> tuple[Array, Array]:
-        """Readings in place of the measured coordinates and zero for the others in mode "raw-sensors"."""
+        """Return in mode "raw-sensors" the readings of measured coordinates and zero for the others."""
         xp, reading, measured = self.xp, measurement.reading, self.task.measured
         zero = xp.zeros_like(reading[0])
         rows = [

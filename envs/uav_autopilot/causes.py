@@ -1,4 +1,4 @@
-"""What makes a loop of UavAutopilot costly: commands, gusts, noisy sensors, dropouts."""
+"""Causes of costs of UavAutopilot: commands, gusts, noisy sensors, dropouts."""
 
 from ..contract.causes import Cause, Moment
 from ..contract.faults import causes_of
@@ -6,7 +6,7 @@ from ..contract.observation import Array
 from .disturbances import DISTURBANCES, RAISED
 
 SETTLING = 20.0
-"""Measurements in which the loop follows a new command."""
+"""Measurements that the loop needs to follow a new command."""
 
 
 def _has_new_command(moment: Moment) -> Array | None:

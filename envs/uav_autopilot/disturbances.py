@@ -1,4 +1,4 @@
-"""What may go wrong with the sensors of UavAutopilot: a class for each. Nobody says any of it but that one answers."""
+"""Disturbances of the sensors of UavAutopilot, a class for each. A measurement reports dropouts only."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -10,7 +10,7 @@ from ..contract.observation import Array
 from .problem import AutopilotProblem
 
 RAISED = 2.0
-"""Factor on a nominal noise from which it is raised."""
+"""Factor on the nominal noise from which a noise counts as raised."""
 
 
 def _has_noisy_sensor(moment: Moment) -> Array | None:
@@ -28,14 +28,14 @@ def draw_steps(
     zero: Array,
     count: int | None = None,
 ) -> StepSignal:
-    """Draw the level in each part of the episode, and when the parts begin."""
+    """Draw the level in each part of the episode, and the first measurements of the parts."""
     values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
     begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
     return StepSignal(draws.xp.stack(values), draws.xp.stack([zero, *begins])[1:])
 
 
 class _OfSensors(Disturbance):
-    """What concerns each of m sensors, or those that are named."""
+    """Base of disturbances of all m sensors, or of some."""
 
     def __init__(self, task: AutopilotProblem) -> None:
         super().__init__(task)
@@ -44,7 +44,7 @@ class _OfSensors(Disturbance):
         self.sigmas: Array = task.constant(task.parameters.value("sensor_sigmas"))[:, None]
 
     def chosen(self, named: tuple[str, ...] | None) -> Array:
-        """One for the sensors that are named, or for all, else zero, ``(m, 1)``."""
+        """Return one for the disturbed sensors, otherwise zero, ``(m, 1)``."""
         return self.task.constant([[float(named is None or s in named)] for s in self.task.sensors])
 
 
@@ -52,13 +52,13 @@ class SensorLevels(NamedTuple):
     """State of :class:`NoisySensors`."""
 
     levels: StepSignal
-    """Factors on the sensors' noise, values ``(J + 1, m, N)``."""
+    """Factors on the sensors' noise in each part, ``(J + 1, m, N)``."""
     level: Array
-    """At this measurement, ``(m, N)``."""
+    """Factors at this measurement, ``(m, N)``."""
 
 
 class NoisySensors(_OfSensors):
-    """The white noise of a sensor is another one, and changes in the episode."""
+    """White noise of sensors that differs from nominal and changes in the episode."""
 
     name = "noisy_sensors"
     causes: ClassVar[tuple[Cause, ...]] = (
@@ -70,27 +70,27 @@ class NoisySensors(_OfSensors):
     )
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> SensorLevels:
-        """Draw levels, and when they change."""
+        """Draw the levels and the times of their changes."""
         p, chosen = self.parameters, self.chosen(self.parameters.changing_sensors)
         levels = draw_steps(draws, "sensor", p.sensor_levels, p.sensor_times, zero, self.count)
         levels = levels._replace(values=1.0 + chosen * (levels.values - 1.0))
         return SensorLevels(levels, levels.values[0])
 
     def quiet(self, state: SensorLevels, calm: Array) -> SensorLevels:
-        """Nominal noise."""
+        """Return the levels, with one in undisturbed episodes."""
         values = self.xp.where(calm, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
 
     def advance(self, state: SensorLevels, step: DisturbanceInput) -> SensorLevels:
-        """Take the levels of this measurement."""
+        """Set the levels of this measurement."""
         return state._replace(level=state.levels.at(step.number, self.xp))
 
     def change_deviations(self, state: SensorLevels, deviations: Array) -> Array:
-        """Multiply them."""
+        """Multiply the standard deviations by the levels."""
         return deviations * state.level
 
     def context(self, state: SensorLevels) -> dict[str, Array]:
-        """All levels, and the numbers of the measurements from which on they hold."""
+        """Return all levels, and the first measurements at which they apply."""
         return {"sensor_levels": state.levels.values, "sensor_level_times": state.levels.times}
 
 
@@ -102,17 +102,17 @@ class Holds(NamedTuple):
     stops: Array
     """First measurement with a reading again, ``(D, m, N)``."""
     reading: Array
-    """Last valid reading of each sensor, which it holds during a dropout, ``(m, N)``."""
+    """Last valid reading of each sensor, repeated during a dropout, ``(m, N)``."""
 
 
 class Dropouts(_OfSensors):
-    """A sensor does not answer for a while, once in a period, and holds its last reading."""
+    """Dropouts of a sensor, one in each period, during which it repeats its last reading."""
 
     name = "dropouts"
     causes: ClassVar[tuple[Cause, ...]] = (MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Holds:
-        """Draw when."""
+        """Draw the first and last measurements of the dropouts."""
         xp, p = self.xp, self.parameters
         none = xp.stack([zero] * self.count)
         starts, stops = [none], [none]
@@ -124,7 +124,7 @@ class Dropouts(_OfSensors):
         return Holds(xp.stack(starts)[1:], xp.stack(stops)[1:], none)
 
     def change_measurement(self, state: Holds, measurement: Any, step: DisturbanceInput) -> tuple[Holds, Any]:
-        """Hold the last reading of each sensor that is out."""
+        """Replace the reading of each sensor in a dropout by its last one."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
             out = within(step.number, (state.starts[i], state.stops[i]))
@@ -134,17 +134,17 @@ class Dropouts(_OfSensors):
         return state._replace(reading=reading), measurement
 
     def context(self, state: Holds) -> dict[str, Array]:
-        """When they are."""
+        """Return the first measurements of the dropouts and after them."""
         return {"dropout_starts": state.starts, "dropout_stops": state.stops}
 
 
 class SensorBias(_OfSensors):
-    """A sensor has a constant error; its state, in its unit, ``(m, N)``."""
+    """Constant errors of sensors; the state is the error in the sensor's unit, ``(m, N)``."""
 
     name = "bias"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Draw size and side."""
+        """Draw size and sign of the errors."""
         xp, limits = self.xp, self.parameters.sensor_bias
         if not limits[1]:
             return xp.stack([zero] * self.count)
@@ -153,20 +153,20 @@ class SensorBias(_OfSensors):
         return self.sigmas * self.chosen(self.parameters.biased_sensors) * side * size
 
     def quiet(self, state: Array, calm: Array) -> Array:
-        """None."""
+        """Return the errors, with zero in undisturbed episodes."""
         return self.xp.where(calm, 0.0, state)
 
     def change_reading(self, state: Array, reading: Array) -> tuple[Array, Array]:
-        """Add it."""
+        """Add the errors to the readings."""
         return state, reading + state if self.parameters.sensor_bias[1] else reading
 
     def context(self, state: Array) -> dict[str, Array]:
-        """All of it."""
+        """Return the errors."""
         return {"sensor_bias": state}
 
 
 class SensorColour(ColouredErrors):
-    """Errors of the sensors that last."""
+    """Coloured errors of sensors, first-order Gauss-Markov processes."""
 
     def __init__(self, task: AutopilotProblem) -> None:
         p = task.parameters
@@ -174,7 +174,7 @@ class SensorColour(ColouredErrors):
         self.sigmas: Array = task.constant(p.value("sensor_sigmas"))[:, None]
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
+        """Draw standard deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
         p, none = self.parameters, self.xp.stack([zero] * self.count)
         if not self.normals:
             return none, none + 1.0
@@ -182,15 +182,15 @@ class SensorColour(ColouredErrors):
         return deviation, draws.log_uniform("correlation_time", p.sensor_correlation_time, self.count)
 
     def change_reading(self, state: ColouredErrorsState, reading: Array) -> tuple[ColouredErrorsState, Array]:
-        """Add them."""
+        """Add the errors to the readings."""
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Those of this measurement."""
+        """Return the errors at this measurement."""
         return {"sensor_coloured": state.level}
 
 
 DISTURBANCES: tuple[type[Disturbance], ...] = (NoisySensors, SensorColour, SensorBias, Dropouts)
-"""In the order in which they act; a further one comes last, so that episodes stay."""
+"""Disturbances in the order of their action; add new ones last to keep episodes equal."""
 DRAWN_FIRST = (NoisySensors, Dropouts, SensorBias)
-"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""
+"""Disturbances that are drawn before the others, in this order, to keep the random numbers of episodes."""

@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the estimator ``level-bank``, steered; what its settings are, ``level_bank.py`` says."""
+"""Control ``hypotheses``: the action sets factors of the estimator ``level-bank``; see ``level_bank.py``."""
 
 import math
 from collections.abc import Sequence
@@ -27,40 +27,40 @@ from .world import Measurement, Start
 
 
 class HypothesesState(NamedTuple):
-    """The bank over levels at one moment."""
+    """State of the bank over levels."""
 
     own: Levels
-    """Predicted between :meth:`HypothesesBank.predict` and the action."""
+    """State of the estimator, predicted between :meth:`HypothesesBank.predict` and the action."""
     likelihood: Likelihood
-    """Of the readings by the estimator."""
+    """Likelihood of the readings by the estimator."""
     action: Array
     """Last action, ``(3 + m, N)``."""
     innovation: Array
-    """Of all hypotheses together over its sigma; 0 in a dropout, ``(m, N)``."""
+    """Innovation of all hypotheses together over its sigma; 0 in a dropout, ``(m, N)``."""
     nis: Array
     """Normalised innovation squared per available reading, ``(N,)``."""
     mean_innovation: Array
     """Short average of the innovation, ``(m, N)``."""
     mean_square: Array
-    """Short average of its square, ``(m, N)``."""
+    """Short average of the squared innovation, ``(m, N)``."""
     mean_nis: Array
     """Short average of the NIS, ``(N,)``."""
     log_trace: Array
-    """Log of the predicted covariance's trace over that of the settled filter, ``(N,)``."""
+    """Log of the trace of the predicted covariance over that of the settled filter, ``(N,)``."""
     log_likelihood: Array
-    """Of the readings by the moments of all hypotheses together, ``(N,)``."""
+    """Log-density of the readings by the moments of all hypotheses together, ``(N,)``."""
     predicted: Array
     """Probabilities of the levels of the gusts before the readings, ``(G, N)``."""
     probabilities: Array
-    """After them, if the action is zero, likewise."""
+    """Probabilities of these levels after the readings under the action zero, ``(G, N)``."""
     entropy: Array
-    """Of the hypotheses then, over the largest possible, ``(N,)``."""
+    """Entropy of the hypotheses after the readings under the action zero, over the largest possible, ``(N,)``."""
     sensor_levels: Array
-    """Expected logarithm of the factor on each sensor's deviation then, ``(m, N)``."""
+    """Expected log of the factor on each sensor's deviation, after the readings under the action zero, ``(m, N)``."""
 
 
 class HypothesesBank(SettingsBank, AutopilotBank):
-    """The bank over levels, steered by factors of its weights and of its noises."""
+    """Bank over levels with factors of the action on its weights and noises."""
 
     strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = LevelBank
 
@@ -69,7 +69,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         prior = self.own.prior
         levels = (f"level_{i}" for i in range(1, prior.gust_points + 1))
         self.names: tuple[str, ...] = ("designed", *levels)
-        """Of the hypotheses of each kind."""
+        """Names of the hypotheses of each kind."""
         self.gust_levels: Array = grid(prior.gusts, prior.gust_points)
         self.sensor_limits: tuple[float, ...] = tuple(math.log(limit) for limit in prior.sensors)
         self.log_levels: list[Any] = [
@@ -78,12 +78,12 @@ class HypothesesBank(SettingsBank, AutopilotBank):
 
     @property
     def action_block(self) -> Block:
-        """Last action."""
+        """Return the block of the last action."""
         return last_action_block(tuple(self.own.settings), name="action")
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What every filter shows, how well this one has predicted the readings, and what it believes."""
+        """Return the blocks of every filter, the log-density of the readings, and the probabilities of the levels."""
         xp, low, high = self.xp, *self.sensor_limits
         unit = math.prod(self.task.sensor_variances) ** 0.5 * (2.0 * math.pi) ** (
             0.5 * len(self.task.sensors)
@@ -91,10 +91,10 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         return (
             *super().blocks,
             log_density_block(
-                lambda f, y: xp.where(self.answered(y), f.likelihood.log_likelihood, 0.0) + math.log(unit),
+                lambda f, y: xp.where(self.has_reading(y), f.likelihood.log_likelihood, 0.0) + math.log(unit),
                 "the log-density of the readings in units of their nominal sigmas, nats",
             ),
-            expected_nis_block(xp, self.answered),
+            expected_nis_block(xp, self.has_reading),
             predicted_block(self.names, "readings", of=" of the gusts' level"),
             probability_block(xp, self.names, "probability after them if the action is zero"),
             Block(
@@ -108,11 +108,11 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         )
 
     def log_trace(self, state: HypothesesState) -> Array:
-        """Log of the predicted covariance's trace, the spread of the hypotheses included."""
+        """Return the log of the trace of the predicted covariance, including the spread of the hypotheses, ``(N,)``."""
         return state.log_trace
 
     def start(self, initial: Start) -> HypothesesState:
-        """Start where the estimator starts, with averages as a consistent filter has them."""
+        """Start at the estimator's initial state, with the averages of a consistent filter."""
         own = self.own.start(initial)
         zeros = 0.0 * self.task.readings_of(initial.mean)
         none = zeros[0]
@@ -136,21 +136,21 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         )
 
     def group(self, probability: Array) -> Array:
-        """Probabilities of the gusts' levels, ``(G, N)``, of those of hypotheses of every kind, ``(H, N)``."""
+        """Return the probabilities of the gusts' levels, ``(G, N)``, from those of the hypotheses, ``(H, N)``."""
         each = len(self.names)
         return ordered_sum(probability[each * i : each * (i + 1)] for i in range(self.own.groups))
 
     def expect_levels(self, h: LevelHypotheses) -> Array:
-        """Expected logarithm of the factor on the deviation of each sensor, ``(m, N)``."""
+        """Return the expected logarithm of the factor on the deviation of each sensor, ``(m, N)``."""
         of_each = [ordered_sum(q * level) for q, level in zip(h.sensors, self.log_levels, strict=True)]
         return self.xp.stack([ordered_sum(h.probability * levels) for levels in of_each])
 
-    def answered(self, measurement: Measurement) -> Array:
-        """Whether any sensor has answered, ``(N,)``."""
+    def has_reading(self, measurement: Measurement) -> Array:
+        """Return whether any sensor has a reading, ``(N,)``."""
         return ordered_sum(measurement.available) > 0.0
 
     def look(self, state: HypothesesState, found: Levels, measurement: Measurement) -> HypothesesState:
-        """Compare the readings with what all hypotheses together predict, and show what is believed after them."""
+        """Compute the joint innovation of all hypotheses, and the probabilities after the readings."""
         xp, bank, rows, h = self.xp, self.own, self.own.rows, state.own.hypotheses
         whole = noise_levels.merge(h.mean, h.covariance, h.probability)
         P = packed_covariance.unpack(whole.covariance, bank.size)
@@ -183,5 +183,5 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Report as the other filters do, likelihood and NIS as the estimator finds them."""
+        """Return the metrics of the other filters, with likelihood and NIS by the estimator."""
         return {**super().records(state, measurement), **state.likelihood._asdict()}

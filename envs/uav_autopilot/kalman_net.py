@@ -1,18 +1,18 @@
-r"""The filter of UavAutopilot that a recurrent network steers from inside: the learned estimator ``kalman-net``.
+r"""The learned estimator ``kalman-net`` of UavAutopilot: a recurrent network sets noises and gain of the filter.
 
-The Kalman filter of the paper with two covariances: that of its errors, P, and the one that its gain is computed from,
-M. At every measurement the network answers with numbers in [-1, 1]: a_l for each part l of the process noise (what the
-level of the disturbance multiplies, and the rest), a_i for each sensor i, and as many again, b_l and b_i:
+This is the Kalman filter of the paper with two covariances: P of its errors, and M, from which the gain is computed. At
+every measurement the network returns numbers in [-1, 1]: a_l for each part l of the process noise (the part that the
+level of the disturbance multiplies, and the rest), a_i for each sensor i, then b_l and b_i like them:
 
     noise    Q_l = 10^(process_decades a_l) Q_l,  R_i = 10^(2 sensor_decades a_i) R_i,  P' = F P F^T + sum_l Q_l
     gain     M' = F M F^T + sum_l agility^(2 b_l) Q_l,  K = M' H^T (H M' H^T + diag(caution^(2 b_i) R_i))^-1,
              M = (I - K H) M'
     update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
 
-All zero is the paper's filter: M is P. Of a sensor in a dropout the column of K is zero. What the autopilot uses is x.
-M follows the Riccati equation of noises between limits, so that the filter is stable whatever is answered; with P in
-the place of M it is not. References and reading stand in ``maneuvering_target/kalman_net.py``; the dynamics are left
-alone, because they are known here.
+All zero is the paper's filter: M is P. The column of K of a sensor in a dropout is zero. The autopilot uses x.
+M follows the Riccati equation of noises between limits, so that the filter is stable for any output; with P in place
+of M it is not. References and reading are in ``maneuvering_target/kalman_net.py``. The network does not change the
+dynamics, because they are known here.
 """
 
 import math
@@ -31,11 +31,11 @@ from .world import Measurement, Start
 AGILITY = 5.0
 """Largest factor and divisor of the disturbances' deviations in the gain alone."""
 CAUTION = 5.0
-"""Likewise of the sensors'."""
+"""Largest factor and divisor of the sensors' deviations in the gain alone."""
 
 
 class NetFilter(NamedTuple):
-    """As :class:`~.banks.KalmanState`, with the covariance of the gain."""
+    """Fields of :class:`~.banks.KalmanState` with the covariance of the gain."""
 
     mean: Array
     covariance: Array
@@ -55,7 +55,7 @@ class NetFilter(NamedTuple):
 
 
 class KalmanNetBank(NoiseBank):
-    """The paper's filter, whose noises and gain the action sets."""
+    """The paper's filter with noises and gain from the action."""
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -73,7 +73,7 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """As of the bank; an estimator is not told of the last valid reading in a dropout, so that it is not shown."""
+        """Return the blocks of the bank without the last valid reading in a dropout, which estimators do not get."""
         reading = Block(
             "reading",
             lambda _, measurement: measurement.available * measurement.reading / self.sensor_sigmas,
@@ -85,29 +85,29 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Parts of the process noise, sensors, and what the gain alone takes for them."""
+        """Return a box for the parts of the process noise, the sensors, and their factors in the gain alone."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 
     @property
     def action_block(self) -> Block:
-        """Last answer."""
+        """Return the block of the last output of the network."""
         return last_action_block(self.answers, name="action")
 
     def scaled_noise(self, scale: Array, entries: list[int] | slice) -> Array:
-        """Process noise, its parts scaled by ``(L, N)``, at some packed entries, ``(entries, N)``."""
+        """Return the process noise with parts scaled by ``(L, N)`` at some packed entries, ``(entries, N)``."""
         total = scale[0] * self.noise_parts[0][entries]
         for factor, part in zip(scale[1:], self.noise_parts[1:], strict=True):
             total = total + factor * part[entries]
         return total
 
     def start(self, initial: Start) -> Any:
-        """Start as the paper's filter, a :class:`NetFilter`."""
+        """Return the initial state of the paper's filter as a :class:`NetFilter`."""
         fields = super().start(initial)._asdict()
         fields["scale"] = self.xp.stack([fields["scale"]] * len(self.noise_parts))
         return NetFilter(**fields, gain_covariance=fields["covariance"])
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
-        """Update a :class:`NetFilter` by the gain that was answered."""
+        """Update a :class:`NetFilter` with the gain of the network's output."""
         xp, p, parts = self.xp, self.parameters, len(self.noise_parts)
         count = parts + len(self.task.sensors)
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)

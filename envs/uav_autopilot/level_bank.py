@@ -2,21 +2,21 @@
 
 Equations: ``filters/noise_levels.py``. A kind of aircraft is an actuator and a slow error of some sensors, which is a
 coordinate of the state, a first-order Gauss-Markov process (A. E. Bryson and L. J. Henrikson, Journal of Spacecraft and
-Rockets 5 (1968), 662-665, by augmentation). In each kind every hypothesis is a level of the gusts; what the sensors'
-levels are, each knows by probabilities of its own. The first hypothesis of a kind believes all noise as designed, for
-ever but for a small hazard. Kinds do not change.
+Rockets 5 (1968), 662-665, by augmentation). In each kind every hypothesis is a level of the gusts, with its
+own probabilities of the sensors' levels. The first hypothesis of a kind assumes all noise as designed, and ends with a
+small hazard. Kinds do not change.
 
-It is the estimator ``level-bank`` of the baselines, and what the control ``hypotheses`` steers. H hypotheses predict to
-the measurement with weights p' and covariances P'. Factors f of its settings change what the readings of m sensors are
-weighed with, this once:
+This is the estimator ``level-bank`` of the baselines, and the control ``hypotheses`` sets factors f of its settings. H
+hypotheses predict to the measurement with weights p' and covariances P'. The factors apply to the update with the
+readings of m sensors at this measurement only:
 
     p'(h) <- p'(h) f1^s(h) f2^designed(h)                                                   renormalised by Bayes' rule
     P'(h) <- P'(h) + (f3 - 1) Q(h),    R_k <- R_k f(3 + k)
 
-s(h): how far the hypothesis' level of the gusts lies above the designed one, logarithmically, one for the highest;
-designed: all noise is as designed. So f1 says that the gusts have risen or fallen and f2 that they are as designed, as
-other probabilities of a change would; Q is the process noise of the hypothesis, so that the prediction is made with
-``f3 Q``; R_k are the variances of sensor k at all its levels. Where no sensor answers nothing changes.
+s(h): log-distance of the hypothesis' level of the gusts above the designed one, scaled to one for the highest;
+designed: 1 if all noise is as designed, otherwise 0. So f1 makes a rise of the gusts more probable and f2 noise as
+designed, like other probabilities of a change. Q is the process noise of the hypothesis, so that the prediction uses
+``f3 Q``; R_k are the variances of sensor k at all its levels. Without any reading nothing changes.
 """
 
 import math
@@ -36,7 +36,7 @@ from .world import Measurement, Start
 
 
 class Kind(NamedTuple):
-    """What does not change in an episode."""
+    """A kind of aircraft: properties that do not change in an episode."""
 
     share: float = 1.0
     """Prior probability."""
@@ -45,16 +45,16 @@ class Kind(NamedTuple):
     error: float = 0.15
     """Standard deviation of the slow errors over the sensor's nominal one."""
     error_time: float = 1.0
-    """Their correlation time, s."""
+    """Correlation time of the slow errors, s."""
     always: bool = False
-    """Whether they are there where all noise is as designed, too."""
+    """Whether the slow errors also exist when all noise is as designed."""
 
 
 class LevelPrior(NamedTuple):
-    """What a bank expects before it has seen anything."""
+    """Prior of a bank over levels."""
 
     gusts: tuple[float, float] = (0.2, 5.0)
-    """Limits of the disturbance's level, all logarithms alike."""
+    """Limits of the disturbance's level, log-uniform."""
     gust_points: int = 7
     gust_change: float = 2.0 / 600.0
     """Probability that the level changes before a measurement."""
@@ -65,22 +65,22 @@ class LevelPrior(NamedTuple):
     outlier: float = 0.0
     """Probability that a reading is an outlier."""
     outlier_factor: float = 30.0
-    """Its standard deviation over the nominal one; above all levels."""
+    """Standard deviation of an outlier over the nominal one; above all levels."""
     nominal: float = 1.0 / 6.0
     """Probability that all noise is as designed."""
     leave: float = 1e-4
-    """Probability that it ends before a measurement."""
+    """Probability before a measurement that noise as designed ends."""
     kept: float = 0.5
-    """Probability that a sensor's noise then still is as designed."""
+    """Probability that a sensor's noise remains as designed at that end."""
     slow: tuple[str, ...] = ("rate",)
     """Sensors with slow errors."""
     kinds: tuple[Kind, ...] = (Kind(),)
 
 
 TRAINING = LevelPrior()
-"""Of the episodes of ``random``: levels of these limits, two changes of the gusts and one of the sensors in 600
+"""Prior of the scenario ``random``: levels of these limits, two changes of the gusts and one of the sensors in 600
 measurements, one episode of six as designed. The slow error has the mean square of the coloured ones there and the
-middle of their correlation times; only the rate sensor's can be told from the motion."""
+middle of their correlation times; only that of the rate sensor is distinguishable from the motion."""
 VAGUE = LevelPrior(
     gusts=(0.1, 10.0),
     gust_points=7,
@@ -92,12 +92,12 @@ VAGUE = LevelPrior(
         Kind(0.1, lag=1.7),
     ),
 )
-"""Ours, for aircraft of which little is known: twice the range of every level, readings that are wrong, a rate sensor
+"""Prior for aircraft of which little is known (ours): twice the range of every level, outliers, a rate sensor
 that has a bias, and an actuator that is slower than designed; one of ten each."""
 
 
 def grid(limits: tuple[float, float], points: int) -> numpy.ndarray:
-    """Middles of equal intervals of the logarithm."""
+    """Return the midpoints of equal intervals of the logarithm."""
     low, high = limits
     return numpy.asarray(low * (high / low) ** ((numpy.arange(points) + 0.5) / points))
 
@@ -106,15 +106,15 @@ class Levels(NamedTuple):
     """State of the bank over levels."""
 
     mean: Array
-    """Of all hypotheses together, ``(n, N)``."""
+    """Mean of all hypotheses together, ``(n, N)``."""
     covariance: Array
-    """``(n, n, N)``."""
+    """Covariance of all hypotheses together, ``(n, n, N)``."""
     likelihood: Likelihood
     hypotheses: LevelHypotheses
 
 
 def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
-    """How well the readings were predicted; NaN in a dropout of all sensors."""
+    """Return the likelihood of the readings; NaN in a dropout of all sensors."""
     count = ordered_sum(measurement.available)
     there = count > 0.0
     return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
@@ -125,8 +125,8 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
 
     Args:
         task: the problem.
-        prior: what it expects.
-        **changed: fields of the prior that differ.
+        prior: the prior.
+        **changed: fields of the prior with other values.
     """
 
     def __init__(self, task: AutopilotProblem, prior: LevelPrior = TRAINING, **changed: Any) -> None:
@@ -184,10 +184,10 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         heights, designed = numpy.log(levels) / (math.log(levels[-1]) or 1.0), numpy.arange(each) == 0
         raised = numpy.tile([heights, designed.astype(float)], (1, self.groups))
         self.raised: Array = constant(raised)[:, :, None]
-        """By how much the first two settings multiply each weight, logarithmically, ``(2, H, 1)``."""
+        """Exponents of the first two factors in each weight, ``(2, H, 1)``."""
 
     def start(self, initial: Initial | Start) -> Levels:
-        """Start all where everyone starts."""
+        """Return all hypotheses at the initial estimate."""
         xp, none = self.xp, 0.0 * initial.mean[0]
         mean = xp.stack([*initial.mean, *[none] * (self.size - self.n)])
         hypotheses = LevelHypotheses(
@@ -199,17 +199,17 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         return Levels(initial.mean, initial.covariance, Likelihood.unknown(none), hypotheses)
 
     def predict(self, state: Levels, measurement: Measurement) -> Levels:
-        """Let levels change, and predict every hypothesis to the time of a measurement."""
+        """Apply the change of levels, and predict every hypothesis to the time of a measurement."""
         h = self.switch(state.hypotheses)
         mean, covariance = self.propagate(h, measurement)
         return state._replace(hypotheses=h._replace(mean=mean, covariance=covariance))
 
     def heeds(self, measurement: Measurement) -> Array:
-        """Where a sensor answers."""
+        """Return where any sensor has a reading, ``(N,)``."""
         return self.xp.where(ordered_sum(measurement.available) > 0.0, 1.0, 0.0)
 
     def apply_factors(self, h: LevelHypotheses, logarithms: Array) -> LevelHypotheses:
-        """Multiply weights and process noise by factors of these logarithms, ``(3, N)``."""
+        """Multiply weights and process noise by factors, given as logarithms ``(3, N)``."""
         xp = self.xp
         return h._replace(
             probability=xp.exp(ordered_sum(self.raised * logarithms[:2, None])) * h.probability,
@@ -217,7 +217,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def update(self, state: Levels, given: FilterInput) -> Levels:
-        """Take in the readings one after the other, and report the moments of all."""
+        """Update with the readings one after the other, and combine the hypotheses."""
         xp, n, measurement, predicted = self.xp, self.n, given.measurement, state.hypotheses
         scaled = self.variances
         if given.action is not None:
@@ -251,7 +251,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def switch(self, memory: LevelHypotheses) -> LevelHypotheses:
-        """Let levels change in every kind."""
+        """Apply the change of levels in every kind."""
         xp, each = self.xp, self.change.shape[0]
         parts = [
             noise_levels.switch(
@@ -273,7 +273,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def propagate(self, h: LevelHypotheses, measurement: Measurement) -> tuple[Array, Array]:
-        """Equations (10), (12) in every hypothesis."""
+        """Predict every hypothesis by equations (10) and (12)."""
         xp, u = self.xp, measurement.control
         mean = [
             xp.matmul(F, h.mean[:, j]) + B * u for j, (F, B) in enumerate(zip(self.F, self.B, strict=True))
@@ -287,9 +287,9 @@ class _KindModel:
 
     Args:
         task: the problem.
-        kind: which one.
+        kind: the kind.
         sigmas: nominal standard deviations of the sensors with slow errors.
-        levels: of the gusts; the first is of noise as designed.
+        levels: levels of the gusts; the first is noise as designed.
     """
 
     def __init__(

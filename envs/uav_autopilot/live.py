@@ -1,4 +1,4 @@
-"""What sensors and autopilot of an aircraft say as they say it, as measurements of UavAutopilot."""
+"""Live measurements of sensors and autopilot for UavAutopilot."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,30 +9,30 @@ from ..contract.live_input import LiveInput, LiveReader, Memory
 
 
 class SensorInput(LiveInput):
-    """Readings of the sensors, the command and the control in force; a sensor that drops out holds its last reading."""
+    """Reader of sensor readings, command and control in force; a sensor in a dropout repeats its last reading."""
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return readings, command and control with their units."""
+        """Return the descriptions of readings, command and control with their units."""
         sensors = ", ".join(self.task.sensors)  # type: ignore[attr-defined]
         values = {
             "reading": f"of each sensor ({sensors}) in the unit of its coordinate; NaN in a dropout",
             "command": "in the unit of the output",
-            "control": "in force since the measurement before: what was fed back",
+            "control": "in force since the previous measurement: the value that was fed back",
         }
         return values, {"command": "at the start, in the unit of the output"}
 
     def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Start with no reading; nothing is commanded unless it is said."""
+        """Start without readings, and with a command of zero unless given."""
         initial, memory = super().start(time, {"command": 0.0, **given})
         return initial, {**memory, "reading": self.same_of_all(0.0, self.measurement.reading.shape[:-1])}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Take the readings that came."""
+        """Return the measurement of the received readings and the memory."""
         measurement, after = super().measure(memory, time, values)
         return measurement, {**after, "reading": measurement.reading}
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
-        """Hold the last reading."""
+        """Replace missing readings by the last ones."""
         return numpy.where(there, received, memory["reading"])
 
 

@@ -1,4 +1,4 @@
-"""Every constant of UavAutopilot, with its limits."""
+"""Constants of UavAutopilot, with their limits."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ NOMINAL_SIGMAS: Mapping[str, Mapping[str, float]] = {
     "P": {"position": 1.0, "rate": 1.0},
     "U": {"pitch": 0.5, "rate": 1.0, "elevator": 0.5},
 }
-"""Sensors of each plant and their nominal standard deviations, where nothing else is stated."""
+"""Sensors of each plant with their default nominal standard deviations."""
 _PLANT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "P": {
         "sampling_interval": 0.25,
@@ -42,8 +42,8 @@ _PLANT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 }
 
 LARGEST_ERROR = 1e3
-"""Standard deviations by which a sensor is wrong: at a hundred times as many, hypotheses stand so far apart that the
-covariance of those that are merged has no digits left."""
+"""Largest error of a sensor in standard deviations: at a hundred times as many, hypotheses are so far apart that the
+covariance of merged ones has no digits left."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +82,17 @@ class UavAutopilotParameters(TaskParameters):
     acceleration_sigma: float = parameter(0.2, above=0.0)
     """Plant P: standard deviation of the noise added to the control, m/s^2. Ours."""
     mass: float = parameter(13.5, above=0.0)
-    """kg, Aerosonde; so are the following."""
+    """Mass, kg (Aerosonde, as the following)."""
     pitch_inertia: float = parameter(1.135, above=0.0)
-    """kg m^2."""
+    """Pitch inertia, kg m^2."""
     wing_area: float = parameter(0.55, above=0.0)
-    """m^2."""
+    """Wing area, m^2."""
     chord: float = parameter(0.18994, above=0.0)
-    """m."""
+    """Chord, m."""
     air_density: float = parameter(1.2682, above=0.0)
-    """kg/m^3."""
+    """Air density, kg/m^3."""
     airspeed: float = parameter(35.0, above=0.0)
-    """V, m/s."""
+    """Airspeed V, m/s."""
     lift_incidence: float = 3.45
     """Lift coefficient per rad of incidence."""
     lift_elevator: float = -0.36
@@ -104,9 +104,9 @@ class UavAutopilotParameters(TaskParameters):
     moment_elevator: float = -0.5
     """Pitching-moment coefficient per rad of elevator."""
     actuator_time_constant: float = parameter(0.05, above=0.0)
-    """s; ours, a usual servo. The filter and the autopilot believe it."""
+    """Time constant of the actuator in the model of filter and autopilot, s; ours, a usual servo."""
     actuator_lag: float = parameter(1.0, above=0.0)
-    """True time constant over the believed one."""
+    """True time constant of the actuator over that of the model."""
     gust_sigma: float = parameter(0.7, above=0.0)
     """Vertical gusts at level 1, m/s; light turbulence. Ours: 1.4 is moderate, 2.8 severe."""
     gust_length: float = parameter(50.0, above=0.0)
@@ -115,8 +115,8 @@ class UavAutopilotParameters(TaskParameters):
     """Intensity of the noise on the pitch acceleration, (deg/s^2)^2 s. Ours: gusts alone have a zero at the
     origin towards the pitch rate, so the filter would have no steady state."""
     actuator_disturbance: float = parameter(0.4, above=0.0)
-    """Intensity of the noise on the elevator rate, (deg/s)^2 s. Ours: play of the linkage; without any the filter
-    would come to know the elevator exactly, and its covariance would be singular."""
+    """Intensity of the noise on the elevator rate, (deg/s)^2 s. Ours: play of the linkage; without it the filter's
+    variance of the elevator would go to zero, and its covariance would be singular."""
 
     step_size: float = 0.0
     """Step of the command, in units of the output."""
@@ -143,7 +143,7 @@ class UavAutopilotParameters(TaskParameters):
         (0.0, 0.0), at_least=0.0, at_most=LARGEST_ERROR, ascending=True
     )
     """Interval of the stationary standard deviation of the coloured error of each sensor (first-order Gauss-Markov),
-    beside the white one, over its nominal standard deviation, drawn uniformly; nobody reports it."""
+    in addition to the white one, over its nominal standard deviation, drawn uniformly; unreported."""
     sensor_correlation_time: tuple[float, float] = parameter((0.2, 5.0), above=0.0, ascending=True)
     """Interval of the correlation time of this error, s, drawn log-uniformly. Ours: from ten samples to half an
     episode of plant U."""
@@ -151,41 +151,41 @@ class UavAutopilotParameters(TaskParameters):
         (0.0, 0.0), at_least=0.0, at_most=LARGEST_ERROR, ascending=True
     )
     """Interval of the size of a constant error of a sensor, over its nominal standard deviation, drawn uniformly, of
-    either sign; nobody reports it."""
+    either sign; unreported."""
     biased_sensors: tuple[str, ...] | None = None
     """Sensors that have such an error; None: all, drawn independently."""
     dropout_period: int = parameter(0, at_least=0)
-    """Each sensor drops out once in every so many measurements; zero: never."""
+    """Period of the dropouts of each sensor, measurements; zero: none."""
     dropout_length: tuple[int, int] = parameter((1, 15), at_least=1, ascending=True)
-    """Range of their length in measurements. Ours: up to half a settling time."""
+    """Range of the length of dropouts, measurements. Ours: up to half a settling time."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """Probability of an episode in which all levels and factors are one. Ours. Dropouts have the law of other
     episodes."""
 
     gain_decades: float = parameter(0.5, above=0.0, at_most=4.0)
     """Decades by which an action of one scales the process noise. Ours: the filter's poles stay inside the
-    circle for every positive scale, so the value is what is useful, and no more, because an agent that explores
-    over decades learns to shun them. From the smallest scale to the largest the limit is half the
+    unit circle for every positive scale, so the value is the useful range. It is not larger, because an agent that
+    explores over decades learns to avoid them. The limit of the ratio of largest to smallest scale is half the
     digits of a number."""
     process_decades: float = parameter(1.5, above=0.0, at_most=4.0)
-    """Decades by which an action can scale the process noise under control ``noise``. Ours: what levels from 0.2 to
-    5 are worth, and a little more."""
+    """Decades by which an action can scale the process noise under control ``noise``. Ours: slightly more than
+    levels from 0.2 to 5 need."""
     sensor_decades: float = parameter(0.8, above=0.0, at_most=4.0)
-    """Decades by which it can scale the standard deviation of a sensor. Ours: the largest factor of ``random``."""
+    """Decades by which an action can scale the sigma of a sensor. Ours: the largest factor of ``random``."""
     noise_reach: float = parameter(0.2, above=0.0, at_most=1.0)
-    """Share of these two that an action of one has under control ``noise``. Ours: a policy that has just been made
-    explores with a standard deviation of about one, and at the whole reach that costs several times what the paper's
-    filter costs, so that it learns to survive its own noise. Who explores less may ask for more."""
+    """Share of these two that an action of one has under control ``noise``. Ours: a new policy explores with a standard
+    deviation of about one. With the whole range this costs several times as much as the paper's filter, so that the
+    policy mainly learns to reduce the effect of its own noise. A policy that explores less may use more."""
     wide_band_scale: float = parameter(100.0, above=0.0)
     """Scale of the process noise in mode "wide-band"."""
     over_smoothed_scale: float = parameter(0.01, above=0.0)
-    """The same in mode "over-smoothed"."""
+    """Scale of the process noise in mode "over-smoothed"."""
     averaging_measurements: float = parameter(20.0, at_least=1.0)
     """Time constant of the exponential averages in the observation, measurements. Ours: shorter than a
     settling time."""
 
     def check(self) -> None:
-        """Check what depends on the plant or concerns several fields together."""
+        """Raise ValueError for fields that contradict each other or the plant."""
         names = tuple(c.name for c in COORDINATES[self.plant])
         sensors = self.value("sensors")
         if not sensors or len(set(sensors)) != len(sensors):
@@ -238,7 +238,7 @@ class UavAutopilotParameters(TaskParameters):
             )
 
     def value(self, name: str) -> Any:
-        """Value of a constant that may have been left to the plant."""
+        """Return the value of a constant, that of the plant if it is None."""
         given = getattr(self, name)
         if given is not None:
             return given

@@ -12,13 +12,13 @@ from .problem import AutopilotProblem
 
 CONTROL = {"P": ("commanded acceleration", "m/s²"), "U": ("elevator command", "deg")}
 GUSTS = ("designed", "weaker", "stronger")
-"""Hypotheses that are drawn as one."""
+"""Groups of hypotheses that share a line."""
 LEAST = 1.5
 """Half of the smallest range of the output, in units of the output: a unit step and some noise."""
 
 
 class UavAutopilotPicture(Picture):
-    """What the autopilot does above, what the filter does below and what it cannot know."""
+    """Strips of the loop, the filter, and the hidden noise levels."""
 
     strip_columns = 2
 
@@ -34,17 +34,17 @@ class UavAutopilotPicture(Picture):
         self.actions: Any = model.filter.action_block.parts
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Signals of the loop, NIS, and the levels of the noise."""
+        """Return the signals of the loop, NIS, and the levels of the noise."""
         task, truth, estimator = self.task, state.truth, state.filter
         assert isinstance(estimator, KalmanState | HypothesesState)
-        answered = state.measurement.available[self.shown, 0] > 0.0
+        available = state.measurement.available[self.shown, 0] > 0.0
         values = {
             "command": truth.command[0],
             "output": truth.state[task.output, 0],
             "estimate": self.model.mean(state)[task.output, 0],
             "control": self.model.feedback(estimator, state.measurement)[0],
-            # A line breaks off where there is no reading.
-            "innovation": estimator.innovation[self.shown, 0] if answered else math.nan,
+            # The line has a gap where there is no reading.
+            "innovation": estimator.innovation[self.shown, 0] if available else math.nan,
             "mean_nis": estimator.mean_nis[0],
             "level": truth.level[0],
         }
@@ -60,7 +60,7 @@ class UavAutopilotPicture(Picture):
         return values | {f"sensor_level.{s}": truth.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
 
     def beliefs(self, estimator: HypothesesState) -> dict[str, float]:
-        """Probabilities of hypotheses about the gusts, by what is drawn as one."""
+        """Return the probabilities of hypotheses about the gusts, summed by line."""
         assert isinstance(self.model.filter, HypothesesBank)
         designed, *others = estimator.probabilities[:, 0]
         stronger = sum(
@@ -70,7 +70,7 @@ class UavAutopilotPicture(Picture):
         return {f"gusts.{name}": float(value) for name, value in zip(GUSTS, values, strict=True)}
 
     def strips(self) -> Sequence[Strip]:
-        """Left column the loop, right column the filter."""
+        """Return the strips, of the loop in the left column and of the filter in the right one."""
         task = self.task
         output = task.components[task.output]
         name, unit = CONTROL[task.parameters.plant]
@@ -115,7 +115,7 @@ class UavAutopilotPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """Yes: it fills the eighth panel."""
+        """Return True: the observation fills the eighth panel."""
         return True
 
 

@@ -1,4 +1,4 @@
-"""The plants of UavAutopilot and the design of the loop: autopilot, nominal filter, theory."""
+"""Plants of UavAutopilot and the design of the loop: autopilot, nominal filter, theory."""
 
 import functools
 from typing import NamedTuple
@@ -16,7 +16,7 @@ class Plant(NamedTuple):
     F: numpy.ndarray
     """Transition matrix (7), ``(n, n)``."""
     B: numpy.ndarray
-    """``(n, 1)``."""
+    """Input matrix, ``(n, 1)``."""
     scaled_noise: numpy.ndarray
     """Covariance of the part of the process noise that the disturbance's level multiplies, ``(n, n)``."""
     other_noise: numpy.ndarray
@@ -24,7 +24,7 @@ class Plant(NamedTuple):
 
 
 def constant_rate(parameters: UavAutopilotParameters) -> Plant:
-    """Plant P: ``F = [[1, T], [0, 1]]``, "with the first derivative of the useful signal" (paper).
+    """Return the plant P: ``F = [[1, T], [0, 1]]``, "with the first derivative of the useful signal" (paper).
 
     Reading: the scan has "1 0,25 / F = 0 =1"; the "=" is a stray sign. ``B = [T^2/2, T]`` and noise that
     enters with the control are ours.
@@ -36,7 +36,7 @@ def constant_rate(parameters: UavAutopilotParameters) -> Plant:
 
 
 def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0) -> Plant:
-    """Plant U: short period, pitch, actuator and gust of a small aircraft, in degrees and deg/s.
+    """Return the plant U: short period, pitch, actuator and gust of a small aircraft, in degrees and deg/s.
 
     With the aerodynamic angle ``a = incidence + gust``:
     ``incidence' = rate - Z_a a - Z_d elevator``, ``rate' = M_a a + M_q rate + M_d elevator + w_q``,
@@ -69,51 +69,51 @@ def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0)
 
 
 class Design(NamedTuple):
-    """Everything that is computed once: believed and true plant, autopilot, filter, theory of the loop."""
+    """Design of the loop, computed once: model and true plant, autopilot, filter, theory of the loop."""
 
     model: Plant
-    """What the filter and the autopilot believe."""
+    """Plant of the filter and the autopilot."""
     true_model: Plant
     H: numpy.ndarray
-    """``(m, n)``."""
+    """Measurement matrix, ``(m, n)``."""
     R: numpy.ndarray
-    """Nominal, ``(m, m)``."""
+    """Nominal covariance of the sensors, ``(m, m)``."""
     feedback: numpy.ndarray
-    """L, ``(1, n)``."""
+    """Feedback gain L, ``(1, n)``."""
     feedforward: float
-    """N."""
+    """Feedforward gain N."""
     weight: numpy.ndarray
-    """Of the state in the cost, ``(n, n)``."""
+    """Weight of the state in the cost, ``(n, n)``."""
     control_weight: float
     steady: linear_systems.SteadyFilter
-    """The nominal filter once settled."""
+    """Steady state of the nominal filter."""
     loop: linear_systems.ClosedLoop
-    """The nominal one without command."""
+    """Nominal loop without command."""
     optimal: linear_systems.Regulator | None
-    """Control of the true plant if its state were known; None where the weights determine none."""
+    """Optimal control of the true plant with known state; None if the weights determine none."""
 
     @property
     def state_covariance(self) -> numpy.ndarray:
-        """Of the state in the nominal loop without command, ``(n, n)``; few need it, and it takes SciPy."""
+        """Return the covariance of the state in the nominal loop without command, ``(n, n)``; requires SciPy."""
         n = len(self.weight)
         return linear_systems.stationary_covariance(*self.loop)[:n, :n]
 
 
 MOST_RATIO = 1e15
-"""Of the variance of a reading as it is predicted and that of its sensor: a covariance after the update holds both, and
-a number has sixteen digits. Of 183 draws of noises and scales, all that came out indefinite were above 1e17."""
+"""Largest ratio of the predicted variance of a reading to that of its sensor: an updated covariance contains both, and
+a number has sixteen digits. Of 183 draws of noises and scales, all indefinite ones were above 1e17."""
 
 MOST_CONDITION = 1e14
-"""Of the correlations of a prediction: beyond it their determinant is rounding."""
+"""Largest condition number of the correlations of a prediction: beyond it their determinant is rounding."""
 
 
 def _check_digits(parameters: UavAutopilotParameters, ratios: numpy.ndarray) -> None:
-    """Raise ValueError where no digits are left of what a sensor says.
+    """Raise ValueError if a sensor's variance vanishes in the rounding of the predicted one.
 
     Args:
-        parameters: of the plant.
-        ratios: variance of each sensor's reading as the settled filter predicts it, over that of the sensor; with a
-            process noise s times as large it is at most s times as large.
+        parameters: parameters of the plant.
+        ratios: predicted variance of each reading in steady state over that of the sensor; a process noise s times as
+            large makes it at most s times as large.
     """
     p = parameters
     scale = max(p.wide_band_scale, 10.0**p.gain_decades, 10.0 ** (p.process_decades + 2.0 * p.sensor_decades))
@@ -122,13 +122,13 @@ def _check_digits(parameters: UavAutopilotParameters, ratios: numpy.ndarray) -> 
         raise ValueError(
             f"sensor_sigmas must be larger: with the process noise at the largest scale that an action can give, "
             f"{scale:.3g}, the {p.value('sensors')[worst]} is predicted with {scale * ratios[worst]:.1e} times the "
-            f"variance of its sensor, more than the {MOST_RATIO:g} of which a number keeps digits"
+            f"variance of its sensor, more than the {MOST_RATIO:g} that the digits of a number allow"
         )
 
 
 @functools.lru_cache(8)  # an evaluation makes the same task for every competitor, on numbers and on symbols
 def design(parameters: UavAutopilotParameters) -> Design:
-    """Design the loop; the arrays are shared by all who ask for the same parameters.
+    """Design the loop; calls with the same parameters share the arrays.
 
     Raises:
         ValueError: if the plant diverges at once, L does not stabilise it, or the sensors do not determine the state.
@@ -136,12 +136,12 @@ def design(parameters: UavAutopilotParameters) -> Design:
     if parameters.plant == "P":
         model = true_model = constant_rate(parameters)
     else:
-        with numpy.errstate(over="ignore", invalid="ignore"):  # refused below, in a sentence
+        with numpy.errstate(over="ignore", invalid="ignore"):  # the error below names the cause
             model, true_model = pitch_channel(parameters), pitch_channel(parameters, parameters.actuator_lag)
     if not all(numpy.isfinite(part).all() for part in (*model, *true_model)):
         raise ValueError(
             f"the plant must move finitely in one sampling_interval, {parameters.value('sampling_interval')} s: "
-            "its coefficients make it diverge faster than numbers can say"
+            "its coefficients make it diverge beyond the range of numbers"
         )
     names = [c.name for c in COORDINATES[parameters.plant]]
     H = numpy.eye(len(names))[[names.index(sensor) for sensor in parameters.value("sensors")]]
@@ -181,6 +181,8 @@ def design(parameters: UavAutopilotParameters) -> Design:
         optimal = linear_systems.discrete_regulator(
             true_model.F, true_model.B, weight, numpy.array([[control_weight]])
         )
-    except ValueError:  # the weights ignore what does not decay, which a feedback of one's own may still hold
+    except (
+        ValueError
+    ):  # the weights ignore states that do not decay, which a user's feedback may still stabilise
         optimal = None
     return Design(model, true_model, H, R, L, N, weight, control_weight, steady, loop, optimal)

@@ -1,4 +1,4 @@
-"""What world, filters and picture of UavAutopilot use of their task: the design of the loop, sensors and output."""
+"""The part of UavAutopilot that world, filters and picture use: design of the loop, sensors and output."""
 
 from ..contract.observation import Array
 from ..contract.task import Component, Task
@@ -7,7 +7,7 @@ from .plant import Design, design
 
 
 class AutopilotProblem(Task):
-    """The loop as it is designed: plant, sensors, output and autopilot."""
+    """Design of the loop: plant, sensors, output and autopilot."""
 
     parameters: UavAutopilotParameters
 
@@ -19,26 +19,26 @@ class AutopilotProblem(Task):
         names = [c.name for c in self.components]
         self.sensors: tuple[str, ...] = p.value("sensors")
         self.measured: tuple[int, ...] = tuple(names.index(sensor) for sensor in self.sensors)
-        """Coordinate that each sensor reads."""
+        """Index of the coordinate of each sensor."""
         self.output: int = names.index(OUTPUT[p.plant])
-        """Coordinate that the command is for."""
+        """Index of the commanded coordinate."""
         sigmas = dict(zip(self.sensors, p.value("sensor_sigmas"), strict=True))
         self.sensor_variances: tuple[float, ...] = tuple(float(sigma) ** 2 for sigma in sigmas.values())
-        """Nominal, of each sensor."""
+        """Nominal variance of each sensor."""
         self.output_sigma: float = float({**NOMINAL_SIGMAS[p.plant], **sigmas}[OUTPUT[p.plant]])
-        """Nominal sigma of the output's sensor; of its default where the output is not measured."""
+        """Nominal sigma of the output's sensor; the default one if the output is not measured."""
         self.cost_unit: float = self.output_sigma**2
-        """What a cost of one is in units of the weighted squares, for comparison with theory."""
+        """Unit of the cost in weighted squares, for comparison with theory."""
         self._L = self.constant(self.design.feedback)
 
     def _sampling_interval(self) -> float:
-        """Return what was left to the plant too, s."""
+        """Return the sampling interval, that of the plant if None, s."""
         return float(self.parameters.value("sampling_interval"))
 
     def autopilot(self, estimate: Array, command: Array) -> Array:
-        """Control that follows from estimate ``(n, N)`` and command ``(N,)``, ``u = N r - L x(k|k)``, ``(N,)``."""
+        """Return the control ``u = N r - L x(k|k)``, ``(N,)``, from estimate ``(n, N)`` and command ``(N,)``."""
         return self.design.feedforward * command - self.xp.matmul(self._L, estimate)[0]
 
     def readings_of(self, state: Array) -> Array:
-        """Measured coordinates of ``(n, N)``, ``(m, N)``."""
+        """Return the measured coordinates ``(m, N)`` of a state ``(n, N)``."""
         return self.xp.stack([state[i] for i in self.measured])

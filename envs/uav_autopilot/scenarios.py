@@ -2,8 +2,8 @@
 
 Times and lengths are counted in measurements, so that one table serves both plants: the loops settle in 16
 (plant P) and 27 (plant U) of them. Levels multiply the nominal standard deviations. The window "steady" of
-``paper-noise`` stops before the end: in the last moments control costs and no longer pays, so that a policy
-that knows the time can be better there than the filter, which is optimal for a loop that goes on.
+``paper-noise`` stops before the end: in the last measurements control costs without a later benefit, so that a policy
+with the time as input can be better there than the filter, which is optimal for an infinite horizon.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "random",
             "Training distribution: steps and doublets of the command; gust level and sensor noise drawn for each "
-            "episode and changing inside it, coloured errors of the sensors beside the white ones; short dropouts of "
+            "episode and changing inside it, coloured errors of the sensors besides the white ones; short dropouts of "
             "single sensors; in one of six all noise is white and nominal.",
             _RANDOM,
             {"steady": (50, 600)},
@@ -69,7 +69,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "actuator-lag",
-            "The actuator is twice as slow as the filter and the autopilot believe (plant U); no training episode "
+            "The actuator is twice as slow as in the model of filter and autopilot (plant U); no training episode "
             "holds the like.",
             {**_NOMINAL_WITH_COMMANDS, "actuator_lag": 2.0},
             {"steady": (100, 600)},

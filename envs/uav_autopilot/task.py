@@ -37,14 +37,14 @@ from .world import AircraftWorld, Measurement, Start
 
 
 def _picture(model: Model) -> Any:
-    """Return what draws an episode; imported here, because it brings matplotlib."""
+    """Return the class of the picture; imported here, because it imports matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Report what is fed back: the control that follows from the estimate."""
+    """Return the control that follows from the estimate, which is fed back."""
     return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 
@@ -53,8 +53,8 @@ class UavAutopilot(AutopilotProblem):
 
     ## Description
 
-    A plant is held on its command by ``u = N r - L x(k|k)``. The autopilot does not see the state x: it gets
-    the estimate of a Kalman filter that hears noisy sensors, and this loop is closed. The action changes the
+    A plant is held on its command by ``u = N r - L x(k|k)``. The autopilot does not receive the state x but
+    the estimate of a Kalman filter on noisy sensors, and this loop is closed. The action changes the
     filter, the estimate moves the controls, the controls move the aircraft. Noise is fixed by the seed; the
     truth follows from the actions.
 
@@ -62,22 +62,22 @@ class UavAutopilot(AutopilotProblem):
     measurements a second, state incidence, rate, pitch, elevator, gust; pitch is commanded. ``plant="P"`` is
     the paper's double integrator, 4 measurements a second. The autopilot is a linear-quadratic regulator.
 
-    The filter believes nominal noise. In the scenario ``random`` the gusts and the sensors' noise differ from
-    it and change during the episode, sensors drop out for a moment, and steps and doublets are commanded. A
+    The filter assumes nominal noise. In the scenario ``random`` the gusts and the sensors' noise differ from
+    it and change during the episode, sensors have short dropouts, and steps and doublets are commanded. A
     filter that trusts its model too much follows gusts late; one that trusts its sensors too much passes
     their noise on to the elevator.
 
     ## Action Space
 
-    What each control means stands in ``Actions``. Values outside the box are taken at its edge.
+    ``Actions`` describes each control. Values outside the box are clipped to it.
 
     ## Observation Space
 
     For each sensor the innovation over its sigma, its short average, the logarithm of the short average of
-    its square, the reading, and whether it answered; the log NIS per reading and that of its short average;
+    its square, the reading, and its availability; the log NIS per reading and that of its short average;
     the command, the control in force, the log trace of the covariance, the time, the last action.
     Innovations, command, control and readings are compressed by ``sign(x) log(1 + |x|)`` in units of one
-    sigma of a sensor; the logarithms of squares stop at 0.01. Sigmas are those of the filter before it is acted on: its last covariance, predicted
+    sigma of a sensor; the logarithms of squares stop at 0.01. Sigmas are those of the filter before the action: its last covariance, predicted
     with the Q of the last action.
 
     ## Rewards
@@ -85,12 +85,12 @@ class UavAutopilot(AutopilotProblem):
     The cost of the loop at a measurement, which evaluations report, is
     ``((x - x_r)^T W (x - x_r) + R u^2) / sigma^2``. ``x_r`` is the equilibrium of the command (output r, all
     else zero), u the control that follows from the estimate, sigma the nominal standard deviation of the
-    output's sensor (U: 0.5 deg; P: 1 m). Most of it is what gusts and commands cost any control. What counts is what
-    the agent can change, the loss of u against the optimal control u* of the true state,
+    output's sensor (U: 0.5 deg; P: 1 m). Gusts and commands cause most of it under any control. The reward uses the
+    part that the agent can change, the loss of u against the optimal control u* of the true state,
     ``x = (R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation: on average it differs between two
-    filters by what the costs of their episodes differ. By default ("relative") the reward is that of the
-    paper's filter on the same noise less that of the agent, ``30 log(1 + x / 30)`` each; "cost" is the
-    agent's own part, below zero. An action shows at once in the control and later in the estimate: the problem
+    filters by the difference of the costs of their episodes. By default ("relative") the reward is that of the
+    paper's filter on the same noise less that of the agent, ``30 log(1 + x / 30)`` each; "cost" is minus the
+    agent's part. An action affects the control at once and the estimate later: the problem
     is not myopic.
 
     ## Starting State
@@ -99,15 +99,15 @@ class UavAutopilot(AutopilotProblem):
 
     ## Episode End
 
-    Truncation after ``horizon`` measurements acted on (600: 12 s for U, 150 s for P). No termination: a loop
-    that an unstable choice (such as raw readings of too few sensors) drives away stops at 10 000 units of
-    each coordinate and goes on costing.
+    Truncation after ``horizon`` measurements (600: 12 s for U, 150 s for P). No termination: a loop
+    that diverges under an unstable choice (such as raw readings of too few sensors) is limited to 10 000 units of
+    each coordinate and continues to cost.
 
     ## Arguments
 
     ``plant``, ``control``, ``scenario`` (``random``, ``paper-noise``, ``paper-step``; held out:
     ``gust-front``, ``sensor-degradation``, ``actuator-lag``, ``gyro-bias``), and every field of
-    :class:`UavAutopilotParameters`. Refused, with the reason: an L that does not stabilise the plant, noise
+    :class:`UavAutopilotParameters`. Errors, with the reason, are an L that does not stabilise the plant, noise
     that is not positive, sensors that do not determine the state.
 
     ## Version History
@@ -127,7 +127,7 @@ class UavAutopilot(AutopilotProblem):
     }
     scenarios = SCENARIOS
     components: tuple[Component, ...] = COORDINATES["U"]
-    # What gusts and sensors do rules the noise of the reward, and the paper's filter bears it too.
+    # Gusts and sensors dominate the noise of the reward, and affect the paper's filter equally.
     reward: ClassVar[Reward] = Reward(
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor",
@@ -162,7 +162,7 @@ class UavAutopilot(AutopilotProblem):
         TrainedBanks({"kalman-net": KalmanNetBank}),
         PictureMaker(_picture),
         Causes(CAUSES, start=20),
-        # A loop that is off by ten times its sensor's error throughout.
+        # A loop with an error of ten times that of its sensor throughout.
         LostTracks(100.0),
         LoopRecords(_records),
         *load_present(("live:LIVE_READER",), __package__),

@@ -1,4 +1,4 @@
-"""The aircraft of UavAutopilot, what disturbs it, and its sensors; equations (8) and (9)."""
+"""Aircraft of UavAutopilot, its disturbances and its sensors; equations (8) and (9)."""
 
 import math
 from typing import Any, NamedTuple
@@ -16,64 +16,64 @@ from .parameters import UavAutopilotParameters
 from .problem import AutopilotProblem
 
 FARTHEST = 1e4
-"""Where a coordinate of a lost loop stops, in its own unit: far beyond what any stable loop reaches, and
-small enough for squares to stay numbers."""
+"""Limit of a coordinate of a diverged loop, in its own unit: far beyond any stable loop, and small enough for squares
+to be finite."""
 
 
 class Truth(NamedTuple):
-    """The aircraft, the noise, and the course of the episode."""
+    """State of the aircraft, its noise levels and commands."""
 
     number: Array
     """Measurements so far, ``(N,)``."""
     state: Array
-    """In the units of the task's components, ``(n, N)``."""
+    """State in the units of the task's components, ``(n, N)``."""
     command: Array
-    """r at this measurement, ``(N,)``."""
+    """Command r at this measurement, ``(N,)``."""
     level: Array
-    """Of the disturbance in the interval before this measurement, ``(N,)``."""
+    """Level of the disturbance in the interval before this measurement, ``(N,)``."""
     sensor_level: Array
     """Factor on the sensors' noise at this measurement, ``(m, N)``."""
     commands: StepSignal
-    """Values ``(J + 1, N)``."""
+    """Command in each part of the episode, values ``(J + 1, N)``."""
     levels: StepSignal
-    """Values ``(J + 1, N)``."""
+    """Level of the disturbance in each part of the episode, values ``(J + 1, N)``."""
     disturbances: dict[str, Any]
-    """State of each by its name, see :mod:`.disturbances`."""
+    """States of the sensors' disturbances by name, see :mod:`.disturbances`."""
 
 
 class Start(NamedTuple):
     """The initial estimate given to every filter."""
 
     mean: Array
-    """Zero, ``(n, N)``."""
+    """Mean, zero, ``(n, N)``."""
     covariance: Array
-    """That of ``initial_sigmas``, ``(n, n, N)``."""
+    """Covariance from ``initial_sigmas``, ``(n, n, N)``."""
     command: Array
-    """Zero: nothing is commanded before the first measurement, ``(N,)``."""
+    """Command before the first measurement, zero, ``(N,)``."""
 
 
 class Measurement(NamedTuple):
-    """What the sensors say, and what the autopilot knows: its command and its control.
+    """Readings of the sensors, with command and control of the autopilot.
 
-    The nominal standard deviations of the sensors are the parameter ``sensor_sigmas``; by how much their noise
-    differs from it nobody says.
+    The nominal standard deviations of the sensors are the parameter ``sensor_sigmas``; differences of the true noise
+    from them are unreported.
     """
 
     number: Array
     """Measurements since the start, ``(N,)``; one comes every ``sampling_interval`` seconds."""
     reading: Array
-    """Of each sensor, in the unit of its coordinate, ``(m, N)``; in a dropout the last valid one, zero if there
-    was none yet, where an estimator gets NaN."""
+    """Reading of each sensor, in the unit of its coordinate, ``(m, N)``; in a dropout the last valid one, zero before
+    the first. An estimator gets NaN in a dropout."""
     available: Array
-    """1 where a sensor answered, 0 in a dropout, ``(m, N)``."""
+    """1 where a sensor gave a reading, 0 in a dropout, ``(m, N)``."""
     command: Array
     """r at this measurement, in the unit of the output, ``(N,)``."""
     control: Array
-    """u in force since the measurement before: what was fed back, m/s^2 (plant P) or deg (U), ``(N,)``."""
+    """Control u since the previous measurement, as fed back, m/s^2 (plant P) or deg (U), ``(N,)``."""
 
 
 class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
-    """An aircraft that is flown by what is fed back, its gusts, and its sensors."""
+    """An aircraft under the control that is fed back, with gusts and sensors."""
 
     parameters: UavAutopilotParameters
     received_field = "reading"
@@ -106,11 +106,11 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         self.manoeuvres: int = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """The nominal ones."""
+        """Return the nominal standard deviations of the sensors."""
         return self.task.constant(self.parameters.value("sensor_sigmas"))[:, None] + 0.0 * measurement.reading
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
-        """Draw what the episode will be like, and the state at its start."""
+        """Draw levels, commands and disturbances of the episode, and the initial state."""
         xp, p, size = self.xp, self.parameters, len(self.task.components)
         state = self.initial_sigmas * normals[:size]
         zero = xp.zeros_like(state[0])
@@ -139,8 +139,8 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
     def _commands(self, draws: Draws, zero: Array) -> StepSignal:
         """Draw the command.
 
-        In each period of random manoeuvres, at a random time, either a step to a new level or a doublet
-        about the present one, as likely.
+        In each period of random manoeuvres, at a random time, a step to a new level or a doublet
+        about the present one, with equal probability.
         """
         xp, p = self.xp, self.parameters
         if p.step_size:
@@ -163,10 +163,10 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return StepSignal(xp.stack(values), xp.stack(times)[1:])
 
     def advance(self, truth: Truth, noise: Array, feedback: Array) -> tuple[Truth, Measurement]:
-        """The control acts for one interval; the sensors that work answer.
+        """Move the aircraft by one interval under the control, and make the measurement.
 
         Args:
-            truth: at the measurement before.
+            truth: truth at the previous measurement.
             noise: ``(normals, N)``.
             feedback: the control u, ``(N,)``.
         """
@@ -200,7 +200,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return truth, measurement
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """Every coordinate that has a sensor."""
+        """Return the readings of coordinates with a sensor."""
         sensors = list(self.task.sensors)
         reading, nothing = self.mask_missing(measurement).reading, measurement.command * math.nan
         rows = [nothing] * len(self.task.components)
@@ -210,7 +210,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return self.xp.stack(rows)
 
     def cost(self, truth: Truth, mean: Array) -> Array:
-        """Weighted squares of deviation from the command's equilibrium and of the control, ``(N,)``."""
+        """Return the weighted squares of deviation from the command's equilibrium and of the control, ``(N,)``."""
         task = self.task
         control = task.autopilot(mean, truth.command)
         total = task.design.control_weight * control * control
@@ -220,12 +220,12 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return total * (1.0 / task.cost_unit)
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
-        """What the control that follows from an estimate loses against the optimal one for the true state.
+        """Return the loss of the control from an estimate against the optimal one from the true state, ``(N,)``.
 
         ``(R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation (see :class:`.Regulator`). Of two filters
-        the sums over an episode differ on average by what the costs differ, the value ``x^T S x`` of where they end
-        included; left out is what noise and command cost any control, and the luck of it. Without that one sees sooner,
-        and at once, what an action was worth.
+        the sums over an episode differ on average by the difference of their costs, including the value ``x^T S x`` of
+        their final states. The loss excludes the costs of noise and command under any control and their variance, so
+        that the value of an action shows sooner.
         """
         if self.optimal is None:
             return self.cost(truth, mean)
@@ -237,7 +237,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return (float(self.optimal.regret[0, 0]) / task.cost_unit) * lost * lost
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Output and command, in the unit of the output."""
+        """Return the output and the command, in the unit of the output."""
         return {
             **self.disturbances.records(truth.disturbances),
             "output": truth.state[self.task.output],
@@ -245,9 +245,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Levels of the disturbance and of each sensor's noise, commands and dropouts, with the numbers of the
-        measurements at which they step, the levels now, and what the sensors' errors have beside white noise.
-        """
+        """Return levels, commands and dropouts with the measurements of their steps, and the other sensor errors."""
         return {
             "levels": truth.levels.values,
             "level_times": truth.levels.times,

@@ -17,7 +17,7 @@ from ..envs.data.recording import Recording
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import nearest
 from ..envs.logs.flights import names_flights, read_flights
-from ..envs.logs.plausibility import LOUD
+from ..envs.logs.plausibility import WARNING_PREFIX
 from ..envs.logs.reading import read_recording
 from ..envs.logs.recording_files import is_recording
 from ..evaluation.competitors.kinds import Competitor, RandomPolicy, is_program
@@ -403,7 +403,7 @@ def write(
         for sentence in reason_sentences(found.records, phrases, name):
             print_sentence(sentence)
     for note in [*notes_of(found.dataset), *missing_rows(found.records)]:
-        print_sentence(note, bold=len(note) if note.startswith(LOUD) else 0)
+        print_sentence(note, bold=len(note) if note.startswith(WARNING_PREFIX) else 0)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"
         console.print(f"{what} in {outputs.folder}")
