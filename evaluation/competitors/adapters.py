@@ -118,7 +118,7 @@ class SingleTrackEstimator(ABC):
 
     @abstractmethod
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """Mean, n numbers, and covariance, ``(n, n)``, of ``state``."""
+        """Return the mean, n numbers, and covariance, ``(n, n)``, of ``state``."""
 
     def reading(self, measurement: Any) -> tuple[Array, Array]:
         """What is measured of a linear function of the state, ``(m,)`` or None, and its covariance, ``(m, m)``.
@@ -160,7 +160,7 @@ class SingleTrackEstimator(ABC):
         return numpy.stack(means, axis=-1), numpy.stack(covariances, axis=-1), tracks
 
     def _components(self, track: Any) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Mean and covariance of the task's components."""
+        """Return the mean and covariance of the task's components."""
         mean, covariance = (numpy.asarray(part, dtype=float) for part in self.estimate(track))
         n = len(self.state)
         if mean.size != n or covariance.shape != (n, n):

@@ -87,7 +87,7 @@ class TrackEstimates(NamedTuple):
 
 
 def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, numpy.ndarray] | None:
-    """Times of the measurements of a recording by the clock of the estimates, of each track.
+    """Return the times of the measurements of a recording by the clock of the estimates, of each track.
 
     Seconds may count from the first measurement of the log, or be those of the log: the clock by which most
     measurements have a row is taken.
@@ -157,14 +157,14 @@ def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
 
 
 def _span(times: Sequence[numpy.ndarray], clock: str) -> str:
-    """First and last time, in words."""
+    """Return the first and last time, in words."""
     return " to ".join(
         describe_time(clock, time) for time in (min(t.min() for t in times), max(t.max() for t in times))
     )
 
 
 def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], tolerance: float) -> float:
-    """Share of the measurements of all tracks that have a row."""
+    """Return the share of the measurements of all tracks that have a row."""
     found = total = 0
     for track, time in times.items():
         rows = numpy.sort(table.time if {*table.track} == {""} else table.time[table.track == track])
@@ -243,7 +243,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         return FileState(state.measurements + 1, seconds, row, 1.0 - fresh, 1.0 * over, state.initial)
 
     def _times(self, state: FileState, measurement: Any) -> numpy.ndarray:
-        """Times of the measurements, s by the clock of the file."""
+        """Return the times of the measurements, s by the clock of the file."""
         width = measurement[0].shape[-1]
         if self.given.times is None:
             interval = getattr(measurement, "interval", None)

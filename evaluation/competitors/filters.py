@@ -21,7 +21,7 @@ from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
 from .adapters import select_lanes
-from .kinds import TOLD_MORE, Kind, check_competitor, compilation_key, is_program, make_competitor
+from .kinds import INFORMED_KINDS, Kind, check_competitor, compilation_key, is_program, make_competitor
 
 AFTER_MISSED = 5.0
 """Number of the reason among :data:`..storage.dataset.FAULTS` that a missed measurement explains."""
@@ -62,7 +62,7 @@ class Adapter(Filter[Task, Any, Adapted]):
         return self.first(initial, self.own.start(initial, initial.mean.shape[-1]))
 
     def first(self, initial: Any, memory: Any) -> Adapted:
-        """State before the first measurement."""
+        """Return the state before the first measurement."""
         return Adapted(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: Adapted, given: FilterInput) -> Adapted:
@@ -171,7 +171,7 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         return self.own.fault if isinstance(self.own, Adapter) else 0
 
     def _repeat_last(self, given: FilterInput) -> FilterInput:
-        """Copies, which may be changed in place."""
+        """Return the copies, which may be changed in place."""
         if self.count is None:
             return given
         width = given.measurement[0].shape[-1]
@@ -297,7 +297,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed, missing)
 
     def _stated(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Mean and covariance with valid numbers in place of what is never stated."""
+        """Return the mean and covariance with valid numbers in place of what is never stated."""
         if self.stated is None:
             return mean, covariance
         known, deviations = map(numpy.array, self.stated)
@@ -520,7 +520,7 @@ def put_in_loop(
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):
         own = make_competitor(competitor, model.task)
-    if kind in TOLD_MORE:
+    if kind in INFORMED_KINDS:
         check_knowledge(name, own, kind, model.task)
     if is_program(own):
         own.tracks, own.last = count, last

@@ -60,7 +60,7 @@ class Windows(NamedTuple):
     """Initial estimates and measurements of so many candidates, of the last number that was run at once."""
 
     def measurement(self, k: int) -> Any:
-        """Measurement k of each, the task's ``Measurement`` of arrays ``(..., W)``."""
+        """Return the measurement k of each, the task's ``Measurement`` of arrays ``(..., W)``."""
         return map_arrays(lambda array: array[k], self.measurements)
 
 
@@ -116,7 +116,7 @@ def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
 
 
 def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[Mapping[str, Any], int]:
-    """Initial estimate of a window, and the number of its first measurement."""
+    """Return the initial estimate of a window, and the number of its first measurement."""
     own = {name: values[span.episode] for name, values in recording.initial.items()}
     log_format = find_companion(task, LogFormat)
     if log_format is None or span.first <= warm_up:
@@ -154,7 +154,7 @@ def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
 def _update(
     task: Task, names: tuple[str, ...], apply: Apply, values: Array, measurement: Any, memory: Any
 ) -> tuple[Any, Array]:
-    """Memory after a measurement, and its log-likelihood; parameters ``(P, N)``."""
+    """Return the memory after a measurement, and its log-likelihood; parameters ``(P, N)``."""
     own = apply({name: values[i] for i, name in enumerate(names)})[1](task)
     return _step(as_filter(task, own), measurement, memory)
 
@@ -219,7 +219,8 @@ class WindowLikelihood:
         return other
 
     def __call__(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood of all measurements that count, nats, ``(C,)``; minus infinity where it is not finite.
+        """Return the log-likelihood of all measurements that count, nats, ``(C,)``; minus infinity where it is not
+        finite.
 
         Args:
             values: of the parameters, candidates last, ``(P, C)``.
@@ -236,7 +237,7 @@ class WindowLikelihood:
     def gradient(
         self, values: numpy.ndarray, step: float = 1e-4, of: Sequence[int] | numpy.ndarray | None = None
     ) -> tuple[float, numpy.ndarray]:
-        """Log-likelihood of a candidate, and its gradient by central differences, in one run.
+        """Return the log-likelihood of a candidate, and its gradient by central differences, in one run.
 
         Args:
             values: ``(P,)``.
@@ -319,8 +320,8 @@ class WindowLikelihood:
         return map_arrays(lambda array: next(after).astype(array.dtype), memory)
 
     def _tile_windows(self, count: int, first: int, rows: int) -> tuple[Any, Any]:
-        """Initial estimates of so many candidates, one after another, and so many of their measurements from the first
-        on, arrays ``(rows, ..., lanes)``.
+        """Return the initial estimates of so many candidates, one after another, and so many of their measurements
+        from the first on, arrays ``(rows, ..., lanes)``.
         """
         tiles = self.windows.tiles
         if count in tiles:

@@ -155,7 +155,7 @@ class OnlineFilter:
         self._go_on(begun if tracks is None else self._merge(begun, tracks))
 
     def _begin(self, initial: Any, memory: Any) -> OnlineState:
-        """State at the start of all tracks."""
+        """Return the state at the start of all tracks."""
         own = self._policy
         policy = self._update.blank_policy if own is None else own.begin(range(self.tracks))
         state = self.model.start_filter(self._padded(initial))
@@ -292,8 +292,8 @@ class OnlineFilter:
         self._state = state._replace(history=History(taken))
 
     def _missed_scans(self, last: Any, at: Any) -> list[Any]:
-        """Times of the scans between that missed the target, as a log that is read has them, of a filter that was
-        advised for a log.
+        """Return the times of the scans between that missed the target, as a log that is read has them, of a filter
+        that was advised for a log.
         """
         interval = self._scan_interval
         scans = int(max(numpy.rint((at - last) / interval).max(), 1))
@@ -314,7 +314,7 @@ class OnlineFilter:
         return found
 
     def _explain(self, found: Estimate, measurement: Any) -> Any:
-        """Reasons why tracks are lost, with what the task finds near their last valid estimates."""
+        """Return the reasons why tracks are lost, with what the task finds near their last valid estimates."""
         near = self._valid if self._is_policy else found
         if near is None:
             return found.lost
@@ -360,7 +360,7 @@ class OnlineFilter:
         return state._replace(fresh=numpy.zeros(self.tracks, dtype=bool))
 
     def predict(self, time: Any = None, **values: Any) -> Estimate:
-        """Estimate of a time at which nothing is received; the filter stays where it is.
+        """Return the estimate of a time at which nothing is received; the filter stays where it is.
 
         Args:
             time: as of :meth:`update`.
@@ -601,7 +601,7 @@ class OnlineFilter:
 
 
 def _shapes(part: Any) -> list[tuple[int, ...]]:
-    """Shapes of nested tuples of arrays."""
+    """Return the shapes of nested tuples of arrays."""
     return [numpy.shape(array) for array in leaves(part)]
 
 
@@ -617,7 +617,7 @@ def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
-    """Numbers of what is wrong with estimates, see :func:`.filters.find_fault`, ``(N,)``."""
+    """Return the numbers of what is wrong with estimates, see :func:`.filters.find_fault`, ``(N,)``."""
     nothing = numpy.zeros(mean.shape[-1])
     return numpy.asarray(find_fault(mean, covariance, nothing, nothing, numpy))
 
@@ -642,7 +642,9 @@ def _check_lag(lag: Any) -> int | timedelta:
 
 
 def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Measurement that has what another lacks, both of one time; None where it lacks nothing, or they differ."""
+    """Return the measurement that has what another lacks, both of one time; None where it lacks nothing, or they
+    differ.
+    """
     both, new = dict(given), False
     for name, value in late.items():
         first, second = _numbers(given.get(name)), _numbers(value)

@@ -61,7 +61,7 @@ class Estimate:
         return numpy.sqrt(numpy.einsum("ii...->i...", self.covariance))
 
     def __getitem__(self, name: str) -> Any:
-        """Mean of a component, by its name."""
+        """Return the mean of a component, by its name."""
         return self.mean[self.names.index(name)]
 
     def __str__(self) -> str:

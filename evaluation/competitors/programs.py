@@ -277,7 +277,7 @@ class ProgramEstimator:
         return answer[:C], answer[C : C + C * C].reshape(C, C, width), self.step_number
 
     def processor_seconds(self) -> float:
-        """Processor time that the program has taken, s; NaN where that is not known."""
+        """Return the processor time that the program has taken, s; NaN where that is not known."""
         return float("nan") if self._process is None else self._process.processor_seconds
 
     def end(self) -> None:
@@ -380,7 +380,7 @@ class ProgramEstimator:
 
 
 def _count(fields: Sequence[ArrayField]) -> int:
-    """Numbers of a track."""
+    """Return the numbers of a track."""
     return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 
 

@@ -98,7 +98,7 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
 
 
 def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
-    """Measurements and memories of a smoother that is stepped."""
+    """Return the measurements and memories of a smoother that is stepped."""
 
     def memory_in(episode: Any) -> Any:
         return looped.filter.own.memory if looped.filter.in_python else episode.filter.own
@@ -119,7 +119,9 @@ def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
 
 
 def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
-    """Measurements and memories of a smoother that is compiled; its measurements are masked as it is shown them."""
+    """Return the measurements and memories of a smoother that is compiled; its measurements are masked as it is
+    shown them.
+    """
     start = map_nested(lambda values: values[None, ..., : lanes.count], lanes.state.filter.own)
     measured: list[Any] = []
     memories = [start]
@@ -187,7 +189,7 @@ def report_smoothed(
 def _check_answers(
     task: Task, before: Checked, measurement: Any, means: numpy.ndarray, covariances: numpy.ndarray
 ) -> Checked:
-    """States of a :class:`.CheckedFilter` at measurements ``(..., scans, N)``, from answers to them.
+    """Return the states of a :class:`.CheckedFilter` at measurements ``(..., scans, N)``, from answers to them.
 
     Args:
         task: the estimation problem.

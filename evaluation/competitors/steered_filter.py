@@ -21,7 +21,7 @@ from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array, DecisionMeans
 from ...envs.engine.compiled import CompiledModel, warn_of
 from .filters import AroundBank
-from .kinds import Policy, says_traceable
+from .kinds import Policy, is_traceable
 
 
 class Decisions(NamedTuple):
@@ -96,7 +96,7 @@ class Decider:
         return action, Decisions(memory, count, answer, total)
 
     def _ask(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
-        """Action ``(A, N)`` and memory, every array ``(entries, N)``."""
+        """Return the action ``(A, N)`` and memory, every array ``(entries, N)``."""
         shapes, N = iter(self._shapes), observation.shape[-1]
 
         def restore(array: Array) -> Array:
@@ -216,7 +216,7 @@ def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Po
         policy: made for it.
         trace: :func:`trace_policy`.
     """
-    if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and says_traceable(policy)):
+    if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and is_traceable(policy)):
         return None
     try:
         return trace(model, policy)

@@ -161,7 +161,7 @@ class SteppingPolicy(Policy):
         return {**self.__dict__, "_traced": None, "_is_traced": False, "_bound": {}}
 
     def _calls(self, count: int) -> list[numpy.ndarray]:
-        """Episodes that each call of the policy is shown."""
+        """Return the episodes that each call of the policy is shown."""
         rows = MODEL_ROWS if hasattr(self.policy, "observation_space") else round_up_lanes(count)
         return [
             numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)

@@ -35,11 +35,12 @@ class StoneSoupEstimator(SingleTrackEstimator):
         return self.task.parameters.sampling_interval
 
     def begin(self, initial: Any) -> Any:
-        """Gaussian state at the start of the track."""
+        """Return the Gaussian state at the start of the track."""
         return GaussianState(initial.mean[:, None], initial.covariance, timestamp=START)
 
     def detection(self, measurement: Any, timestamp: datetime) -> Any:
-        """Detection of the position, with the covariance of this measurement in its model; None where there is none.
+        """Return the detection of the position, with the covariance of this measurement in its model; None where there
+        is none.
 
         Args:
             measurement: of this track.

@@ -114,7 +114,7 @@ def _frame(world: TaskEnv) -> Any:
 
 
 def _palette() -> Image.Image:
-    """Colours of the figures and their shades: one palette for all frames, or colours would flicker.
+    """Return the colours of the figures and their shades: one palette for all frames, or colours would flicker.
 
     A palette chosen from the pixels would drop what is small, such as the radar's mark.
     """

@@ -43,7 +43,7 @@ class CurvePanel(NamedTuple):
 
 
 def _abscissa(curves: xarray.Dataset) -> numpy.ndarray:
-    """Seconds where measurements come regularly, else their numbers."""
+    """Return the seconds where measurements come regularly, else their numbers."""
     found: numpy.ndarray = curves["elapsed" if "elapsed" in curves.coords else "time"].values
     return found
 
@@ -205,7 +205,7 @@ def _title(curves: xarray.Dataset) -> str:
 def draw_error_over_time(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """RMSE over time of every quantity, with 95 % bands over episodes.
+    """Return the RMSE over time of every quantity, with 95 % bands over episodes.
 
     Args:
         curves: of an evaluation with truth.
@@ -306,7 +306,7 @@ def draw_consistency(
 def draw_error_distribution(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Share of measurements with an error above a given size, of every quantity.
+    """Return the share of measurements with an error above a given size, of every quantity.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -349,7 +349,7 @@ def draw_error_distribution(
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
-    """Policies whose mode probabilities move by more than 0.02 over time, with those that have the same."""
+    """Return the policies whose mode probabilities move by more than 0.02 over time, with those that have the same."""
     probabilities = {name: curves["mode_probability"].sel(policy=name).values for name in names}
     found = {
         name: values
@@ -364,7 +364,8 @@ def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, lis
 def draw_mode_probabilities(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Mean over episodes of the mode probabilities, with 95 % bands, of what is told apart and where they vary.
+    """Return the mean over episodes of the mode probabilities, with 95 % bands, of what is told apart and where they
+    vary.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -408,7 +409,7 @@ def draw_mode_probabilities(
 def draw_true_class_probability(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Mean over episodes of the probability of the true class, with 95 % bands.
+    """Return the mean over episodes of the probability of the true class, with 95 % bands.
 
     Arguments as of :func:`draw_error_over_time`.
     """

@@ -122,7 +122,7 @@ def draw_panel(axis: Any, panel: FrontPanel) -> None:
 
 
 def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
-    """Handles of what the panels show."""
+    """Return the handles of what the panels show."""
     from matplotlib.lines import Line2D
 
     shown = [(point, panel) for panel in panels for point in panel.points if point.kind in RANKED]
@@ -339,12 +339,12 @@ def _nearest(box: Box, point: tuple[float, float]) -> tuple[float, float]:
 
 
 def _unit(cosine: numpy.ndarray) -> numpy.ndarray:
-    """Side on which a box lies: that of its middle for directions near the other axis."""
+    """Return the side on which a box lies: that of its middle for directions near the other axis."""
     return numpy.clip(1.8 * cosine, -1.0, 1.0)
 
 
 def _octaves(percent: Any) -> Any:
-    """Logarithm of a cost's ratio to the paper's."""
+    """Return the logarithm of a cost's ratio to the paper's."""
     return numpy.log2(numpy.maximum(1.0 + numpy.asarray(percent) / 100.0, 1e-6))
 
 
@@ -366,7 +366,7 @@ def _origin(point: Point, panel: FrontPanel) -> str:
 
 
 def _colour(point: Point, panel: FrontPanel) -> str:
-    """Colour of a name."""
+    """Return the colour of a name."""
     return {"paper's algorithm": PAPER, "learned": LEARNED, "yours": OWN}.get(_origin(point, panel), "black")
 
 

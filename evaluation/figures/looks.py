@@ -21,7 +21,7 @@ MOST_HIGHLIGHTED = 6
 
 
 def styles(names: list[str]) -> dict[str, dict[str, Any]]:
-    """Colour and line style of each policy; two policies never share both."""
+    """Return the colour and line style of each policy; two policies never share both."""
     n = len(COLOURS)
     return {
         name: {"color": COLOURS[i % n], "linestyle": LINES[(i // n) % len(LINES)], "linewidth": 1.6}
@@ -30,8 +30,8 @@ def styles(names: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def by_cost(curves: xarray.Dataset) -> list[str]:
-    """Names of what is ranked, the lowest mean cost first; without costs by the mean RMSE of the first quantity, and
-    without truth as they come.
+    """Return the names of what is ranked, the lowest mean cost first; without costs by the mean RMSE of the first
+    quantity, and without truth as they come.
     """
     names = curves["policy"].values[numpy.isin(curves["kind"].values.astype(str), RANKED)].tolist()
     if "mean_cost" in curves:
@@ -50,7 +50,8 @@ def choose_highlights(
     learned: Sequence[str] = (),
     own: Sequence[str] = (),
 ) -> list[str]:
-    """Names of the lines that are told apart, the most important first; of those that are the same, the first.
+    """Return the names of the lines that are told apart, the most important first; of those that are the same, the
+    first.
 
     Args:
         curves: of an evaluation.
@@ -104,7 +105,7 @@ def looks(
     learned: Sequence[str] = (),
     own: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """Colour, line style and width of the lines that are told apart, in the order of the legend.
+    """Return the colour, line style and width of the lines that are told apart, in the order of the legend.
 
     Args:
         curves: of an evaluation.
@@ -156,7 +157,8 @@ def group_equal_lines(names: Iterable[str], values: Mapping[str, numpy.ndarray])
 def distinguish_lines(
     look: Iterable[str], values: Mapping[str, numpy.ndarray]
 ) -> tuple[dict[str, str], list[str]]:
-    """Lines that are told apart, with their labels, and the others; whoever lies on one of them is named with it.
+    """Return the lines that are told apart, with their labels, and the others; whoever lies on one of them is named
+    with it.
 
     Args:
         look: names of those that are told apart, in the order of the legend.
@@ -171,6 +173,8 @@ def distinguish_lines(
 
 
 def join_names(names: Sequence[str], most: int = 2) -> str:
-    """Name of a line that several share: ``imm = zero``, or of more than ``most`` ``imm = zero = 3 more``."""
+    """Return the name of a line that several share: ``imm = zero``, or of more than ``most`` ``imm = zero = 3
+    more``.
+    """
     few = len(names) <= most
     return " = ".join(names if few else [*names[:most], f"{len(names) - most} more"])

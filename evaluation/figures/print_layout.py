@@ -134,7 +134,7 @@ def sensible_limits(
     always: Sequence[numpy.ndarray] = (),
     bounds: Sequence[numpy.ndarray] = (),
 ) -> tuple[float, float]:
-    """Limits of a logarithmic axis on which one line, or a transient, cannot squash all others.
+    """Return the limits of a logarithmic axis on which one line, or a transient, cannot squash all others.
 
     A line takes the room from its 5th percentile, so that it need not begin at zero, to its largest value, but not more
     than a factor of six above what half of the lines take.
@@ -165,7 +165,7 @@ def positive(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def _spread(wanted: Sequence[float], gap: float) -> list[float]:
-    """Places as near to the wanted ones as a gap between them allows, within 0 and 1."""
+    """Return the places as near to the wanted ones as a gap between them allows, within 0 and 1."""
     order = numpy.argsort(wanted, kind="stable")
     places = numpy.clip(numpy.asarray(wanted, dtype=float)[order], 0.0, 1.0)
     for _ in range(200):

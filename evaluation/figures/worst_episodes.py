@@ -118,7 +118,7 @@ def main_causes(run: xarray.Dataset) -> list[list[str]]:
 
 
 def _share_of_all(sums: numpy.ndarray) -> numpy.ndarray:
-    """Share that each cause has of the whole, ``(episodes, causes)``; zero where the whole is zero."""
+    """Return the share that each cause has of the whole, ``(episodes, causes)``; zero where the whole is zero."""
     whole = numpy.broadcast_to(sums[:, :1], sums.shape)
     return numpy.nan_to_num(ratio(numpy.stack([sums, whole], axis=1)))
 

@@ -284,7 +284,9 @@ def cost_in_stretches(cost: numpy.ndarray) -> numpy.ndarray:
 
 
 def _stretch_coords(dataset: xarray.Dataset) -> dict[str, Any]:
-    """Middle of every stretch, as the number of a measurement and, where they come regularly, in seconds."""
+    """Return the middle of every stretch, as the number of a measurement and, where they come regularly, in
+    seconds.
+    """
     middles = {
         name: [float(dataset[name].values[stretch].mean()) for stretch in stretches_of(dataset.sizes["time"])]
         for name in ("time", "elapsed")
@@ -332,7 +334,7 @@ def _cost_differences(
 
 
 def gains_of(dataset: xarray.Dataset) -> list[str]:
-    """Names of the gains that some bank records: a number for every measurement."""
+    """Return the names of the gains that some bank records: a number for every measurement."""
     names = map(str, dataset.data_vars)
     return [
         name
@@ -345,7 +347,7 @@ def gains_of(dataset: xarray.Dataset) -> list[str]:
 
 
 def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
-    """Size that a share of errors reaches or exceeds, for each of :data:`SHARES`.
+    """Return the size that a share of errors reaches or exceeds, for each of :data:`SHARES`.
 
     Args:
         errors: of any shape, not below zero; NaN: none.
@@ -384,7 +386,7 @@ def _consistency_bands(found: Sequence[CompetitorCurves]) -> dict[str, Series]:
 
 
 def _spread(values: numpy.ndarray) -> Curve:
-    """Mean and percentiles over the episodes of ``(episodes, name, time)``."""
+    """Return the mean and percentiles over the episodes of ``(episodes, name, time)``."""
     flat = values.reshape(len(values), -1)
     found = numpy.full((3, flat.shape[1]), numpy.nan)
     absent = numpy.isnan(flat)

@@ -22,7 +22,7 @@ from ...envs.engine.catalogue import importable_name, nearest, task_class
 from ...envs.engine.episode_noise import uniforms_of_seeds
 from ...envs.engine.programs import Report
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
-from ..competitors.kinds import TOLD_MORE, Kind, kind_of
+from ..competitors.kinds import INFORMED_KINDS, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
@@ -422,7 +422,7 @@ def plan_of(
     model = next(iter(models.values()))
     if chosen.recording is not None:
         for name, kind in kinds.items():
-            if kind in TOLD_MORE:
+            if kind in INFORMED_KINDS:
                 raise ValueError(
                     f"{kind} {name!r} is told what recording {chosen.name!r} does not hold, more of the truth than the "
                     "components: leave it out"
@@ -471,7 +471,8 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
 def _flights_in_turn(
     model: Model, split: str, seed: int, episodes: int
 ) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
-    """Seeds, in their order, of which every flight gets as many as any other; the flight and length of each.
+    """Return the seeds, in their order, of which every flight gets as many as any other; the flight and length of
+    each.
 
     An episode stays what its seed makes it. Who wants fewer episodes than there are flights gets one of each.
     """

@@ -13,7 +13,7 @@ DRAWN_PREFIX = "drawn_"
 
 
 def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
-    """Normalised squared error of the components whose truth is known, with their marginal covariance.
+    """Return the normalised squared error of the components whose truth is known, with their marginal covariance.
 
     Args:
         model: task with a filter.

@@ -65,7 +65,7 @@ class Record(NamedTuple):
 def squared_errors(
     run: "xarray.Dataset", component: str, groups: dict[str, tuple[str, ...]]
 ) -> numpy.ndarray:
-    """Squared error of a component or group in one run, ``(episodes, time)``; of a bound its mean."""
+    """Return the squared error of a component or group in one run, ``(episodes, time)``; of a bound its mean."""
     parts = list(groups.get(component, (component,)))
     if "mean_square" in run and not numpy.isnan(run["mean_square"].values[0, 0, 0]):
         return run["mean_square"].sel(component=parts).sum("component", skipna=False).values
@@ -73,7 +73,7 @@ def squared_errors(
 
 
 def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Components and groups of components whose truth is known, with their units."""
+    """Return the components and groups of components whose truth is known, with their units."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
     if "truth_known" in dataset.coords:
         known = dataset["truth_known"].values > 0
@@ -83,7 +83,8 @@ def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
 
 
 def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
-    """Sum of every episode over the times, and how many there are, of which :func:`.bootstrap.ratio` is the mean.
+    """Return the sum of every episode over the times, and how many there are, of which :func:`.bootstrap.ratio` is the
+    mean.
 
     Args:
         values: ``(episodes, time)``; NaN stands for no measurement, or no event.
@@ -96,7 +97,7 @@ def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
-    """Resampling of the episodes of an evaluation; of whole flights where they fly several."""
+    """Return the resampling of the episodes of an evaluation; of whole flights where they fly several."""
     clusters = tuple(dataset["flight"].values.tolist()) if "flight" in dataset.coords else None
     return resampling(dataset.sizes["episode"], resamples, clusters)
 
@@ -110,15 +111,15 @@ def resampling(
 
 
 def units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
-    """Units of time that are resampled of one long episode; None of several, or of a short one."""
+    """Return the units of time that are resampled of one long episode; None of several, or of a short one."""
     if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST:
         return TimeUnits(dataset.sizes["time"])
     return None
 
 
 def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | None:
-    """Sums in units of time of what the length of blocks follows from, ``(units, 2)``: of the cost, without truth of
-    the log-likelihood; None where neither is known.
+    """Return the sums in units of time of what the length of blocks follows from, ``(units, 2)``: of the cost,
+    without truth of the log-likelihood; None where neither is known.
     """
     known = [name for name in ("cost", "log_likelihood") if name in run]
     return units.sums_of_present(run[known[0]].values) if known else None
@@ -127,13 +128,13 @@ def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | N
 def bootstrap_over_time(
     units: TimeUnits, series: Sequence[numpy.ndarray | None], resamples: int = RESAMPLES
 ) -> Bootstrap:
-    """Resampling of one episode, whose blocks are as long as the ``series`` of all competitors need."""
+    """Return the resampling of one episode, whose blocks are as long as the ``series`` of all competitors need."""
     known = [one for one in series if one is not None]
     return BlockBootstrap(units, known, resamples) if known else Bootstrap(1, resamples)
 
 
 def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
-    """Resampling of the episodes of an evaluation; of one episode of blocks of time."""
+    """Return the resampling of the episodes of an evaluation; of one episode of blocks of time."""
     if (units := units_of(dataset)) is None:
         return bootstrap_of_episodes(dataset, resamples)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
@@ -170,7 +171,7 @@ def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) 
 
 
 def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset") -> Bootstrap:
-    """Resampling of an evaluation that was reduced, as of :func:`bootstrap_of`."""
+    """Return the resampling of an evaluation that was reduced, as of :func:`bootstrap_of`."""
     if (units := reduced[0].units) is None:
         return bootstrap_of_episodes(evaluation)
     return bootstrap_over_time(units, [one.series for one in reduced])
@@ -197,7 +198,7 @@ def records_of_reduced(
 
 
 def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
-    """Mean of each episode, ``(episodes,)``; where flights differ in length, over its own.
+    """Return the mean of each episode, ``(episodes,)``; where flights differ in length, over its own.
 
     Args:
         run: that the values are of.
@@ -209,7 +210,7 @@ def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarra
 
 
 def _peak(means: numpy.ndarray) -> numpy.ndarray:
-    """Largest root over time."""
+    """Return the largest root over time."""
     found: numpy.ndarray = numpy.fmax.reduce(numpy.sqrt(means), axis=1)
     return found
 
@@ -229,7 +230,7 @@ def record_statistics(
     judged = run.attrs.get("truth", True)
 
     def means(metric: str, component: str, unit: str, values: Any, function: Function = identity) -> Any:
-        """Mean over every window."""
+        """Return the mean over every window."""
         for window, times in slices.items():
             key, mean = ("record", metric, component, window, unit), mean_over_time(run, values[:, times])
             yield Statistic(key, mean, function, of_units=_units(values, times))
@@ -280,7 +281,7 @@ def record_statistics(
 def _mean_of_present(
     metric: str, component: str, window: str, unit: str, values: numpy.ndarray, times: slice
 ) -> Statistic:
-    """Mean over episodes and times of what is there; a block of episodes may have nothing."""
+    """Return the mean over episodes and times of what is there; a block of episodes may have nothing."""
     key, sums = ("record", metric, component, window, unit), sums_of_present(values[:, times])
     return Statistic(key, sums, ratio, optional=True, of_units=_units(values, times))
 
@@ -313,7 +314,7 @@ def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[
 
 
 def _over_dimension(run: "xarray.Dataset", metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """NEES or NIS over its dimension, NaN where there is none, and that dimension, as their arrays are."""
+    """Return the NEES or NIS over its dimension, NaN where there is none, and that dimension, as their arrays are."""
     degrees = consistency_degrees(run, metric)
     some = numpy.where(degrees > 0.0, degrees, 1.0)
     return numpy.where(degrees > 0.0, run[metric].values / some, numpy.nan), degrees
@@ -343,7 +344,7 @@ def consistency_metrics(run: "xarray.Dataset") -> list[str]:
 
 
 def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
-    """Dimension of what ``nees`` or ``nis`` is of, as their arrays are."""
+    """Return the dimension of what ``nees`` or ``nis`` is of, as their arrays are."""
     if metric == "nis":
         return numpy.nan_to_num(run["nis_degrees"].values)
     # Of whoever states everything there are no degrees, though there may be of others in the same evaluation.
@@ -352,7 +353,7 @@ def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
 
 
 def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
-    """Quantile of the chi-square distribution.
+    """Return the quantile of the chi-square distribution.
 
     Args:
         probability: of smaller numbers.
@@ -370,7 +371,9 @@ def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
 
 
 def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of freedom."""
+    """Return the two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of
+    freedom.
+    """
     low, high = (chi_square_quantile(p, runs * degrees) / runs for p in (0.025, 0.975))
     return low, high
 
@@ -378,7 +381,9 @@ def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarra
 def score(
     cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
 ) -> IntervalEstimate:
-    """(C_paper - C) / (C_paper - C_reference), from means, and resampled ones, of three costs or their logarithms."""
+    """Return the (C_paper - C) / (C_paper - C_reference), from means, and resampled ones, of three costs or their
+    logarithms.
+    """
     room = paper - reference
     # Where the reference is not significantly better than the paper, a ratio to the room says nothing, and where it is
     # worse it would praise what is worse still.
@@ -441,8 +446,8 @@ class _Against:
         }
 
     def _columns(self, part: slice) -> numpy.ndarray:
-        """Numbers of some episodes of which means are needed, ``(some, columns)``: of every competitor its cost, its
-        logarithm, whether it is lost, and whether it is less than the paper's algorithm's.
+        """Return the numbers of some episodes of which means are needed, ``(some, columns)``: of every competitor
+        its cost, its logarithm, whether it is lost, and whether it is less than the paper's algorithm's.
         """
         costs = [own[part] for own in self.costs.values()]
         with numpy.errstate(divide="ignore", invalid="ignore"):
@@ -452,7 +457,9 @@ class _Against:
         return numpy.stack(columns, axis=1)
 
     def behind_best(self, name: str) -> Iterator[Measure]:
-        """Paired ratio of the cost to the best one's, less one, and how often other episodes would name this one."""
+        """Return the paired ratio of the cost to the best one's, less one, and how often other episodes would name
+        this one.
+        """
         if name in self.ranked:
             difference = self._difference(name, self.best)
             yield Measure("behind_best", self.best, "all", difference, "1")
@@ -460,12 +467,14 @@ class _Against:
             yield Measure("best_share", "", "all", IntervalEstimate(share, math.nan, math.nan), "1")
 
     def _difference(self, name: str, other: str) -> IntervalEstimate:
-        """Geometric mean of the ratios of two costs, less one."""
+        """Return the geometric mean of the ratios of two costs, less one."""
         with numpy.errstate(invalid="ignore", over="ignore"):
             return self.bootstrap.interval(numpy.expm1(self.logs[name] - self.logs[other]))
 
     def own(self, name: str) -> Iterator[Measure]:
-        """Geometric mean of the cost, and the share of episodes whose track is lost where a bound says so."""
+        """Return the geometric mean of the cost, and the share of episodes whose track is lost where a bound says
+        so.
+        """
         if name in self.logs:
             with numpy.errstate(over="ignore"):
                 mean = self.bootstrap.interval(numpy.exp(self.logs[name]))
@@ -533,7 +542,7 @@ def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
 
 @one_thread()
 def flight_records(dataset: "xarray.Dataset") -> list[Record]:
-    """Cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
+    """Return the cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
 
     Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
 
@@ -631,7 +640,7 @@ def contender_of(
 def _compare_causes(
     contender: Contender, contenders: Sequence[Contender], bootstrap: Bootstrap
 ) -> Iterator[Measure]:
-    """Cost under each cause over that of the opponent; a cause stands in the place of a window."""
+    """Return the cost under each cause over that of the opponent; a cause stands in the place of a window."""
     split = {c.name: c.causes for c in contenders if c.causes is not None}
     if contender.name not in split:
         return

@@ -44,7 +44,7 @@ MEASURED = ("that of the environment's table of measurements", "as the sensors r
 
 
 def _attributes(key: str, cost: str) -> dict[str, str]:
-    """Unit of a variable, and whether it is normalised; nothing where only the environment knows."""
+    """Return the unit of a variable, and whether it is normalised; nothing where only the environment knows."""
     name = key.removeprefix(DRAWN_PREFIX)
     if name == "cost":
         return {"units": "1", "long_name": f"{cost}, normalised as it says"}
@@ -77,7 +77,9 @@ def recording_coords(
 
 
 def _further_dimensions(key: str, count: int) -> list[str]:
-    """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
+    """Return the names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the
+    first.
+    """
     if count < 0:
         return []
     key = key.removeprefix(DRAWN_PREFIX)
@@ -91,7 +93,7 @@ def _further_dimensions(key: str, count: int) -> list[str]:
 
 
 def action_names(model: Model) -> tuple[str, ...]:
-    """Names of the components of a box of actions.
+    """Return the names of the components of a box of actions.
 
     As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
     for each; else the control, with numbers from 1 on where there are several.

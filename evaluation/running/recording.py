@@ -110,7 +110,7 @@ def _check_size(task: Task, episodes: int) -> None:
 def _record(
     model: Model, seeds: Sequence[int], tick: Progress
 ) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
-    """Measurements and truth, ``(E, T, ...)``, and what was told of the start, ``(E, ...)``."""
+    """Return the measurements and truth, ``(E, T, ...)``, and what was told of the start, ``(E, ...)``."""
     initial: dict[str, numpy.ndarray] = {}
     series: dict[str, list[numpy.ndarray]] = {}
     count, interval = len(seeds), model.task.decision_interval

@@ -22,9 +22,9 @@ from ...envs.interface.requests import check_action
 from ..competitors.filters import put_in_loop
 from ..competitors.kinds import (
     Kind,
-    answers_by_track,
     check_competitor,
     compilation_key,
+    is_made_for_episodes,
     is_program,
     kind_of,
     make_competitor,
@@ -114,7 +114,7 @@ def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int]
             SmoothedTrack(model.task, *_smoothed_estimates(model, competitor, seeds, name)),
             "estimator",
         )
-    if answers_by_track(competitor):
+    if is_made_for_episodes(competitor):
         competitor = competitor.of_episodes(model.task, seeds)
     return put_in_loop(model, competitor, kind, name, len(seeds), model.task.horizon)
 
@@ -383,7 +383,7 @@ def measure_time(
         seeds: of some episodes, which are repeated where they are fewer.
         name: of the competitor, in errors.
     """
-    if kind in ("smoother", "bound") or answers_by_track(competitor):
+    if kind in ("smoother", "bound") or is_made_for_episodes(competitor):
         return None
     seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
     task, is_policy = model.task, kind == "policy"
@@ -414,7 +414,7 @@ def _report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
 def _time_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], decisions: int
 ) -> float:
-    """Seconds of a decision of all episodes, in the quickest run of optimised code."""
+    """Return the seconds of a decision of all episodes, in the quickest run of optimised code."""
     identities = identities_of_seeds(seeds)
     lanes = start_lanes(looped, seeds, report=_report_estimate)
     interval = looped.task.decision_interval
@@ -442,7 +442,7 @@ def _time_compiled(
 def _time_steps(
     steps: Iterator[Any], decisions: int, interval: int, clock: Callable[[], float] = time.process_time
 ) -> float:
-    """Seconds of the median decision, by a clock."""
+    """Return the seconds of the median decision, by a clock."""
     spent: list[float] = []
     for _ in range(decisions):
         began = clock()

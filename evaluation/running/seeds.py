@@ -9,7 +9,7 @@ SPLITS = {"train": 0, "validation": 1, "test": 2}
 
 
 def episode_seeds(split: str, seed: int, episodes: int, first: int = 0) -> list[int]:
-    """Seeds of a run of episodes.
+    """Return the seeds of a run of episodes.
 
     Each is an ordinary Gymnasium seed: ``env.reset(seed=...)`` replays the episode.
 

@@ -74,7 +74,7 @@ def is_supervised() -> bool:
 
 @contextmanager
 def running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
-    """Report that the code of a competitor runs; gives the progress that is to be called while it does.
+    """Return the report that the code of a competitor runs; gives the progress that is to be called while it does.
 
     Args:
         name: of the competitor.

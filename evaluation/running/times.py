@@ -71,7 +71,7 @@ class Point(NamedTuple):
 
 
 def times_of_records(records: Sequence[Any]) -> dict[str, ProcessorTime]:
-    """Times by name, from tidy records of one environment and scenario."""
+    """Return the times by name, from tidy records of one environment and scenario."""
     return {
         r.policy: ProcessorTime(r.value, r.component == COMPILED, r.component == OWN)
         for r in records
@@ -80,8 +80,8 @@ def times_of_records(records: Sequence[Any]) -> dict[str, ProcessorTime]:
 
 
 def points_of_records(records: Sequence[Any]) -> list[Point]:
-    """Points of all competitors whose cost and time are known, but for programs, whose time is without the world; the
-    cost is relative to the paper's algorithm, in %.
+    """Return the points of all competitors whose cost and time are known, but for programs, whose time is without the
+    world; the cost is relative to the paper's algorithm, in %.
 
     Args:
         records: tidy ones of one environment and scenario.
@@ -96,7 +96,8 @@ def points_of_records(records: Sequence[Any]) -> list[Point]:
 
 
 def front(points: Sequence[Point]) -> list[str]:
-    """Names of the ranked competitors that no other beats in cost and time, the quickest first (Pareto front).
+    """Return the names of the ranked competitors that no other beats in cost and time, the quickest first (Pareto
+    front).
 
     Whoever takes about as long, within :data:`EQUAL_TIMES`, and costs less beats, too; so noise of the clock puts
     nobody on the front. Of equal costs it is the quickest, of those that take about as long the first by name.
@@ -120,7 +121,7 @@ def front(points: Sequence[Point]) -> list[str]:
 
 
 def time_text(time: ProcessorTime | None) -> str:
-    """Nanoseconds in two digits, marked where the time is that of Python."""
+    """Return the nanoseconds in two digits, marked where the time is that of Python."""
     if time is None or time.nanoseconds <= 0.0:
         return "-"
     rounded = round(time.nanoseconds, min(1 - math.floor(math.log10(time.nanoseconds)), 0))
@@ -129,7 +130,8 @@ def time_text(time: ProcessorTime | None) -> str:
 
 
 def column_of_times(records: Sequence[Any]) -> dict[str, str]:
-    """Text of a table's column of times by name, with a mark for who lies on the front; empty where none is known.
+    """Return the text of a table's column of times by name, with a mark for who lies on the front; empty where none is
+    known.
 
     Args:
         records: tidy ones of one environment and scenario.

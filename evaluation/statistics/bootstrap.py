@@ -45,18 +45,20 @@ class IntervalEstimate(NamedTuple):
 
 
 def ratio(sums: numpy.ndarray) -> numpy.ndarray:
-    """First over second of what stands on the second axis, ``(n, 2, ...)``; NaN where the second is zero."""
+    """Return the first over second of what stands on the second axis, ``(n, 2, ...)``; NaN where the second is
+    zero.
+    """
     first, second = sums[:, 0], sums[:, 1]
     return numpy.divide(first, second, out=numpy.full(first.shape, numpy.nan), where=second > 0.0)
 
 
 def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
-    """Means from what all episodes contribute to :meth:`Bootstrap.sums`; NaN where nobody has a number."""
+    """Return the means from what all episodes contribute to :meth:`Bootstrap.sums`; NaN where nobody has a number."""
     return sums[:, 0] if sums.shape[1] == 1 else ratio(sums)
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
-    """Values and their 95 % percentile intervals; NaN where a resample is not finite, or there is none.
+    """Return the values and their 95 % percentile intervals; NaN where a resample is not finite, or there is none.
 
     Args:
         samples: of the data and of every resample, ``(1 + resamples, ...)``.
@@ -138,11 +140,11 @@ class Bootstrap:
         self._last: tuple[slice, numpy.ndarray] | None = None
 
     def _resampled(self, episodes: numpy.ndarray) -> numpy.ndarray:
-        """Number of the cluster or group with which each of these episodes is resampled."""
+        """Return the number of the cluster or group with which each of these episodes is resampled."""
         return episodes // self._group if self._clusters is None else self._clusters[episodes]
 
     def _weigh(self, numbers: numpy.ndarray) -> numpy.ndarray:
-        """Sum of whole numbers ``(clusters, ...)`` in every resample, ``(1 + resamples, ...)``; exact."""
+        """Return the sum of whole numbers ``(clusters, ...)`` in every resample, ``(1 + resamples, ...)``; exact."""
         numbers = numbers.astype(float)
         parts = (self._counts[i : i + AT_ONCE] for i in range(0, len(self._counts), AT_ONCE))
         return numpy.concatenate([part.astype(float) @ numbers for part in parts])
@@ -153,7 +155,9 @@ class Bootstrap:
         return self._counts[:, self._resampled(numpy.arange(self.episodes))] / self.totals[:, None]
 
     def weights_of(self, some: slice) -> numpy.ndarray:
-        """Share of some episodes, or of those of some groups, ``(1 + resamples, some)``; the last ones are kept."""
+        """Return the share of some episodes, or of those of some groups, ``(1 + resamples, some)``; the last ones
+        are kept.
+        """
         if self._last is None or self._last[0] != some:
             self._last = None  # two blocks of weights are never held
             which = some if self._clusters is None else self._clusters[some]
@@ -195,7 +199,7 @@ class Bootstrap:
         ]
 
     def means(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Means over the episodes and over every resample of them.
+        """Return the means over the episodes and over every resample of them.
 
         Args:
             values: ``(episodes, ...)``.
@@ -206,14 +210,14 @@ class Bootstrap:
         return self.means_of(lambda part: values[part])
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Means as of :meth:`means`, of values that are made for some episodes at a time."""
+        """Return the means as of :meth:`means`, of values that are made for some episodes at a time."""
         parts = (self.sums([values(slice(i, i + BLOCK))], i)[0] for i in range(0, self.episodes, BLOCK))
         return mean_of_sums(functools.reduce(operator.add, parts))
 
     def quantiles(
         self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
     ) -> numpy.ndarray:
-        """Quantiles over the episodes and over every resample of them, ``(1 + resamples,)``.
+        """Return the quantiles over the episodes and over every resample of them, ``(1 + resamples,)``.
 
         The smallest value that at least that share of the weight does not exceed; NaN where nobody is chosen.
 
@@ -248,21 +252,25 @@ class Bootstrap:
         return found
 
     def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
-        """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``; none of one episode."""
+        """Return the percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``; none of
+        one episode.
+        """
         if self._counts.shape[1] == 1:
             statistics = statistics[:1]
         return IntervalEstimate(*percentile_interval(statistics).tolist())
 
     def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
-        """Paired relative difference of means to those of another competitor, both from :meth:`means`."""
+        """Return the paired relative difference of means to those of another competitor, both from :meth:`means`."""
         return self.interval(means / others - 1.0)
 
     def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
-        """Geometric mean of the ratios of two competitors' costs in every episode, ``(episodes,)``, less one."""
+        """Return the geometric mean of the ratios of two competitors' costs in every episode, ``(episodes,)``, less
+        one.
+        """
         return self.estimate(numpy.log(costs / others), numpy.expm1)
 
     def estimate(
         self, values: numpy.ndarray, of_means: Callable[[numpy.ndarray], numpy.ndarray] = lambda m: m
     ) -> IntervalEstimate:
-        """Interval of a function of the means of ``values`` over the episodes."""
+        """Return the interval of a function of the means of ``values`` over the episodes."""
         return self.interval(of_means(self.means(values)))

@@ -22,7 +22,7 @@ UNKNOWN = IntervalEstimate(math.nan, math.nan, math.nan)
 
 
 def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
-    """Correlation of successive prediction errors; zero where they are white.
+    """Return the correlation of successive prediction errors; zero where they are white.
 
     Args:
         errors: ``(m, episodes, time)``.
@@ -37,7 +37,8 @@ def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
 def stretch_interval(
     mask: numpy.ndarray, values: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
 ) -> IntervalEstimate:
-    """Value and 95 % interval of a function of two means over measurements, by resampling stretches of them.
+    """Return the value and 95 % interval of a function of two means over measurements, by resampling stretches of
+    them.
 
     Args:
         mask: of the measurements, ``(episodes, time)``.
@@ -64,7 +65,7 @@ def stretches_of(mask: numpy.ndarray) -> numpy.ndarray:
 def interval_of_sums(
     sums: numpy.ndarray, counts: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
 ) -> IntervalEstimate:
-    """Value and 95 % interval of a function of two means, by resampling stretches.
+    """Return the value and 95 % interval of a function of two means, by resampling stretches.
 
     Args:
         sums: over each stretch, ``(stretches, 2)``.
@@ -115,7 +116,7 @@ def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
 
 
 def likelihood_differences(found: Mapping[str, LikelihoodSums]) -> dict[str, IntervalEstimate]:
-    """Log-likelihood per measurement less that of the best, by name.
+    """Return the log-likelihood per measurement less that of the best, by name.
 
     The interval is paired; there is none where both are known of different measurements.
     """

@@ -49,7 +49,7 @@ class TimeUnits:
         return numpy.pad(values, [(0, 0), (0, beyond)]).reshape(len(values), self.units, self.unit)
 
     def sums_of_present(self, values: numpy.ndarray, times: slice = slice(None)) -> numpy.ndarray:
-        """Sum of every unit, and how many numbers there are, ``(units, 2)``.
+        """Return the sum of every unit, and how many numbers there are, ``(units, 2)``.
 
         Args:
             values: ``(1, time)``; NaN stands for no measurement, or no event.
@@ -94,7 +94,7 @@ class BlockBootstrap(Bootstrap):
         self.totals = self._counts.sum(axis=1)
 
     def resample(self, values: numpy.ndarray, of_units: numpy.ndarray) -> numpy.ndarray:
-        """Mean over the episode and over every resample of its blocks, ``(1 + resamples, ...)``.
+        """Return the mean over the episode and over every resample of its blocks, ``(1 + resamples, ...)``.
 
         Args:
             values: of the episode, ``(1, ...)``.
@@ -106,14 +106,14 @@ class BlockBootstrap(Bootstrap):
         return found
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Values of the episode, as their means; NaN in every resample."""
+        """Return the values of the episode, as their means; NaN in every resample."""
         own = values(slice(0, 1))
         return numpy.concatenate([own, numpy.full((len(self._counts) - 1, *own.shape[1:]), math.nan)])
 
     def quantiles(
         self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
     ) -> numpy.ndarray:
-        """Value of the episode, as any quantile; NaN in every resample."""
+        """Return the value of the episode, as any quantile; NaN in every resample."""
         return self.means(values if chosen is None else numpy.where(chosen, values, math.nan))
 
     @property
@@ -133,7 +133,7 @@ class BlockBootstrap(Bootstrap):
 
 
 def block_length(series: numpy.ndarray) -> int:
-    """Length of the blocks of a circular block bootstrap of the mean, by the rule of Politis and White.
+    """Return the length of the blocks of a circular block bootstrap of the mean, by the rule of Politis and White.
 
     Args:
         series: ``(n,)``; NaN, which is not known, adds nothing to an autocovariance.

@@ -64,6 +64,6 @@ def write_blind(folder: Path, recording: Recording, task: Task) -> None:
 
 
 def _numbered(name: str, values: numpy.ndarray) -> Iterator[tuple[str, numpy.ndarray]]:
-    """Columns of an array ``(..., rows)`` by name, numbered from 1 on where a field has several numbers."""
+    """Return the columns of an array ``(..., rows)`` by name, numbered from 1 on where a field has several numbers."""
     for place in numpy.ndindex(values.shape[:-1]):
         yield "_".join([name, *(str(i + 1) for i in place)]), values[place] * 1

@@ -98,7 +98,7 @@ def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
 
 
 def windows_of(dataset: "xarray.Dataset") -> dict[str, tuple[int, int]]:
-    """Windows by name: first and last measurement of each, both included, from 1 on.
+    """Return the windows by name: first and last measurement of each, both included, from 1 on.
 
     Args:
         dataset: from an evaluation, as it was or read from a file.
@@ -108,7 +108,7 @@ def windows_of(dataset: "xarray.Dataset") -> dict[str, tuple[int, int]]:
 
 
 def slices_of(dataset: "xarray.Dataset") -> dict[str, slice]:
-    """Windows by name, as parts of the time axis."""
+    """Return the windows by name, as parts of the time axis."""
     return {name: slice(first - 1, last) for name, (first, last) in windows_of(dataset).items()}
 
 
@@ -125,7 +125,7 @@ def window_coords(windows: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
 
 
 def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
-    """Components of every group, such as ``position``, in the order of the components."""
+    """Return the components of every group, such as ``position``, in the order of the components."""
     found: dict[str, list[str]] = {}
     for name, group in zip(
         dataset["component"].values.tolist(), dataset["group"].values.tolist(), strict=True
@@ -136,7 +136,7 @@ def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
 
 
 def keywords_of(dataset: "xarray.Dataset") -> dict[str, Any]:
-    """Parameters of the task that the evaluation was asked for; sequences are lists, as JSON has them.
+    """Return the parameters of the task that the evaluation was asked for; sequences are lists, as JSON has them.
 
     Other objects, of a task of one's own, are text, as Python's ``repr`` shows them.
     """

@@ -79,7 +79,7 @@ def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
 
 
 def _table_columns(path: Path, components: Sequence[str]) -> dict[str, Any]:
-    """Columns of a table, numbers or words."""
+    """Return the columns of a table, numbers or words."""
     pairs = [f"covariance_{a}_{b}" for a in components for b in components]
     forms = [form + name for name in components for form in ("estimate_", "mean_", "sigma_", "")]
     columns, names, _ = read_table(path, {*TRACK, *SECONDS, LOG_TIME, "policy", *LIKELIHOOD, *forms, *pairs})
@@ -174,7 +174,7 @@ def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> Estima
 
 
 def _track_name(value: Any) -> str:
-    """Name of a track; of a number without a fraction the whole number."""
+    """Return the name of a track; of a number without a fraction the whole number."""
     text = str(value).strip()
     return text.removesuffix(".0") if text.removesuffix(".0").isdigit() else text
 
@@ -199,7 +199,7 @@ def _covariance(
 
 
 def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
-    """Positions of one file, or of a folder with a file for each track; the orientation is not read."""
+    """Return the positions of one file, or of a folder with a file for each track; the orientation is not read."""
     import pandas
 
     axes = [components.index(name) for name in AXES if name in components]

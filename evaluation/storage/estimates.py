@@ -120,7 +120,7 @@ def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
 
 
 def _log_seconds(own: xarray.Dataset) -> numpy.ndarray:
-    """Times of the log in s, ``(T,)``; NaN beyond the end of a shorter episode."""
+    """Return the times of the log in s, ``(T,)``; NaN beyond the end of a shorter episode."""
     import pandas
 
     found = numpy.full(own.sizes["time"], numpy.nan)

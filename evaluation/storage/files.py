@@ -102,7 +102,7 @@ def claim_folder(folder: Path) -> None:
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Claim a folder for a while; what was made for that and is empty afterwards is taken away.
+    """Return the claim a folder for a while; what was made for that and is empty afterwards is taken away.
 
     Raises:
         ValueError: as of :func:`claim_folder`.

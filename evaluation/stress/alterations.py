@@ -91,7 +91,7 @@ def _reordered(order: Callable[[int], list[int]]) -> Function:
 
 
 def _stamped(change: Callable[[numpy.ndarray], numpy.ndarray], passes: bool = True) -> Function:
-    """Other time stamps; ``change`` is given the times from ``SETTLED - 1`` on."""
+    """Return the other time stamps; ``change`` is given the times from ``SETTLED - 1`` on."""
 
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
         if not stream.is_timed:

@@ -121,7 +121,7 @@ class StreamFilter(OnlineFilter):
 
 
 def _subtract(stream: Stream, means: numpy.ndarray) -> numpy.ndarray:
-    """Errors ``(K, C, N)`` of means at the first K measurements; of angles the shortest differences."""
+    """Return the errors ``(K, C, N)`` of means at the first K measurements; of angles the shortest differences."""
     means, truth = (numpy.moveaxis(values, 1, 0) for values in (means, stream.truth[: len(means)]))
     return numpy.moveaxis(stream.task.subtract(means, truth), 0, 1)
 
@@ -180,7 +180,7 @@ class CrashTest:
             }
 
     def _record(self, seeds: Sequence[int], length: int, chunk: int) -> Iterator[Stream]:
-        """Streams of episodes of the simulation that are as long as it takes."""
+        """Return the streams of episodes of the simulation that are as long as it takes."""
         task, keywords = self.experiment.task, dict(self.experiment.keywords)
         usual = self.experiment.make_task()
         interval = usual.decision_interval
@@ -214,7 +214,7 @@ class CrashTest:
     # --- running
 
     def _errors(self, filter: StreamFilter, stream: Stream) -> numpy.ndarray:
-        """Errors of the mean, ``(K, C, N)``."""
+        """Return the errors of the mean, ``(K, C, N)``."""
         filter.begin(stream.initial)
         means = numpy.stack([filter.take(stream.at(k))["mean"] for k in range(len(stream))])
         return _subtract(stream, means)
@@ -371,7 +371,9 @@ class CrashTest:
             yield f"cautious, {_anees_text(anees)}"
 
     def _ratio(self, run: Run | None, other: Run | None, stream: Stream, part: slice) -> numpy.ndarray:
-        """Error of each episode over that of another run at the same measurements of the recorded stream, ``(N,)``."""
+        """Return the error of each episode over that of another run at the same measurements of the recorded
+        stream, ``(N,)``.
+        """
         if run is None or other is None:
             return numpy.full(stream.episodes, numpy.nan)
         chosen = numpy.arange(len(stream))[part]
@@ -387,7 +389,7 @@ class CrashTest:
         return ratio
 
     def _mean(self, values: numpy.ndarray) -> IntervalEstimate:
-        """Mean over measurements and episodes, with its interval."""
+        """Return the mean over measurements and episodes, with its interval."""
         with numpy.errstate(all="ignore"):
             each = values.mean(axis=0) if len(values) else numpy.full(values.shape[1], numpy.nan)
             return self._bootstrap.estimate(each)
@@ -419,7 +421,7 @@ class CrashTest:
         return self._finding(name, RESTORE, PASSED)
 
     def _long_streams(self) -> Iterable[Stream]:
-        """Streams of the long run; all but very long ones are kept for the next filter."""
+        """Return the streams of the long run; all but very long ones are kept for the next filter."""
         streams = self._record(self._seeds[:LONG_EPISODES], self.steps, CHUNK)
         if self.steps > MOST_KEPT:
             return streams
@@ -453,7 +455,7 @@ class CrashTest:
 
 
 def _geometric_mean(ratio: Any) -> float:
-    """Geometric mean of what is known; NaN where nothing is."""
+    """Return the geometric mean of what is known; NaN where nothing is."""
     with numpy.errstate(all="ignore"):
         logs = numpy.log(numpy.atleast_1d(ratio))
     logs = logs[numpy.isfinite(logs)]

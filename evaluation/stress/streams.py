@@ -134,7 +134,7 @@ class Stream:
 
 
 def _since_received(seconds: numpy.ndarray, received: numpy.ndarray) -> numpy.ndarray:
-    """Time since the last measurement before that was received, or the start, ``(K, N)``."""
+    """Return the time since the last measurement before that was received, or the start, ``(K, N)``."""
     last, found = 0.0 * seconds[0], []
     for now, there in zip(seconds, received, strict=True):
         found.append(now - last)
@@ -178,7 +178,7 @@ def record_streams(model: Model, seeds: Sequence[int], length: int, chunk: int) 
 
 
 def _stack(parts: Sequence[Any]) -> Any:
-    """Nested tuples of arrays with a first axis of their number."""
+    """Return the nested tuples of arrays with a first axis of their number."""
     first = parts[0]
     if isinstance(first, tuple):
         columns = (_stack([part[i] for part in parts]) for i in range(len(first)))
