@@ -359,7 +359,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         mean, other_mean = self.agent.mean(agent), self.fallback.mean(fallback)
         own = Likelihood.told(self.agent.records(agent, measurement))
         other = Likelihood.told(self.fallback.records(fallback, measurement))
-        if isinstance(self.fallback, Adapter) and not self.fallback.tells:
+        if isinstance(self.fallback, Adapter) and not self.fallback.has_likelihood:
             other = Likelihood(None)
         # A track that is lost altogether, so that its estimate is no number, is no answer either.
         odds, sound = state.odds, xp.all(xp.isfinite(mean), axis=0)

@@ -129,9 +129,9 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
     if shares[best] < LEAST_SHARE:
         spans = (f"{_span([*times.values()], table.clock)} {which}" for which, times in clocks.items())
         raise ValueError(
-            f"{100.0 * shares[best]:.0f} % of the measurements have a row in {name} within {tolerance:.3g} s, but "
-            f"{100.0 * LEAST_SHARE:.0f} % must have one: its times are from {_span([table.time], table.clock)}, those of the "
-            f"log from {', or from '.join(spans)}"
+            f"{100.0 * shares[best]:.0f} % of the measurements have a row in {name} within {tolerance:.3g} s, "
+            f"but {100.0 * LEAST_SHARE:.0f} % must have one: its times are from {_span([table.time], table.clock)}, "
+            f"those of the log from {', or from '.join(spans)}"
         )
     return clocks[best]
 
@@ -152,7 +152,7 @@ def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
     end = (task.horizon + 1) * _usual_interval(task)
     if numpy.mean((table.time >= 0.0) & (table.time <= 2.0 * end)) < LEAST_SHARE:
         raise ValueError(
-            f"the times of {name} are from {_span([table.time], 'seconds')}, and those of an episode from 0 to {end:g} s"
+            f"the times of {name} are from {_span([table.time], 'seconds')}, those of an episode from 0 to {end:g} s"
         )
 
 
@@ -271,11 +271,11 @@ class FileTrack(Filter[Task, Any, FileState]):
 
     def records(self, state: FileState, measurement: Any) -> dict[str, Array]:
         """Return the file's numbers about the measurement, and whether it has a row for it."""
-        told = {
+        numbers = {
             name: numpy.where(state.missing > 0.0, numpy.nan, values[state.row])
             for name, values in self.given.table.likelihood.items()
         }
-        return {**told, "missing": state.missing, "lost": state.over * NO_ROW}
+        return {**numbers, "missing": state.missing, "lost": state.over * NO_ROW}
 
 
 def find_estimates(name: str, path: str, problem: Any, find: Any) -> Competitor:

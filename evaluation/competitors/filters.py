@@ -25,11 +25,11 @@ from .kinds import INFORMED_KINDS, Kind, check_competitor, compilation_key, is_p
 
 AFTER_MISSED = 5.0
 """Number among :data:`..storage.dataset.FAULTS` of the reason that a missed measurement explains."""
-UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
+TRUTH_FREE_KINDS: tuple[Kind, ...] = ("estimator", "smoother")
 """Kinds that use only the initial estimate and the measurements."""
 
 
-class Adapted(NamedTuple):
+class AdaptedState(NamedTuple):
     """State of a user's estimator, reference or bound."""
 
     mean: Array
@@ -42,7 +42,7 @@ class Adapted(NamedTuple):
     """Log-likelihood of the last measurement; NaN where the estimator returns none."""
 
 
-class Adapter(Filter[Task, Any, Adapted]):
+class Adapter(Filter[Task, Any, AdaptedState]):
     """A user's estimator as a filter, see :class:`.kinds.Estimator`.
 
     Args:
@@ -54,18 +54,18 @@ class Adapter(Filter[Task, Any, Adapted]):
         super().__init__(task)
         self.own = own
         self.in_python: bool = not getattr(own, "traceable", False)
-        self.tells: bool = False
+        self.has_likelihood: bool = False
         """Whether the estimator has ever returned a log-likelihood."""
 
-    def start(self, initial: Any) -> Adapted:
+    def start(self, initial: Any) -> AdaptedState:
         """Start from the initial estimate."""
         return self.first(initial, self.own.start(initial, initial.mean.shape[-1]))
 
-    def first(self, initial: Any, memory: Any) -> Adapted:
+    def first(self, initial: Any, memory: Any) -> AdaptedState:
         """Return the state before the first measurement."""
-        return Adapted(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
+        return AdaptedState(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: Adapted, given: FilterInput) -> Adapted:
+    def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
         """Update the estimator."""
         answer = self.ask(given, state.memory)
         if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
@@ -77,9 +77,9 @@ class Adapter(Filter[Task, Any, Adapted]):
         mean, covariance, memory, *reported = answer
         likelihood = state.likelihood
         if reported:
-            self.tells, likelihood = True, Likelihood.of(*reported)
+            self.has_likelihood, likelihood = True, Likelihood.of(*reported)
             likelihood = likelihood if self.in_python else likelihood.fill_unknown(mean[0])
-        return Adapted(mean, covariance, memory, likelihood)
+        return AdaptedState(mean, covariance, memory, likelihood)
 
     @property
     def fault(self) -> int:
@@ -90,7 +90,7 @@ class Adapter(Filter[Task, Any, Adapted]):
         """Call the estimator's ``update``."""
         return self.own.update(memory, given.measurement)
 
-    def smooth(self, measurements: Sequence[Any], states: Sequence[Adapted]) -> tuple[Array, Array]:
+    def smooth(self, measurements: Sequence[Any], states: Sequence[AdaptedState]) -> tuple[Array, Array]:
         """Smooth the track by the smoother's method ``smooth``."""
         answer: tuple[Array, Array] = self.own.smooth(measurements, [state.memory for state in states])
         return answer
@@ -103,7 +103,7 @@ class ReferenceAdapter(Adapter):
         super().__init__(task, own)
         self.knows: str = getattr(own, "knows", "") or "the truth"
 
-    def initialise(self, given: FilterInput) -> Adapted:
+    def initialise(self, given: FilterInput) -> AdaptedState:
         """Start from the initial estimate, with the truth."""
         return self.first(given.measurement, self.own.start(given.measurement, given.truth))
 
@@ -115,9 +115,9 @@ class ReferenceAdapter(Adapter):
 class BoundAdapter(ReferenceAdapter):
     """A bound as a filter whose mean is the limit, see :class:`.kinds.Bound`."""
 
-    def first(self, initial: Any, memory: Any) -> Adapted:
+    def first(self, initial: Any, memory: Any) -> AdaptedState:
         """Return the state before the first measurement, with an infinite limit."""
-        return Adapted(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
+        return AdaptedState(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
 
     def ask(self, given: FilterInput, memory: Any) -> Any:
         """Call the bound's ``update``; there is no covariance."""
@@ -133,7 +133,7 @@ def as_filter(task: Task, own: Any, kind: Kind = "estimator") -> Filter[Any, Any
     return adapters.get(kind, Adapter)(task, own)
 
 
-class HeldInPython(Filter[Task, Any, Adapted]):
+class PythonFilter(Filter[Task, Any, AdaptedState]):
     """A filter that runs in Python: this object stores its state, which may be anything, and checks its estimates.
 
     Args:
@@ -161,7 +161,7 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         self.stated: Stated | None = getattr(own, "stated", stated)
         self.memory: Any = None
         self.step_number: int = 0
-        self.told: Mapping[str, Array] = {}
+        self.extra: Mapping[str, Array] = {}
         """Log-likelihood returned with its last estimate."""
         self.knows: str = getattr(own, "knows", "")
 
@@ -178,18 +178,18 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
         return given._replace(measurement=select_lanes(given.measurement, lanes))
 
-    def initialise(self, given: FilterInput) -> Adapted:
+    def initialise(self, given: FilterInput) -> AdaptedState:
         """Start the filter and store its state."""
         with explain_errors(f"{self.name} failed at the start of the track"):
             self.memory = self.own.initialise(self._repeat_last(given))
         initial = given.measurement
-        return Adapted(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
+        return AdaptedState(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
 
-    def start(self, initial: Any) -> Adapted:
+    def start(self, initial: Any) -> AdaptedState:
         """Start from the initial estimate, without the truth."""
         return self.initialise(FilterInput(initial))
 
-    def update(self, state: Adapted, given: FilterInput) -> Adapted:
+    def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
         """Update the filter and check its estimate.
 
         Raises:
@@ -200,7 +200,7 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         with explain_errors(f"{self.name} failed at measurement {self.step_number}"):
             self.memory = after = self.own.step(self.memory, given)
             mean, covariance = self.own.mean(after), self.own.covariance(after)
-            self.told = self.own.records(after, given.measurement)
+            self.extra = self.own.records(after, given.measurement)
         C, width = len(self.task.components), given.measurement[0].shape[-1]
         # Copies, since the estimator may change its own arrays; in their layout, on which rounding in matrix products
         # depends.
@@ -211,11 +211,11 @@ class HeldInPython(Filter[Task, Any, Adapted]):
             covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
         known = (
             None if values is None else self._numbers(name, values, (width,))
-            for name, values in Likelihood.told(self.told)._asdict().items()
+            for name, values in Likelihood.told(self.extra)._asdict().items()
         )
-        return Adapted(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
+        return AdaptedState(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
 
-    def feedback(self, state: Adapted, measurement: Any) -> Array | None:
+    def feedback(self, state: AdaptedState, measurement: Any) -> Array | None:
         """Return the feedback that a program has reported."""
         own: Any = self.own.own if isinstance(self.own, Adapter) else None
         return own.feedback if is_program(own) else None
@@ -290,9 +290,9 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         mean, covariance = self.own.mean(own), self.own.covariance(own)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         before, missing = state.fault, None
-        if isinstance(self.own, HeldInPython):
-            before = numpy.where(before > 0.0, before, self.own.told.get("lost", float(self.own.fault)))
-            missing = self.own.told.get("missing")
+        if isinstance(self.own, PythonFilter):
+            before = numpy.where(before > 0.0, before, self.own.extra.get("lost", float(self.own.fault)))
+            missing = self.own.extra.get("missing")
         fault = find_fault(*self._stated(mean, covariance), before, missed, self.xp)
         lost = fault > 0.0
         mean = self._held(lost, state.mean, mean)
@@ -316,7 +316,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
 
     def feedback(self, state: Checked, measurement: Any) -> Array | None:
         """Return a program's feedback where it is a number and the episode not lost; elsewhere that of the estimate."""
-        own = self.own.feedback(state.own, measurement) if isinstance(self.own, HeldInPython) else None
+        own = self.own.feedback(state.own, measurement) if isinstance(self.own, PythonFilter) else None
         if own is None:
             return None
         usable = numpy.isfinite(own).all(axis=0) & (state.fault == 0.0)
@@ -324,9 +324,9 @@ class CheckedFilter(Filter[Task, Any, Checked]):
 
     def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
         """Return the log-likelihood of the measurement, and the reason why the episode is lost."""
-        told = Likelihood.told(self.own.records(state.own, measurement)).fill_unknown(state.fault)
+        likelihood = Likelihood.told(self.own.records(state.own, measurement)).fill_unknown(state.fault)
         missing = {} if state.missing is None else {"missing": state.missing}
-        return {**told._asdict(), "lost": state.fault, **missing}
+        return {**likelihood._asdict(), "lost": state.fault, **missing}
 
 
 def is_lacking(received: Any, xp: Any) -> Array:
@@ -386,15 +386,15 @@ class AroundBank(Filter[Task, Any, State]):
         return state._replace(bank=self.bank.predict(state.bank, measurement))
 
     def mean(self, state: Any) -> Array:
-        """Return that of the bank."""
+        """Return the mean of the bank."""
         return self.bank.mean(state.bank)
 
     def covariance(self, state: Any) -> Array:
-        """Return that of the bank."""
+        """Return the covariance of the bank."""
         return self.bank.covariance(state.bank)
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """Return that of the bank."""
+        """Return the feedback of the bank."""
         return self.bank.feedback(state.bank, measurement)
 
 
@@ -444,11 +444,11 @@ class BoundFilter(AroundBank[LimitState]):
         return {"mean_square": self.own.mean(state.own)}
 
 
-def surround(kind: Kind, model: Model, own: Filter[Any, Any, Any]) -> Filter[Any, Any, Any]:
-    """Return the filter for a model's loop: a competitor with checks, a bound beside the bank, a reference unchanged."""
+def wrap_for_loop(kind: Kind, model: Model, own: Filter[Any, Any, Any]) -> Filter[Any, Any, Any]:
+    """Return the filter for a loop: a competitor with checks, a bound beside the bank, a reference unchanged."""
     if kind == "bound":
         return BoundFilter(model.task, own, model.filter)
-    return CheckedFilter(model.task, own) if kind in UNTOLD else own
+    return CheckedFilter(model.task, own) if kind in TRUTH_FREE_KINDS else own
 
 
 @dataclass(frozen=True)
@@ -465,11 +465,11 @@ class _Maker:
         """Make the filter, on any arrays."""
         task = model.task
         own = (
-            HeldInPython(task, stated=self.stated)
+            PythonFilter(task, stated=self.stated)
             if self.maker is None
             else make_competitor(self.maker, task)
         )
-        return surround(self.kind, model, as_filter(task, own, self.kind))
+        return wrap_for_loop(self.kind, model, as_filter(task, own, self.kind))
 
 
 def _can_be_traced(maker: Any, own: Filter[Any, Any, Any]) -> bool:
@@ -503,7 +503,7 @@ def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
             )
 
 
-def put_in_loop(
+def close_loop(
     model: Model, competitor: Any, kind: Kind, name: str, count: int, last: int | None = None
 ) -> Model:
     """Return a model whose filter is a competitor.
@@ -533,6 +533,6 @@ def put_in_loop(
         except NotTraceable as error:
             warn_of(f"{name!r} of {model.task.id}", error)
     looped = model.with_filter(_Maker(kind, None, own.stated))
-    held = HeldInPython(model.task, own, f"{kind} {name!r}", count if kind in UNTOLD else None)
-    looped.filter = surround(kind, model, held)
+    held = PythonFilter(model.task, own, f"{kind} {name!r}", count if kind in TRUTH_FREE_KINDS else None)
+    looped.filter = wrap_for_loop(kind, model, held)
     return looped

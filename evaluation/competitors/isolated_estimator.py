@@ -423,13 +423,13 @@ def serve(apart: bool) -> None:
     try:
         own = make(load(request), make_task(hello, numpy))
     except Exception as error:  # a module is a program: it can raise anything
-        said: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
+        response: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
     else:
-        said = {"filtergym": 1, "format": "float64"} | ({"warning": gaps} if gaps else {})
-    answers.write(json.dumps(said).encode() + b"\n")
+        response = {"filtergym": 1, "format": "float64"} | ({"warning": gaps} if gaps else {})
+    answers.write(json.dumps(response).encode() + b"\n")
     answers.flush()
     frames = Frames(hello, numpy, questions)
-    if "error" in said or (initial := frames.read("initial")) is None:
+    if "error" in response or (initial := frames.read("initial")) is None:
         return
     memory = own.start(initial, frames.lanes)
     while (measurement := frames.read("measurement")) is not None:

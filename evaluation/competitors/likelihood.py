@@ -284,8 +284,8 @@ class WindowLikelihood:
                 warn_of(type(own).__name__, error)
                 self._compiled = None
         for k in range(len(found)):
-            memory, told = _step(own, map_arrays(lambda array: array[k], measurements), memory)  # noqa: B023
-            found[k] = numpy.nan if told is None else told
+            memory, log_likelihood = _step(own, map_arrays(lambda array: array[k], measurements), memory)  # noqa: B023
+            found[k] = numpy.nan if log_likelihood is None else log_likelihood
         return found, memory
 
     def _run_compiled(
@@ -321,7 +321,7 @@ class WindowLikelihood:
         return map_arrays(lambda array: next(after).astype(array.dtype), memory)
 
     def _tile_windows(self, count: int, first: int, rows: int) -> tuple[Any, Any]:
-        """Return the initial estimates repeated for the candidates, and the first measurements, ``(rows, ..., lanes)``."""
+        """Return the initial estimates and first measurements repeated for the candidates, ``(rows, ..., lanes)``."""
         tiles = self.windows.tiles
         if count in tiles:
             return tiles[count]

@@ -19,7 +19,7 @@ from ...envs.engine.episode_noise import identities_of_seeds, uniforms_of_seeds
 from ...envs.engine.lanes import Lanes, whole_episode
 from ...envs.engine.programs import Report
 from ...envs.interface.requests import check_action
-from ..competitors.filters import put_in_loop
+from ..competitors.filters import close_loop
 from ..competitors.kinds import (
     Kind,
     check_competitor,
@@ -85,7 +85,7 @@ def rollout(
         action applied to it, batch first.
     """
     kind = kind or kind_of(competitor)
-    looped = model if kind == "policy" else _put_in_loop(model, competitor, kind, seeds, name)
+    looped = model if kind == "policy" else _close_loop(model, competitor, kind, seeds, name)
     yield from _step(looped, competitor if kind == "policy" else None, seeds, report, name)
 
 
@@ -106,7 +106,7 @@ def _step(
             yield found, action
 
 
-def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str) -> Model:
+def _close_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str) -> Model:
     """Return a model whose filter is a competitor, of a smoother what it has found in these episodes."""
     if kind == "smoother":
         check_open_loop(model, f"smoother {name!r}")
@@ -116,7 +116,7 @@ def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int]
         )
     if is_made_for_episodes(competitor):
         competitor = competitor.of_episodes(model.task, seeds)
-    return put_in_loop(model, competitor, kind, name, len(seeds), model.task.horizon)
+    return close_loop(model, competitor, kind, name, len(seeds), model.task.horizon)
 
 
 def _smoothed_estimates(
@@ -133,7 +133,7 @@ def _smoothed_estimates(
     for length in numpy.unique(lengths).tolist():
         lanes = numpy.flatnonzero(lengths == length)
         own = [seeds[lane] for lane in lanes.tolist()]
-        looped = put_in_loop(model, competitor, "smoother", name, len(own))
+        looped = close_loop(model, competitor, "smoother", name, len(own))
         found = run_forward(looped, start_lanes(looped, own), length, name)
         for kept, answered in zip((means, covariances), found, strict=True):
             kept[..., :length, lanes] = answered[..., : len(own)]
@@ -178,11 +178,11 @@ def run_episodes(
     """
     count, compiled_policy, tick = len(seeds), None, tick or (lambda measurements: None)
     is_policy = kind == "policy"
-    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
     if is_policy:
         compiled_policy = _compiled_policy_of(model, competitor, name)
     if kind == "smoother" and isinstance(track := looped.filter.own.own, SmoothedTrack):
-        forward = put_in_loop(model, competitor, kind, name, count)
+        forward = close_loop(model, competitor, kind, name, count)
         if can_step(forward, report_world):
             lanes = start_lanes(forward, seeds)
             length = lanes.decisions_per_episode * model.task.decision_interval
@@ -221,7 +221,7 @@ def run_stretches(
         What is reported of some measurements after the others, arrays ``(rows, ..., episodes)`` by name.
     """
     interval, is_policy, policy = model.task.decision_interval, kind == "policy", None
-    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
     if is_policy:
         policy = _compiled_policy_of(model, competitor, name)
     length = model.task.horizon // interval * interval
@@ -392,7 +392,7 @@ def measure_time(
         competitor = competitor(task)
         clock = competitor.processor_seconds
     decisions = max(1, min(TIMED_MEASUREMENTS, task.horizon) // task.decision_interval)
-    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
     compiled_policy = _compiled_policy_of(model, competitor, name) if is_policy else None
     if can_step(looped, _report_estimate) and (compiled_policy is not None or not is_policy):
         spent = _time_compiled(looped, compiled_policy, seeds, decisions)
