@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 import filtergym
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.filter import Likelihood
-from filtergym.evaluation.competitors.filters import find_fault, is_lacking, close_loop
+from filtergym.evaluation.competitors.filters import close_loop, find_fault, is_lacking
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds

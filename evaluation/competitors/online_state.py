@@ -34,9 +34,9 @@ class Estimate:
     time: Any
     """Time, s."""
     names: tuple[str, ...]
-    """Names or units of the components."""
+    """Names of the components."""
     units: tuple[str, ...]
-    """Names or units of the components."""
+    """Units of the components."""
     mean: numpy.ndarray
     """Mean of the components, ``(C,)``."""
     covariance: numpy.ndarray

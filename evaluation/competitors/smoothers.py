@@ -119,7 +119,7 @@ def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
 
 
 def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
-    """Return the measurements, masked as the smoother receives them, and the memories of a smoother that is compiled."""
+    """Return the measurements, masked as the smoother receives them, and the memories of a compiled smoother."""
     start = map_nested(lambda values: values[None, ..., : lanes.count], lanes.state.filter.own)
     measured: list[Any] = []
     memories = [start]
