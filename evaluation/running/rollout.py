@@ -1,4 +1,4 @@
-"""Episodes from their seeds to their end, with whatever competes in the loop."""
+"""Runs of whole episodes from their seeds, with any competitor in the loop."""
 
 import itertools
 import math
@@ -35,10 +35,10 @@ from ..competitors.stepping import SteppingPolicy
 from .kept import DRAWN_PREFIX
 
 AT_ONCE = 2**18
-"""Measurements of all episodes side by side that are run at once in native code."""
+"""Measurements, over all episodes side by side, in one call of native code."""
 
 Progress = Callable[[int], None]
-"""Called with the number of measurements just done."""
+"""Function that is called with the number of measurements just done."""
 
 
 def start_lanes(
@@ -47,13 +47,13 @@ def start_lanes(
     on_start: Callable[[Episode], None] | None = None,
     report: Report | None = None,
 ) -> Lanes:
-    """Return one episode for each seed, side by side, with its first measurement made.
+    """Return one episode for each seed, side by side, with its first measurement.
 
     Args:
         model: task with a bank.
-        seeds: of the episodes.
+        seeds: seeds of the episodes.
         on_start: called with the episodes at the start of the track.
-        report: that will be made of them; default: not known.
+        report: report function that will be applied to them; default: unknown.
     """
     lanes = Lanes(model, len(seeds), on_start=on_start, report=report)
     lanes.begin(identities_of_seeds(seeds))
@@ -69,16 +69,16 @@ def rollout(
     kind: Kind | None = None,
     name: str = "competitor",
 ) -> Iterator[tuple[Any, Array]]:
-    """Run whatever competes over one episode for each seed, measurement by measurement.
+    """Run a competitor over one episode for each seed, measurement by measurement.
 
     Args:
-        model: task with a bank; of a policy, that of its control.
+        model: task with a bank; for a policy, that of its control.
         competitor: policy, estimator, smoother, reference or bound, or a class or function that makes it. A smoother
-            runs over the episodes twice, the second time with what it says when all is measured.
+            runs over the episodes twice, the second time with its smoothed estimates.
         seeds: of the episodes, all run side by side.
-        report: function of the model and the state after the measurement was taken in; default: the state itself.
-        kind: what the competitor is; default: what it says.
-        name: of it, in errors.
+        report: function of the model and the state after the update; default: the state itself.
+        kind: kind of the competitor; default: its own.
+        name: its name in errors.
 
     Yields:
         For every measurement the report, arrays ``(..., N)`` whose lanes beyond ``len(seeds)`` are padding, and the
@@ -92,7 +92,7 @@ def rollout(
 def _step(
     looped: Model, asked: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
-    """Step a bank, whose policy is asked before every decision, or a filter that needs none, ``asked`` is None."""
+    """Step a bank with a policy, or a filter without one if ``asked`` is None."""
     lanes, action, policy, memory = start_lanes(looped, seeds, report=report), None, None, None
     if asked is None:
         action = numpy.zeros(len(seeds), dtype=numpy.int64)
@@ -107,7 +107,7 @@ def _step(
 
 
 def _close_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str) -> Model:
-    """Return a model whose filter is a competitor, of a smoother what it has found in these episodes."""
+    """Return a model whose filter is a competitor, or the smoothed estimates of a smoother in these episodes."""
     if kind == "smoother":
         check_open_loop(model, f"smoother {name!r}")
         competitor, kind = (
@@ -124,7 +124,7 @@ def _smoothed_estimates(
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Return means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of a smoother.
 
-    Episodes of one length are smoothed together, from their last measurement on; beyond it that estimate is held.
+    Episodes of one length are smoothed together, from their last measurement on; after it that estimate is repeated.
     """
     task = model.task
     lengths = task.lengths(uniforms_of_seeds(seeds, task.noise))
@@ -142,12 +142,12 @@ def _smoothed_estimates(
 
 
 class Flown(NamedTuple):
-    """What is reported of episodes that were run to their end."""
+    """Reports on complete episodes."""
 
     found: dict[str, numpy.ndarray]
     """Arrays ``(episodes, time, ...)`` by name; not always one row after the other in memory."""
     action: numpy.ndarray | None
-    """That a policy applied to each measurement, ``(episodes, time, ...)``; None of what has none."""
+    """Action of a policy at each measurement, ``(episodes, time, ...)``; None for other competitors."""
 
 
 def run_episodes(
@@ -160,21 +160,21 @@ def run_episodes(
     tick: Progress | None = None,
     more: tuple[Report, int] | None = None,
 ) -> Flown:
-    """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
+    """Run a competitor over one episode for each seed, and return the reports on every measurement.
 
-    Where everything is compiled, world, filter, policy and report, all episodes are one call of native code; else they
+    Where world, filter, policy and report are all compiled, all episodes are one call of native code; otherwise they
     are stepped. The numbers are the same.
 
     Args:
-        model: as in :func:`rollout`, likewise what follows.
-        competitor: likewise.
-        kind: likewise.
-        seeds: likewise.
-        report: of arrays ``(..., N)`` by name.
-        name: of the competitor, in errors.
-        tick: told of measurements done.
-        more: report on the first episodes, and how many they are: of all it would take much memory. Names that begin
-            with :data:`.kept.DRAWN_PREFIX` are of them only.
+        model: task with a bank; for a policy, that of its control.
+        competitor: policy, estimator, smoother, reference or bound, or a class or function that makes it.
+        kind: kind of the competitor.
+        seeds: seeds of the episodes, all run side by side.
+        report: function of the model and the state that returns arrays ``(..., N)`` by name.
+        name: name of the competitor in errors.
+        tick: called with the number of measurements done.
+        more: a larger report and the number of first episodes that it is for: for all it would take much memory. Names
+            that begin with :data:`.kept.DRAWN_PREFIX` exist for these episodes only.
     """
     count, compiled_policy, tick = len(seeds), None, tick or (lambda measurements: None)
     is_policy = kind == "policy"
@@ -206,19 +206,19 @@ def run_episodes(
 def run_stretches(
     model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report, rows: int, name: str
 ) -> Iterator[dict[str, numpy.ndarray]]:
-    """Run whatever competes as :func:`run_episodes` does, in a memory that does not grow with the episodes' length.
+    """Run a competitor as :func:`run_episodes` does, in memory that does not grow with the episodes' length.
 
     Args:
-        model: as in :func:`run_episodes`, with the five arguments of the same names.
-        competitor: see there.
-        kind: see there.
-        seeds: see there.
-        report: see there.
-        rows: measurements that are reported at once, in whole decisions.
-        name: see there.
+        model: task with a bank; for a policy, that of its control.
+        competitor: policy, estimator, smoother, reference or bound, or a class or function that makes it.
+        kind: kind of the competitor.
+        seeds: seeds of the episodes, all run side by side.
+        report: function of the model and the state that returns arrays ``(..., N)`` by name.
+        rows: number of measurements in one report, in whole decisions.
+        name: name of the competitor in errors.
 
     Yields:
-        What is reported of some measurements after the others, arrays ``(rows, ..., episodes)`` by name.
+        Reports on successive stretches of measurements, arrays ``(rows, ..., episodes)`` by name.
     """
     interval, is_policy, policy = model.task.decision_interval, kind == "policy", None
     looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
@@ -238,20 +238,20 @@ def run_stretches(
 
 
 def _without_padding(report: Mapping[str, numpy.ndarray], count: int) -> dict[str, numpy.ndarray]:
-    """Return the first lanes of a report in memory of their own: a view would keep the padding."""
+    """Return the first lanes of a report as copies: views would hold the memory of the padding."""
     return {name: values[..., :count].copy() for name, values in report.items()}
 
 
 def _run_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
 ) -> Flown:
-    """Run compiled episodes in native code, ``AT_ONCE`` measurements at a time, each from where the last was left."""
+    """Run compiled episodes in native code, ``AT_ONCE`` measurements in each call."""
     lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
     interval = looped.task.decision_interval
     decisions, most = lanes.decisions_per_episode, max(1, AT_ONCE // (lanes.width * interval))
 
     def run(decisions: int, whole: bool) -> Flown:
-        """Run so many decisions; of whole episodes a view is returned."""
+        """Run a number of decisions; for whole episodes return a view."""
         reports, actions = lanes.run(report, compiled_policy, decisions * interval)
         tick(count * decisions * interval)
         found = {name: _episodes_first(values, count) for name, values in reports.items()}
@@ -263,9 +263,7 @@ def _run_compiled(
 
 
 def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
-    """Join episodes, or measurements of the same ones, and empty the parts on the way; what is reported of some
-    episodes only is theirs alone.
-    """
+    """Concatenate parts along an axis, and empty them on the way; reports on some episodes only are not padded."""
     if len(parts) == 1:
         return parts[0]
     found = {
@@ -279,7 +277,7 @@ def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
 def _join_stretches(
     stretches: Iterator[dict[str, numpy.ndarray]], count: int, tick: Progress, drawn: int
 ) -> Flown:
-    """Keep what is reported of many measurements together, arrays ``(scans, ..., N)`` by name."""
+    """Concatenate reports on stretches of measurements, arrays ``(scans, ..., N)`` by name."""
     series: dict[str, list[numpy.ndarray]] = {}
     for found in stretches:
         for name, values in found.items():
@@ -294,7 +292,7 @@ def _join_stretches(
 def _step_episodes(
     steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, drawn: int
 ) -> Flown:
-    """Keep what is reported of episodes that are stepped."""
+    """Run episodes step by step and collect the reports."""
     series: dict[str, list[numpy.ndarray]] = {}
     actions = []
     for found, action in steps:
@@ -310,7 +308,7 @@ def _step_episodes(
 
 
 def _compiled_policy_of(model: Model, competitor: Any, name: str) -> Specialised | None:
-    """Return what steers the model in native code; None of a policy that is asked in Python."""
+    """Return the policy in native code; None for a policy that runs in Python."""
 
     def trace() -> Specialised | None:
         policy = check_competitor(name, make_competitor(competitor, model), "policy")
@@ -321,7 +319,7 @@ def _compiled_policy_of(model: Model, competitor: Any, name: str) -> Specialised
         return None
     try:
         return model.programs.keep((run_episodes, compilation_key(competitor)), trace)
-    except TypeError:  # it has no hash
+    except TypeError:  # the maker has no hash
         return trace()
 
 
@@ -334,7 +332,7 @@ def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.
     """Return actions ``(time, ..., N)``, episodes first.
 
     Raises:
-        ValueError: for the first that is not in the action space, but for the limits of a box.
+        ValueError: for the first action outside the action space, apart from the limits of a box.
     """
     space, kept = model.action_space, _episodes_first(actions, count)
     if isinstance(space, gymnasium.spaces.Discrete):
@@ -348,40 +346,39 @@ def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.
 
 
 TIMED_EPISODES, TIMED_MEASUREMENTS = 512, 256
-"""Episodes side by side, and measurements of each, of which a time is taken: enough for two digits."""
+"""Episodes side by side, and measurements of each, in a measurement of time: enough for two digits."""
 RUN_SECONDS = 0.02
-"""How long a run takes, about, where the episodes are long enough."""
+"""Approximate duration of a run, s, where the episodes are long enough."""
 TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.05, 3, 20
-"""For how long, and how often, runs are repeated of which the quickest counts."""
+"""Duration, s, and numbers of repeated runs, of which the quickest counts."""
 
 
 class ProcessorTime(NamedTuple):
-    """What a measurement takes on one core: world and competitor together, or of a program the process alone."""
+    """Processor time of a measurement on one core: world and competitor together, or a program's process alone."""
 
     nanoseconds: float
-    """Of a measurement of one of many episodes side by side."""
+    """Time of a measurement of one of many episodes side by side, ns."""
     compiled: bool
-    """Whether all of it is native code; else the time is mostly that of the steps between, in Python."""
+    """Whether all code is native; otherwise the time is mostly that of the steps in Python."""
     own: bool = False
-    """Whether it is that of a program's own process, without the world: not to be compared with the others."""
+    """Whether it is the time of a program's own process, without the world, which is not comparable with the others."""
 
 
 def measure_time(
     model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str = "competitor"
 ) -> ProcessorTime | None:
-    """Measure the processor time of a measurement: the world moves, is measured, and the competitor estimates.
+    """Measure the processor time of a measurement: motion of the world, sensors, and the competitor's estimate.
 
-    Of :data:`TIMED_EPISODES` episodes side by side, after everything is traced and compiled: of native code the
-    quickest of several runs, since what disturbs one only adds to it; of what is asked in Python the median decision.
-    Of a program it is the time of its own process.
+    :data:`TIMED_EPISODES` episodes run side by side, after tracing and compilation. For native code the quickest of
+    several runs counts, since disturbances only add time; for Python code the median decision. For a program it is the
+    time of its own process.
 
     Args:
-        model: as in :func:`rollout`, likewise what follows.
-        competitor: likewise.
-        kind: likewise. A smoother answers when all is measured, a bound estimates nothing, and the time of what has
-            answered before is not known: None.
-        seeds: of some episodes, which are repeated where they are fewer.
-        name: of the competitor, in errors.
+        model: task with a bank; for a policy, that of its control.
+        competitor: as in :func:`rollout`.
+        kind: kind of the competitor. Smoothers, bounds and competitors made for given episodes have no time: None.
+        seeds: seeds of episodes, which are repeated up to that number.
+        name: name of the competitor in errors.
     """
     if kind in ("smoother", "bound") or is_made_for_episodes(competitor):
         return None
@@ -400,7 +397,7 @@ def measure_time(
     steps = _step(looped, competitor if is_policy else None, seeds, _report_estimate, name)
     with warnings.catch_warnings():
         if own:
-            warnings.simplefilter("ignore")  # the evaluation has said what is wrong with a program
+            warnings.simplefilter("ignore")  # the evaluation has already warned of a program's faults
         spent = _time_steps(steps, decisions, task.decision_interval, clock)
     if math.isnan(spent):
         return None
@@ -427,9 +424,9 @@ def _time_compiled(
 
     with optimised_code():
         run(1)  # compiles
-    # And a first decision. Where a clock that counts ticks has not moved meanwhile, it took one at most.
+    # And a first decision. Where a clock with coarse ticks has not advanced, it took one tick at most.
     setting_up = max(min(run(1) for _ in range(FEWEST_RUNS)), time.get_clock_info("process_time").resolution)
-    # No step branches, so that every decision takes as long: a dear one need not be repeated to the end.
+    # No step branches, so every decision takes the same time: a slow one need not be repeated to the end.
     count = min(decisions, 1 + math.ceil(RUN_SECONDS / setting_up))
     if count == 1:
         return setting_up
@@ -457,5 +454,5 @@ def _time_steps(
 def run_competitor(
     model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report
 ) -> dict[str, numpy.ndarray]:
-    """Run whatever competes, see :func:`run_episodes`, and return what is reported, ``(episodes, time, ...)``."""
+    """Run a competitor by :func:`run_episodes`, and return the reports, ``(episodes, time, ...)``."""
     return run_episodes(model, competitor, kind, seeds, report).found

@@ -1,7 +1,7 @@
-"""What records, curves and a track need of an evaluation: little enough to send, to keep in a file, and to hold.
+"""Summaries of evaluations: statistics for records, curves and tracks, small enough to send and to store.
 
-A summary is of one competitor. Its episodes are run where it is made, in chunks each of which is reduced before the
-next begins, and what they come to is added in their order; so its bits depend on nothing but what was asked for.
+A summary contains one competitor. Its episodes are run in chunks, each reduced before the next begins, and the results
+are added in their order; so its bits depend only on the request.
 """
 
 import functools
@@ -44,14 +44,14 @@ from .threads import one_thread
 from .times import COORDINATES, with_times
 
 TOGETHER = 4 * BLOCK
-"""Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
+"""Episodes of a piece of work: enough that its result is small compared with its computation."""
 DRAWN_TIMES = 20_000
-"""Measurements of an episode that pictures show, at most."""
+"""Maximal number of measurements of an episode in pictures."""
 MOST_RECORDINGS = 40
-"""Episodes of a recording that are reported one by one."""
+"""Maximal number of episodes of a recording that are reported separately."""
 BATCH = 600_000
-"""Measurements that another process is given at once, where several pieces of work share a model: about a second. A
-longer batch would leave the others idle at the end, and lose more where the work is interrupted."""
+"""Measurements that are sent to another process in one batch, where several pieces of work share a model: about a
+second. A longer batch would leave other processes idle at the end, and lose more in an interruption."""
 
 
 class EvaluationRequest(NamedTuple):
@@ -61,7 +61,7 @@ class EvaluationRequest(NamedTuple):
     name: str
     maker: Any
     metrics: OwnMetrics | None = None
-    """The environment's own."""
+    """Metrics of the environment."""
     horizon: int = 1
     """Measurements of an episode, for the progress."""
     first: int = 0
@@ -69,13 +69,13 @@ class EvaluationRequest(NamedTuple):
     last: int | None = None
     """Episode before which it ends; None: the end."""
     curves: bool = True
-    """Whether it is reduced to curves, too: who draws no figure needs none, and they take as long as the records."""
+    """Whether to compute curves, too, for figures; they take as long as the records."""
     identity: str | None = None
-    """Of the competitor, see :class:`..competitors.kinds.Competitor`; with None its summary is not kept in a store."""
+    """Identity of the competitor, see :class:`..competitors.kinds.Competitor`; with None its summary is not stored."""
 
     @property
     def episodes(self) -> int:
-        """How many the experiment has."""
+        """Number of episodes of the experiment."""
         return self.experiment.episodes
 
     @property
@@ -85,17 +85,17 @@ class EvaluationRequest(NamedTuple):
 
     @property
     def measurements(self) -> int:
-        """How many there are."""
+        """Number of measurements."""
         return (self.end - self.first) * self.horizon
 
     def work(self) -> Work | None:
-        """Return the piece of work that the summary is, for a store; None where nothing is kept of it."""
+        """Return the piece of work of the summary, for a store; None where it is not stored."""
         if self.identity is None:
             return None
         return Work(f"{stem_of(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
 
     def pieces(self) -> list["EvaluationRequest"]:
-        """Return the pieces of work that this is: one, unless there are many episodes."""
+        """Split the request into pieces of work: one, unless there are many episodes."""
         if self.episodes <= TOGETHER:
             return [self]
         begins = range(0, self.episodes, TOGETHER)
@@ -103,26 +103,26 @@ class EvaluationRequest(NamedTuple):
 
 
 def stem_of(experiment: Experiment) -> str:
-    """Begin the name of a file about an experiment."""
+    """Return the beginning of the name of a file about an experiment."""
     environment, scenario = short_name(experiment.task.id), experiment.scenario or "default"
     return f"{environment}.{scenario}.{experiment.episodes}.{experiment.split}{experiment.seed}"
 
 
 class Evaluation(NamedTuple):
-    """What an evaluation has found."""
+    """Results of an evaluation."""
 
     dataset: xarray.Dataset
-    """All that was kept of every episode (:func:`.evaluate.run_experiment`); or, of summaries, its coordinates and
-    attributes with what was kept of the first episodes, over policy, drawn_episode and time."""
+    """Values of every episode (:func:`.evaluate.run_experiment`); or, for summaries, coordinates and attributes with
+    the values of the first episodes, over policy, drawn_episode and time."""
     records: list[Record]
     curves: xarray.Dataset | None
     """See :func:`.curves.curves_of`; None where they were not requested of every competitor."""
     costs: Mapping[str, numpy.ndarray]
-    """Mean cost of every episode by name, ``(episodes,)``, of all whose cost is known."""
+    """Mean cost of every episode by name, ``(episodes,)``, of all competitors with a known cost."""
     flights: Sequence[Record] = ()
-    """Of every flight, where they are reported one by one."""
+    """Records of every flight, where they are reported separately."""
     differences: Mapping[str, IntervalEstimate] = {}
-    """Of a recording, by name, the log-likelihood per measurement less that of the best."""
+    """For a recording, the log-likelihood per measurement less that of the best, by name."""
 
     @property
     def has_truth(self) -> bool:
@@ -140,9 +140,9 @@ class Summary(NamedTuple):
 
     contender: Contender
     curves: CompetitorCurves | None
-    """None where none were asked for."""
+    """Curves; None where they were not requested."""
     head: xarray.Dataset
-    """Its part of the evaluation, without what was kept of every episode."""
+    """Its part of the evaluation, without the values of every episode."""
     episodes: int
 
 
@@ -157,7 +157,7 @@ class Part(NamedTuple):
         return self._replace(reduction=self.reduction.merge(later.reduction))
 
     def summary(self, asked: EvaluationRequest) -> Summary:
-        """Return the summary of all episodes of what was asked for."""
+        """Return the summary of all episodes of the request."""
         results, bootstrap = self.reduction.results(), resampling(asked.episodes)
         contender = contender_of(results, self.head, bootstrap, asked.metrics)
         curves = competitor_curves(results) if asked.curves else None
@@ -165,7 +165,7 @@ class Part(NamedTuple):
 
 
 def summarise(asked: EvaluationRequest, tick: Progress) -> Summary | Part:
-    """Run what is asked for and reduce it; of a piece of the episodes only, return what they contribute.
+    """Run a request and reduce it to a summary; for a piece of the episodes only, return their contribution.
 
     Raises:
         ValueError: as :func:`reduce_episodes`.
@@ -185,11 +185,11 @@ def summarise(asked: EvaluationRequest, tick: Progress) -> Summary | Part:
 def reduce_episodes(
     asked: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
-    """Run what is asked for and reduce it to statistics, a block of episodes at a time.
+    """Run a request and reduce it to statistics, a block of episodes at a time.
 
     Args:
-        asked: one competitor over episodes.
-        declare: from some of its episodes to their statistics.
+        asked: request of one competitor over episodes.
+        declare: function from some of its episodes to their statistics.
         tick: told of measurements done.
 
     Raises:
@@ -202,7 +202,7 @@ def reduce_episodes(
     block = block_of(plan.models[asked.name].task.horizon)
 
     def part(first: int) -> Part:
-        """Run a block of episodes and reduce it; nothing of what was measured in it outlives the call."""
+        """Run a block of episodes and reduce it; its measurements are freed at the end of the call."""
         piece = plan.piece(asked.name, first, min(block, asked.end - first), True)
         count = len(piece.seeds)
         kept = plan.arrays(count, asked.experiment.drawn_episodes - first)
@@ -229,10 +229,10 @@ def summaries(
     """Summarise competitors, of any environments.
 
     Args:
-        asked: whom, over what; they are begun in this order.
-        workers: who does it.
-        progress: told of measurements done.
-        store: keeps the summary of each, from which a second call takes it. Default: nothing is kept.
+        asked: the requests, started in this order.
+        workers: processes that do the work.
+        progress: called with the number of measurements done.
+        store: stores each summary, so that a second call reads it. Default: nothing is stored.
 
     Yields:
         Number of a competitor among them and its summary, as they are finished.
@@ -270,7 +270,7 @@ def summaries(
             store.write(work[i], found)
             yield i, found
             continue
-        # In the order of the episodes, whichever come first: sums of the same numbers in another order differ.
+        # In the order of the episodes, not of arrival: sums in another order round differently.
         waiting.setdefault(i, {})[piece.first] = found, piece.last or 0
         while done[i] in waiting[i]:
             later, done[i] = waiting[i].pop(done[i])
@@ -283,9 +283,9 @@ def summaries(
 
 
 def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:
-    """Group pieces of work that share a model, which every process that runs one of them would trace for itself.
+    """Group pieces of work that share a model, so that one process traces it once.
 
-    A batch stands where its first piece stood, and holds at most ``BATCH`` measurements, or one piece.
+    A batch takes the place of its first piece, and contains at most ``BATCH`` measurements, or one piece.
     """
     batches: list[list[tuple[int, EvaluationRequest]]] = []
     last: dict[Any, tuple[list[tuple[int, EvaluationRequest]], int]] = {}
@@ -302,7 +302,7 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 @one_thread()
 def combine_summaries(found: Sequence[Summary]) -> Evaluation:
-    """Return the evaluation of which these are the summaries of all competitors."""
+    """Combine the summaries of all competitors to their evaluation."""
     evaluation = _heads_together(
         [one.head for one in found], [one.contender.losses for one in found], found[0].episodes
     )
@@ -319,7 +319,7 @@ def combine_summaries(found: Sequence[Summary]) -> Evaluation:
 def _actions_by_control(
     curves: Sequence[CompetitorCurves], controls: Sequence[str]
 ) -> list[CompetitorCurves]:
-    """Name the actions of competitors that steer by several controls by these, too."""
+    """Add the control to the names of actions where competitors use several controls."""
     if len({control for control, own in zip(controls, curves, strict=True) if own.actions}) < 2:
         return list(curves)
     return [
@@ -329,27 +329,27 @@ def _actions_by_control(
 
 
 class Alone(NamedTuple):
-    """What remains of one competitor over flights, a recording or one episode, which is resampled with the others."""
+    """Data of one competitor over flights, a recording or one episode, which are resampled with those of the others."""
 
     reduced: Reduced
     flights: list[Reduced]
     likelihood: LikelihoodSums | None
     costs: numpy.ndarray | None
-    """Mean of every episode; None where none is known."""
+    """Mean cost of every episode; None where none is known."""
     losses: Losses | None
     curves: CompetitorCurves | None
     head: xarray.Dataset
-    """Its part of the evaluation, without what was kept of every episode, at ``DRAWN_TIMES`` measurements at most."""
+    """Its part of the evaluation, without the values of every episode, at ``DRAWN_TIMES`` measurements at most."""
 
 
 def reduce_alone(run: xarray.Dataset, asked: EvaluationRequest) -> Alone:
-    """Reduce one competitor's part of an evaluation to what remains of it."""
+    """Reduce one competitor's part of an evaluation."""
     episodes, times = run.sizes["episode"], run.sizes["time"]
     flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
     if not run.attrs["truth"] or (recorded and episodes > MOST_RECORDINGS):
         flights = iter(())
     costs = mean_over_time(run, run["cost"].values) if "cost" in run else None
-    if costs is not None and numpy.isnan(costs).all():  # of bounds there is none
+    if costs is not None and numpy.isnan(costs).all():  # bounds have no cost
         costs = None
     chosen, curves = spread(times, DRAWN_TIMES), None
     if asked.curves:
@@ -414,11 +414,11 @@ def run_requests(
     """Evaluate the competitors of one experiment.
 
     Args:
-        asked: one request for each.
-        workers: share the work.
+        asked: one request for each competitor.
+        workers: processes that share the work.
         progress: called with the number of measurements done.
-        store: as of :func:`summaries`.
-        whole: keep every number of every episode.
+        store: stores each summary, so that a second call reads it. Default: nothing is stored.
+        whole: whether to store every number of every episode.
 
     Raises:
         ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
@@ -432,7 +432,7 @@ def run_requests(
     elif first.episodes > 1 and not first.experiment.make_task().flights:
         found = dict(summaries(asked, workers, progress, store))
         return combine_summaries([found[i] for i in range(len(found))])
-    else:  # one competitor after the other, of which nothing is kept that is as long as the episodes
+    else:  # one competitor after the other, without storing arrays as long as the episodes
         if not workers.alone:
             check_sendable(first.experiment.task, {one.name: one.maker for one in asked})
         done = dict(workers.run(_run_alone, asked, [one.measurements for one in asked], progress))
@@ -469,7 +469,7 @@ def _heads_together(
             if name in head:
                 stacked[i] = head[name].values
         variables[name] = (("policy", *example.dims), stacked)
-    # A file has an order of its own.
+    # A file may have another order.
     return xarray.Dataset(
         variables, dict(sorted(coords.items())), {**heads[0].attrs, "notes": "\n".join(notes)}
     )
