@@ -1,4 +1,4 @@
-"""Seeds of episodes: three splits that share nothing, whatever the number beside them."""
+"""Seeds of episodes, in three splits without common seeds."""
 
 import numpy
 
@@ -15,9 +15,9 @@ def episode_seeds(split: str, seed: int, episodes: int, first: int = 0) -> list[
 
     Args:
         split: "train", "validation" or "test".
-        seed: number of the experiment; different numbers share no episode.
-        episodes: how many.
-        first: how many to skip.
+        seed: seed of the experiment; different seeds have no episode in common.
+        episodes: number of episodes.
+        first: number of episodes to skip.
 
     Raises:
         ValueError: for an unknown split, a seed below zero, or fewer episodes than one.
