@@ -524,7 +524,7 @@ def test_a_table_does_not_say_of_which_environment_it_is(tmp_path):
 
 
 def test_too_many_rows_are_refused_early():
-    with pytest.raises(ValueError, match="more than the 50,000,000 numbers that a recording may hold"):
+    with pytest.raises(ValueError, match="more than the 50,000,000 numbers that a recording may contain"):
         record(TARGET, episodes=10, horizon=10_000_000)
 
 

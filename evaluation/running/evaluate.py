@@ -83,15 +83,15 @@ def check_observation(model: Model, policy: Any, name: str) -> None:
     space = getattr(policy, "observation_space", None)
     if isinstance(space, gymnasium.spaces.Dict):
         raise ValueError(
-            f"policy {name!r} takes privileged observations ({', '.join(space)}), which no evaluation provides: wrap its "
-            "actor, which needs the observations alone, in an object with a method predict"
+            f"policy {name!r} takes privileged observations ({', '.join(space)}), which no evaluation provides: wrap "
+            "its actor, which needs the observations alone, in an object with a method predict"
         )
     shown = getattr(space, "shape", None)
     if shown is not None and shown != (len(model.fields),):
         raise ValueError(
             f"policy {name!r} expects observations of shape {shown}, but control {model.control!r} has "
-            f"{len(model.fields)} fields, and a model does not contain their names: train it again, or give the .safetensors "
-            "of its run, which does"
+            f"{len(model.fields)} fields, and a model does not contain their names: train it again, or give the "
+            ".safetensors of its run, which does"
         )
 
 

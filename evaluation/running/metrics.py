@@ -160,7 +160,7 @@ class Reduced(NamedTuple):
 
 
 def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
-    """Reduce one competitor's part of an evaluation to the statistics for its records; ``metrics`` not for recordings."""
+    """Reduce a competitor's part of an evaluation to the statistics for its records; no ``metrics`` for recordings."""
     # An environment's own metrics need more of the truth than a recording contains.
     own = None if run.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)
