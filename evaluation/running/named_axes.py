@@ -134,7 +134,7 @@ class StackedArrays:
         self._written: list[tuple[int, slice, set[str]]] = []
 
     def write(self, name: str, part: slice, kept: dict[str, numpy.ndarray]) -> None:
-        """Write the values of some episodes of a competitor, ``(episodes, time, ...)`` by name, and empty the mapping."""
+        """Write the values of some episodes, ``(episodes, time, ...)`` by name, and empty the mapping."""
         place = self._places[name]
         self._written.append((place, part, set(kept)))
         while kept:
