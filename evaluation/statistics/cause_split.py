@@ -167,7 +167,7 @@ def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) ->
 def compare(
     own: CauseCosts, other: CauseCosts, opponent: str, bootstrap: Bootstrap
 ) -> Iterator[CauseMeasure]:
-    """Compare the cost under every cause, paired: ``cause_cost_ratio``, the cost of a competitor over its opponent's."""
+    """Return the paired ratio of a competitor's cost to its opponent's under every cause, ``cause_cost_ratio``."""
     for name in own.names:
         if name in other.names:
             both = numpy.stack([own.of(name), other.of(name)], axis=1)
