@@ -211,7 +211,7 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
             covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
         known = (
             None if values is None else self._numbers(name, values, (width,))
-            for name, values in Likelihood.told(self.extra)._asdict().items()
+            for name, values in Likelihood.of_records(self.extra)._asdict().items()
         )
         return AdaptedState(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
 
@@ -324,7 +324,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
 
     def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
         """Return the log-likelihood of the measurement, and the reason why the episode is lost."""
-        likelihood = Likelihood.told(self.own.records(state.own, measurement)).fill_unknown(state.fault)
+        likelihood = Likelihood.of_records(self.own.records(state.own, measurement)).fill_unknown(state.fault)
         missing = {} if state.missing is None else {"missing": state.missing}
         return {**likelihood._asdict(), "lost": state.fault, **missing}
 

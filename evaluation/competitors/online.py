@@ -124,8 +124,8 @@ class OnlineFilter:
     def __reduce__(self) -> Any:
         """Raise an error: a filter runs machine code of this process and cannot be copied."""
         raise TypeError(
-            "a running filter cannot be copied or pickled: make another with filtergym.online, and let it restore what "
-            "save of this one returns"
+            "a running filter cannot be copied or pickled: make another with filtergym.online, and restore the state "
+            "that save of this one returns"
         )
 
     # --- public methods
@@ -278,7 +278,7 @@ class OnlineFilter:
         try:
             if after:
                 self._resume(after[0].before._replace(history=History(before), too_late=state.too_late))
-            return [self._take(time, said) for time, said in again][-1]
+            return [self._take(time, values) for time, values in again][-1]
         except BaseException:
             self._resume(kept)
             raise
@@ -416,10 +416,10 @@ class OnlineFilter:
             self._state = None
             if kept is not None:
                 self._resume(kept)
-            said = f"{type(error).__name__}: {error}"
+            reason = f"{type(error).__name__}: {error}"
             raise ValueError(
                 f"{self.name!r} cannot continue from this state, which is not one that save has returned: "
-                f"{quote_shortened(said)}"
+                f"{quote_shortened(reason)}"
             ) from None
 
     def _try(self, state: OnlineState) -> None:
@@ -491,9 +491,9 @@ class OnlineFilter:
         lost, count = found.pop("lost"), self.tracks
         words = [FAULTS[int(i) - 1] if i else "" for i in (lost if count > 1 else (lost,))]
         departure = self._each([""] * count if self.watch is None else self.watch.describe())
-        said = {"time": _plain(time), "lost": self._each(words), "departure": departure}
+        further = {"time": _plain(time), "lost": self._each(words), "departure": departure}
         estimate = object.__new__(Estimate)  # whose __init__ takes twice as long as the filter
-        estimate.__dict__.update(self._same_of_estimates, **found, **said)
+        estimate.__dict__.update(self._same_of_estimates, **found, **further)
         return estimate
 
     def _each(self, words: list[str]) -> Any:

@@ -261,9 +261,9 @@ class CompiledUpdate:
             self._states.append(after[: len(self._kinds)])
             memories = [self.shown, *self._policies[1 - now]], [self._action, *self._policies[now]]
             looks.append([watch.bound([*received.parts, *predicted[now]], fields)] if watch else [])
-            told = tell.bound([*received.parts, *self._states[now]], reported)
+            report_call = tell.bound([*received.parts, *self._states[now]], reported)
             steer = [policy.bound(*memories)] if policy else []
-            answers.append([*steer, update.bound(given, written), told])
+            answers.append([*steer, update.bound(given, written), report_call])
         self._states.append(written[: len(self._kinds)])
         arrivals = []
         for before, program, now in ((0, predict, 1), (1, predict, 0), (2, first, 0)):

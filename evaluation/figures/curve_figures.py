@@ -350,7 +350,7 @@ def draw_error_distribution(
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the policies whose mode probabilities change by more than 0.02 over time, with those that have the same."""
+    """Return the policies whose mode probabilities vary by more than 0.02 over time, with those that have the same."""
     probabilities = {name: curves["mode_probability"].sel(policy=name).values for name in names}
     found = {
         name: values

@@ -87,7 +87,7 @@ def figure_with_pairs(rows: int, columns: int = 2) -> Any:
 
 
 def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
-    """Add a title and a legend, of the first axes or of handles: beside the title where there is room, otherwise below."""
+    """Add a title and a legend, of the first axes or of handles: beside the title where there is room, else below."""
     width = figure.get_figwidth()
     size = FONT_SIZES[1 if width < 5.0 else 2]
     # Letters are a little wider than half their height.
@@ -225,7 +225,7 @@ def wrap_label(label: str, columns: int) -> str:
 def save(figure: Any, path: Path) -> None:
     """Save a figure in the format of its suffix, completely or not at all.
 
-    Formats are ``.png``; ``.svg``, with text as text; and ``.pdf``, with embedded fonts. Equal figures give equal files.
+    Formats are ``.png``; ``.svg``, with text as text; ``.pdf``, with embedded fonts. Equal figures give equal files.
 
     Raises:
         ValueError: for another suffix, or if it cannot be written.

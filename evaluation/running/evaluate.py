@@ -275,8 +275,13 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
         most = experiment.drawn_episodes - piece.first
         drawn = replace(kept, drawings=True), most
     # Code that is timed afterwards is optimised here: so nothing is compiled in two ways.
-    with optimised_code() if experiment.timed else nullcontext(), running(piece.name, tick) as told:
-        flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, told, drawn)
+    with (
+        optimised_code() if experiment.timed else nullcontext(),
+        running(piece.name, tick) as report_progress,
+    ):
+        flown = run_episodes(
+            model, piece.maker, kind, piece.seeds, report, piece.name, report_progress, drawn
+        )
     arrays = dict(flown.found)
     if kind == "policy":
         _check_reserved(model, arrays)

@@ -251,10 +251,10 @@ def record_statistics(
             yield from means(
                 "mean_mode_probability", mode, "1", run["mode_probability"].sel(mode=mode).values
             )
-    says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
-    if says or not judged:  # a user's estimator has no other statistics then
+    has_likelihood = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
+    if has_likelihood or not judged:  # a user's estimator has no other statistics then
         shape = (run.sizes["episode"], run.sizes["time"])
-        log_likelihood = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
+        log_likelihood = run["log_likelihood"].values if has_likelihood else numpy.full(shape, math.nan)
         for window, times in slices.items():
             yield _mean_of_present("log_likelihood", "measurement", window, "nat", log_likelihood, times)
     if not is_bound and judged:

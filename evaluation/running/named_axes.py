@@ -47,7 +47,7 @@ def _attributes(key: str, cost: str) -> dict[str, str]:
     """Return the unit of a variable, and whether it is normalised; empty for variables of the environment."""
     name = key.removeprefix(DRAWN_PREFIX)
     if name == "cost":
-        return {"units": "1", "long_name": f"{cost}, normalised as it says"}
+        return {"units": "1", "long_name": f"{cost}, normalised as stated"}
     found = MEASURED if name.startswith("measurement_") else MEANINGS.get(name, ())
     return dict(zip(("units", "long_name"), found, strict=False))
 

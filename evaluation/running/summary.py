@@ -190,7 +190,7 @@ def reduce_episodes(
     Args:
         asked: request of one competitor over episodes.
         declare: function from some of its episodes to their statistics.
-        tick: told of measurements done.
+        tick: called with the number of measurements done.
 
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.

@@ -184,12 +184,12 @@ def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
     before, initial = stream.at(SETTLED - 1), stream.initial
     root = semidefinite_root(initial.covariance)
     errors = numpy.einsum("ijn,jn->in", root, generator.standard_normal(initial.mean.shape))
-    told = {}
+    others = {}
     for name, value in initial._asdict().items():
         if name not in ("mean", "covariance"):
             # The other initial values are the measurement there, or one of its fields.
-            told[name] = before if isinstance(value, type(before)) else getattr(before, name, value)
-    begun = initial._replace(mean=stream.truth[SETTLED - 1] + errors, **told)
+            others[name] = before if isinstance(value, type(before)) else getattr(before, name, value)
+    begun = initial._replace(mean=stream.truth[SETTLED - 1] + errors, **others)
     later = stream.select(numpy.arange(SETTLED, len(stream)))
     return _cut(replace(later, initial=begun).renumbered(), Causes.of(stream.task).start, 1)
 

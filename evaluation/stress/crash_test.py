@@ -59,7 +59,7 @@ DESCRIPTIONS: Mapping[str, str] = {
     RESTORE: "the state is saved, and restored in another filter",
     LONG: "many measurements, one after another",
 }
-UNSAID = "the measurement has nothing that says it"
+NOT_CONTAINED = "the measurement does not contain it"
 PASSED, DEGRADED, FAILED, NOTHING = "passed", "degraded", "failed", "does not apply"
 
 
@@ -277,7 +277,7 @@ class CrashTest:
         plain = self._run(filter, self._stream(UNALTERED))
         for alteration, stream in self.streams.items():
             if stream is None:
-                yield self._finding(name, alteration, NOTHING, UNSAID)
+                yield self._finding(name, alteration, NOTHING, NOT_CONTAINED)
             else:
                 run = plain if alteration == UNALTERED else self._run(filter, stream)
                 yield self._judge(name, alteration, stream, run, plain)
