@@ -225,7 +225,7 @@ def test_what_is_no_program_is_refused_before_anything_runs():
     ):
         with pytest.raises(ValueError, match=words):
             competitor(ID, f"exec:{name}")
-    with pytest.raises(ValueError, match="a time limit is above zero"), limit_programs(0.0, 0.0):
+    with pytest.raises(ValueError, match="a time limit must be above zero"), limit_programs(0.0, 0.0):
         pass
     with limit_programs(3.0, 70.0):
         assert Program("true").limits == LIMITS.get() == (3.0, 70.0)
