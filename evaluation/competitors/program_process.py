@@ -131,7 +131,7 @@ class ProgramProcess:
             for key, _ in self._answers.select(left):
                 self._read(key.fd)
 
-    def tell(self, message: bytes) -> None:
+    def send(self, message: bytes) -> None:
         """Write a message without a response.
 
         Raises:

@@ -337,7 +337,7 @@ class ProgramEstimator:
         self._format = answer["format"]
         if answer.get("feedback") is not True:
             self._feedback_field = None
-        self._process.tell(self._message("initial", self._fields, self._initial))
+        self._process.send(self._message("initial", self._fields, self._initial))
         self._fields = list(fields_of(measurement))
 
     def _message(self, name: str, fields: Sequence[ArrayField], rows: numpy.ndarray) -> bytes:

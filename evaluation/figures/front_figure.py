@@ -133,7 +133,7 @@ def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
         handles.setdefault(_origin(point, panel), Line2D([], [], label=_origin(point, panel), **style))
     if any(not point.time.compiled for point, _ in shown):
         style = {"marker": "o", "markersize": 4.0, "color": CLASSICAL, "markerfacecolor": "white"}
-        handles["python"] = Line2D([], [], label="asked in Python", linestyle="", **style)
+        handles["python"] = Line2D([], [], label="runs in Python", linestyle="", **style)
     handles["front"] = Line2D([], [], color="0.25", lw=1.0, label="the front")
     handles["reference"] = Line2D([], [], color="black", lw=0.9, ls="--", label="reference")
     order = ("yours", "paper's algorithm", "policy", "estimator", "learned", "python", "front", "reference")

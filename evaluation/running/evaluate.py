@@ -28,12 +28,12 @@ from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
-from .kept import Kept, limits
 from .metrics import bootstrap_of, units_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
+from .stored_values import StoredValues, limits
 from .supervision import running
 from .threads import one_thread
 from .times import with_times
@@ -269,7 +269,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     """
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
-    kept, drawn = Kept(experiment.tracks), None
+    kept, drawn = StoredValues(experiment.tracks), None
     report: Report = limits if kind == "bound" else kept
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first

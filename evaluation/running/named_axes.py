@@ -12,7 +12,7 @@ from ...envs.data.recording import Recording
 from ..competitors.kinds import Kind
 from ..statistics.cause_split import VARIABLE
 from ..storage.dataset import window_coords
-from .kept import DRAWN_PREFIX
+from .stored_values import DRAWN_PREFIX
 
 if TYPE_CHECKING:
     import xarray

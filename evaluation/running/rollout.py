@@ -32,7 +32,7 @@ from ..competitors.kinds import (
 from ..competitors.smoothers import SmoothedTrack, check_open_loop, report_smoothed, report_world, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
-from .kept import DRAWN_PREFIX
+from .stored_values import DRAWN_PREFIX
 
 AT_ONCE = 2**18
 """Measurements, over all episodes side by side, in one call of native code."""
@@ -174,7 +174,7 @@ def run_episodes(
         name: name of the competitor in errors.
         tick: called with the number of measurements done.
         more: a larger report and the number of first episodes that it is for: for all it would take much memory. Names
-            that begin with :data:`.kept.DRAWN_PREFIX` exist for these episodes only.
+            that begin with :data:`.stored_values.DRAWN_PREFIX` exist for these episodes only.
     """
     count, compiled_policy, tick = len(seeds), None, tick or (lambda measurements: None)
     is_policy = kind == "policy"

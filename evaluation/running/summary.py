@@ -20,7 +20,6 @@ from ..storage.dataset import Losses, count_losses, losses_in
 from ..storage.store import Store, Work
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, spread, stack_curves
 from .evaluate import Experiment, check_sendable, plan_of, run_competitors, run_piece
-from .kept import DRAWN_PREFIX
 from .metrics import (
     PER_FLIGHT,
     Contender,
@@ -40,6 +39,7 @@ from .metrics import (
 from .own_metrics import OwnMetrics
 from .parallel import Workers
 from .rollout import Progress
+from .stored_values import DRAWN_PREFIX
 from .threads import one_thread
 from .times import COORDINATES, with_times
 

@@ -127,8 +127,8 @@ class BlockBootstrap(Bootstrap):
                 f"{FEWEST_BLOCKS} intervals over time are too narrow."
             )
         return (
-            "The intervals of one episode are over time: those of a circular block bootstrap (Politis and Romano, 1992) "
-            f"of {rule}; a statistic that is one number of the whole episode has none."
+            "The intervals of one episode are over time: those of a circular block bootstrap (Politis and Romano, "
+            f"1992) of {rule}; a statistic that is one number of the whole episode has none."
         )
 
 

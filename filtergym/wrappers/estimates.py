@@ -17,7 +17,7 @@ from ..envs.engine.scenario_choice import find_scenario
 from ..envs.linear.equations import StateSpaceMeasurement
 from ..envs.linear.inputs import Input
 from ..envs.linear.sensors import Sensor
-from ..evaluation.competitors.filters import put_in_loop
+from ..evaluation.competitors.filters import close_loop
 from ..evaluation.competitors.kinds import kind_of
 from ..evaluation.competitors.stepping import CompiledUpdate, ModelUpdate
 from ..filters.angles import PERIODS
@@ -128,7 +128,7 @@ class Estimates:
                 raise ValueError(
                     f"competitor must be an estimator, one of {', '.join(known)}, got {competitor!r}"
                 )
-            own = put_in_loop(own, maker, "estimator", str(competitor), lanes)
+            own = close_loop(own, maker, "estimator", str(competitor), lanes)
         self.action_space = None if control is None else own.action_space
         self._own, world = own, own.task.world
         self._is_compiled = can_step(own, report_estimate)

@@ -40,7 +40,7 @@ def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, An
 
 
 @dataclass(frozen=True)
-class Kept:
+class StoredValues:
     """Report function of the values that are stored of every measurement of a competitor."""
 
     tracks: bool = False
