@@ -347,13 +347,13 @@ class OnlineFilter:
         update = self._update
         # Equal to _replace, which takes longer than the filter: other input, one more measurement.
         after = OnlineState._make((None, memory, *before[2:4], before.measurements + 1, *before[5:]))
-        update.arrive(measurement)
+        update.receive(measurement)
         if self._policy is not None:
             after = self._decide(after, update.shown)
         elif self.watch is not None and before.measurements % self._interval == 0:
             after = self._look(after, update.observed[: self.tracks])
         if self._is_asked:
-            update.answer(self._no_action if self._policy is None else after.action[self._pad])
+            update.act(self._no_action if self._policy is None else after.action[self._pad])
         self._state = after
         return update.report()
 
@@ -467,7 +467,7 @@ class OnlineFilter:
         self._go_on(state)
 
     def _go_on(self, state: OnlineState) -> None:
-        self._update.go_on(state.filter, state.policy)
+        self._update.resume(state.filter, state.policy)
         self._state = state._replace(filter=None, policy=state.policy if self._policy else None)
 
     # --- one measurement

@@ -277,14 +277,14 @@ class CompiledUpdate:
         cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
         self._report = [(name, reported[i][cut]) for name, i in tell.template.items()]
 
-    def arrive(self, measurement: Any) -> None:
+    def receive(self, measurement: Any) -> None:
         """Predict to a measurement, and update with it where no policy acts in Python."""
         before, now = self._now, int(self._now == 0)
         self._received[now].put(measurement)
         self._now = now
         self._arrivals[before].run(self._width, self._threads)
 
-    def answer(self, action: numpy.ndarray) -> None:
+    def act(self, action: numpy.ndarray) -> None:
         """Update with the measurement and an action chosen in Python, ``(width, ...)``."""
         self._action[...] = action.T
         self._answers[self._now].run(self._width, self._threads)
@@ -303,7 +303,7 @@ class CompiledUpdate:
         """Memory of the traced policy, in new arrays."""
         return map_arrays(lambda i: self._policies[self._now > 0][i].copy(), self._policy_template)
 
-    def go_on(self, state: Any, policy: Any) -> None:
+    def resume(self, state: Any, policy: Any) -> None:
         """Continue from a state of the filter and a memory of the traced policy."""
         self._now = 2
         arrays = leaves(state) + (leaves(policy) if self._policy_template else [])
@@ -327,7 +327,7 @@ class ModelUpdate:
         self.state: Any = None
         """State of the filter, in arrays that never change."""
 
-    def arrive(self, measurement: Any) -> None:
+    def receive(self, measurement: Any) -> None:
         """Predict to a measurement."""
         self._received.put(measurement)
         measured = self._received.copy()
@@ -343,7 +343,7 @@ class ModelUpdate:
         """Values of ``observe``, ``(width, fields)``."""
         return numpy.asarray(self._model.run(self._observe, self._episode)).T
 
-    def answer(self, action: numpy.ndarray) -> None:
+    def act(self, action: numpy.ndarray) -> None:
         """Update with the measurement and an action, ``(width, ...)``."""
         turned = numpy.asarray(action.T, dtype=float if self._model.action_space.shape else None)
         self._episode = self._model.act(self._episode, turned)
@@ -354,6 +354,6 @@ class ModelUpdate:
         reported = self._model.run(self._make_report, self._episode)
         return {name: numpy.copy(array[self._cut])[()] for name, array in reported.items()}
 
-    def go_on(self, state: Any, policy: Any) -> None:
+    def resume(self, state: Any, policy: Any) -> None:
         """Continue from a state of the filter."""
         self.state = state
