@@ -67,7 +67,7 @@ class Adapter(Filter[Task, Any, AdaptedState]):
 
     def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
         """Update the estimator."""
-        answer = self.ask(given, state.memory)
+        answer = self.call_update(given, state.memory)
         if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
             count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
             raise TypeError(
@@ -86,7 +86,7 @@ class Adapter(Filter[Task, Any, AdaptedState]):
         """Number among ``FAULTS`` of the reason for a missing response, as of a program; 0: none."""
         return getattr(self.own, "fault", 0)
 
-    def ask(self, given: FilterInput, memory: Any) -> Any:
+    def call_update(self, given: FilterInput, memory: Any) -> Any:
         """Call the estimator's ``update``."""
         return self.own.update(memory, given.measurement)
 
@@ -107,7 +107,7 @@ class ReferenceAdapter(Adapter):
         """Start from the initial estimate, with the truth."""
         return self.first(given.measurement, self.own.start(given.measurement, given.truth))
 
-    def ask(self, given: FilterInput, memory: Any) -> Any:
+    def call_update(self, given: FilterInput, memory: Any) -> Any:
         """Call the reference's ``update`` with the truth."""
         return self.own.update(memory, given.measurement, given.truth)
 
@@ -119,9 +119,9 @@ class BoundAdapter(ReferenceAdapter):
         """Return the state before the first measurement, with an infinite limit."""
         return AdaptedState(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
 
-    def ask(self, given: FilterInput, memory: Any) -> Any:
+    def call_update(self, given: FilterInput, memory: Any) -> Any:
         """Call the bound's ``update``; there is no covariance."""
-        limit, memory = super().ask(given, memory)
+        limit, memory = super().call_update(given, memory)
         return limit, None, memory
 
 

@@ -97,11 +97,11 @@ class OnlineFilter:
         blank = Estimate(None, self.names, self.units, numpy.empty(0), numpy.empty(0))
         self._same_of_estimates = dict(vars(blank))
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
-        self._is_asked = self._policy is not None or not is_compiled
+        self._is_in_python = self._policy is not None or not is_compiled
         self._no_action = numpy.zeros((len(self._pad), *(self.model.action_space.shape or ())))
         own: Any = self.model
         self._update: CompiledUpdate | ModelUpdate = (
-            CompiledUpdate(own, report_estimate, tracks, traced, self._is_asked, observe)
+            CompiledUpdate(own, report_estimate, tracks, traced, self._is_in_python, observe)
             if is_compiled
             else ModelUpdate(own, report_estimate, tracks, world.measurement, observe)
         )
@@ -154,7 +154,7 @@ class OnlineFilter:
         if tracks is not None:
             self._check_restart()
         begun = self._begin(initial, memory)
-        self._go_on(begun if tracks is None else self._merge(begun, tracks))
+        self._set_state(begun if tracks is None else self._merge(begun, tracks))
 
     def _begin(self, initial: Any, memory: Any) -> OnlineState:
         """Return the state at the start of all tracks."""
@@ -349,10 +349,10 @@ class OnlineFilter:
         after = OnlineState._make((None, memory, *before[2:4], before.measurements + 1, *before[5:]))
         update.receive(measurement)
         if self._policy is not None:
-            after = self._decide(after, update.shown)
+            after = self._decide(after, update.observation)
         elif self.watch is not None and before.measurements % self._interval == 0:
             after = self._look(after, update.observed[: self.tracks])
-        if self._is_asked:
+        if self._is_in_python:
             update.act(self._no_action if self._policy is None else after.action[self._pad])
         self._state = after
         return update.report()
@@ -388,7 +388,7 @@ class OnlineFilter:
     def _snapshot(self) -> OnlineState:
         state, update = self._running(), self._update
         state = state._replace(filter=update.state, watch=None if self.watch is None else self.watch.memory)
-        if not self._is_asked:
+        if not self._is_in_python:
             return state._replace(policy=update.policy_state)
         own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
         return copy.deepcopy(state._replace(python=None if own is None else (own.memory, own.step_number)))
@@ -459,32 +459,32 @@ class OnlineFilter:
 
     def _resume(self, state: OnlineState) -> None:
         """Continue from a snapshot, which does not change."""
-        state = copy.deepcopy(state) if self._is_asked else state
+        state = copy.deepcopy(state) if self._is_in_python else state
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step_number = state.python
         if self.watch is not None:
             self.watch.memory = state.watch
-        self._go_on(state)
+        self._set_state(state)
 
-    def _go_on(self, state: OnlineState) -> None:
+    def _set_state(self, state: OnlineState) -> None:
         self._update.resume(state.filter, state.policy)
         self._state = state._replace(filter=None, policy=state.policy if self._policy else None)
 
     # --- one measurement
 
-    def _decide(self, state: OnlineState, shown: numpy.ndarray) -> OnlineState:
+    def _decide(self, state: OnlineState, inputs: numpy.ndarray) -> OnlineState:
         """Choose an action where a decision is due, from the observation ``(width, fields)``."""
         assert self._policy is not None
-        number, observation = state.measurements - 1, shown.T
+        number, observation = state.measurements - 1, inputs.T
         if number:
             state = state._replace(total=self._means.add(state.total, observation))
         if number and number % self._interval == 0:
             observation = self._means.show(observation, state.total, numpy)
             state = state._replace(total=0.0)
         if number % self._interval == 0:
-            shown = numpy.ascontiguousarray(observation[:, : self.tracks].T)
-            action, memory = self._policy.predict(shown, state.policy, state.fresh)
-            state = self._look(state._replace(policy=memory, action=action), shown)
+            inputs = numpy.ascontiguousarray(observation[:, : self.tracks].T)
+            action, memory = self._policy.predict(inputs, state.policy, state.fresh)
+            state = self._look(state._replace(policy=memory, action=action), inputs)
         return state
 
     def _estimate(self, time: Any, found: dict[str, Any]) -> Estimate:

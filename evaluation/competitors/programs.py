@@ -257,7 +257,7 @@ class ProgramEstimator:
             try:
                 if memory == 0:
                     self._greet(measurement)
-                found = self._ask(rows_of(measurement, self.count), C)
+                found = self._exchange(rows_of(measurement, self.count), C)
                 if self.step_number == self.last:
                     self._process.finish()
                 answer = found
@@ -353,7 +353,7 @@ class ProgramEstimator:
             place += size
         return json.dumps({name: content}).encode() + b"\n"
 
-    def _ask(self, rows: numpy.ndarray, C: int) -> numpy.ndarray:
+    def _exchange(self, rows: numpy.ndarray, C: int) -> numpy.ndarray:
         """Return the response to a measurement, ``(tracks, C + C * C)``."""
         assert self._process is not None
         question = self._message("measurement", self._fields, rows)

@@ -57,7 +57,7 @@ class Decider:
     def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
         self._template = memory
         self.xp: ModuleType = model.task.xp
-        self.ask = act
+        self.act = act
         self._shapes = [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
         self.space: gymnasium.Space[Any] = model.action_space
         self.size: int = math.prod(self.space.shape or (1,))
@@ -85,7 +85,7 @@ class Decider:
             total = xp.where(first, 0.0, self.means.add(total, observation))
             observation = xp.where(first, observation, self.means.show(observation, total, xp))
             total = xp.where(due, 0.0, total)
-        answer, memory = self._ask(observation, state.memory, first)
+        answer, memory = self._act(observation, state.memory, first)
         if K > 1:
             answer = xp.where(due, answer, state.action)
             kept = iter(leaves(state.memory))
@@ -96,7 +96,7 @@ class Decider:
         count = xp.where(due, 1.0, state.count + 1.0) if K > 1 else xp.ones_like(state.count)
         return action, Decisions(memory, count, answer, total)
 
-    def _ask(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
+    def _act(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
         """Return the action ``(A, N)`` and memory, every array ``(entries, N)``."""
         shapes, N = iter(self._shapes), observation.shape[-1]
 
@@ -116,7 +116,7 @@ class Decider:
                 rows = self.xp.reshape(array, (N if shape[:1] == (1,) else 1, -1)).T
             return self.xp.astype(rows, self.xp.float64)
 
-        answer, memory = self.ask(observation.T, map_arrays(restore, memory), first)
+        answer, memory = self.act(observation.T, map_arrays(restore, memory), first)
         answer = self.xp.asarray(answer)
         if answer.size != self.size * N or (answer.dtype.kind == "f" and not self.space.shape):
             raise ValueError(

@@ -124,13 +124,13 @@ class SteppingPolicy(Policy):
             raise ValueError(f"the state is not one of {len(batch)} episodes: start again with state=None")
         answers, kept = [], []
         for call, memory in zip(calls, memories, strict=True):
-            answer, after = self._ask(batch[call], memory, start[call], deterministic)
+            answer, after = self._act(batch[call], memory, start[call], deterministic)
             answers.append(check_action(self.model.action_space, answer, len(call)))
             kept.append(after)
         action = numpy.concatenate(answers)[: len(batch)]
         return (action[0] if single else action), PolicyMemory(kept, False)
 
-    def _ask(
+    def _act(
         self, observation: numpy.ndarray, memory: Any, start: numpy.ndarray, deterministic: bool
     ) -> tuple[Any, Any]:
         """Compute the actions, in native code where the policy can be traced."""
@@ -212,11 +212,11 @@ class CompiledUpdate:
         report: function that returns a dictionary of arrays after the update.
         tracks: number of tracks side by side.
         policy: traced, see :func:`.steered_filter.trace_policy`; None without.
-        is_asked: whether a policy acts in Python.
+        in_python: whether a policy acts in Python.
         observe: function that returns ``(fields, N)`` before the update; None: the observation of a policy.
 
     Attributes:
-        shown: observation of a policy, ``(width, fields)``.
+        observation: observation of a policy, ``(width, fields)``.
         observed: values of ``observe``, ``(width, fields)``.
         blank_policy: memory of the traced policy before its first decision.
     """
@@ -227,7 +227,7 @@ class CompiledUpdate:
         report: Report,
         tracks: int,
         policy: Specialised | None = None,
-        is_asked: bool = False,
+        in_python: bool = False,
         observe: Report | None = None,
     ) -> None:
         update, _, predict, episode = model.programs.later
@@ -250,8 +250,8 @@ class CompiledUpdate:
             memory_of(watch.outputs if watch else (), width),
         )
         self._action[...] = 0.0
-        self.shown: numpy.ndarray = numpy.zeros((width, predict.outputs[-1].shape[0]))
-        self.observed: numpy.ndarray = fields[0].T if fields else self.shown
+        self.observation: numpy.ndarray = numpy.zeros((width, predict.outputs[-1].shape[0]))
+        self.observed: numpy.ndarray = fields[0].T if fields else self.observation
         self._states: list[list[numpy.ndarray]] = []
         """States after the update in each memory, and one set from outside."""
         looks, answers = [], []
@@ -259,7 +259,7 @@ class CompiledUpdate:
             given = [*predicted[now], *received.parts, self._action]
             after = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
             self._states.append(after[: len(self._kinds)])
-            memories = [self.shown, *self._policies[1 - now]], [self._action, *self._policies[now]]
+            memories = [self.observation, *self._policies[1 - now]], [self._action, *self._policies[now]]
             looks.append([watch.bound([*received.parts, *predicted[now]], fields)] if watch else [])
             report_call = tell.bound([*received.parts, *self._states[now]], reported)
             steer = [policy.bound(*memories)] if policy else []
@@ -267,11 +267,14 @@ class CompiledUpdate:
         self._states.append(written[: len(self._kinds)])
         arrivals = []
         for before, program, now in ((0, predict, 1), (1, predict, 0), (2, first, 0)):
-            read, ahead = [*self._states[before], *self._received[now].parts], [*predicted[now], self.shown]
-            answered = [] if is_asked else answers[now]
+            read, ahead = (
+                [*self._states[before], *self._received[now].parts],
+                [*predicted[now], self.observation],
+            )
+            answered = [] if in_python else answers[now]
             arrivals.append([program.bound(read, ahead), *looks[now], *answered])
         self._arrivals, self._answers = [CallSequence(calls) for calls in arrivals], []
-        if is_asked:
+        if in_python:
             self._answers = [CallSequence(calls) for calls in answers]
         self._now = 2
         cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
@@ -334,7 +337,7 @@ class ModelUpdate:
         self._episode = Episode((), measured, self._model.predict_filter(self.state, measured))
 
     @property
-    def shown(self) -> numpy.ndarray:
+    def observation(self) -> numpy.ndarray:
         """Observation of a policy, ``(width, fields)``."""
         return numpy.asarray(self._model.observe(self._episode)).T
 

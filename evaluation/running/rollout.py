@@ -90,14 +90,14 @@ def rollout(
 
 
 def _step(
-    looped: Model, asked: Any, seeds: Sequence[int], report: Report, name: str
+    looped: Model, maker: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
-    """Step a bank with a policy, or a filter without one if ``asked`` is None."""
+    """Step a bank with a policy, or a filter without one if ``maker`` is None."""
     lanes, action, policy, memory = start_lanes(looped, seeds, report=report), None, None, None
-    if asked is None:
+    if maker is None:
         action = numpy.zeros(len(seeds), dtype=numpy.int64)
     else:
-        policy = SteppingPolicy(looped, check_competitor(name, make_competitor(asked, looped), "policy"))
+        policy = SteppingPolicy(looped, check_competitor(name, make_competitor(maker, looped), "policy"))
         memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
         if policy is not None:
@@ -141,7 +141,7 @@ def _smoothed_estimates(
     return means, covariances
 
 
-class Flown(NamedTuple):
+class EpisodeReports(NamedTuple):
     """Reports on complete episodes."""
 
     found: dict[str, numpy.ndarray]
@@ -159,7 +159,7 @@ def run_episodes(
     name: str = "competitor",
     tick: Progress | None = None,
     more: tuple[Report, int] | None = None,
-) -> Flown:
+) -> EpisodeReports:
     """Run a competitor over one episode for each seed, and return the reports on every measurement.
 
     Where world, filter, policy and report are all compiled, all episodes are one call of native code; otherwise they
@@ -244,25 +244,29 @@ def _without_padding(report: Mapping[str, numpy.ndarray], count: int) -> dict[st
 
 def _run_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
-) -> Flown:
+) -> EpisodeReports:
     """Run compiled episodes in native code, ``AT_ONCE`` measurements in each call."""
     lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
     interval = looped.task.decision_interval
     decisions, most = lanes.decisions_per_episode, max(1, AT_ONCE // (lanes.width * interval))
 
-    def run(decisions: int, whole: bool) -> Flown:
+    def run(decisions: int, whole: bool) -> EpisodeReports:
         """Run a number of decisions; for whole episodes return a view."""
         reports, actions = lanes.run(report, compiled_policy, decisions * interval)
         tick(count * decisions * interval)
         found = {name: _episodes_first(values, count) for name, values in reports.items()}
         steered = None if actions is None else _checked_actions(looped, actions, count)
-        return Flown(found, steered) if whole else map_arrays(numpy.ascontiguousarray, Flown(found, steered))
+        return (
+            EpisodeReports(found, steered)
+            if whole
+            else map_arrays(numpy.ascontiguousarray, EpisodeReports(found, steered))
+        )
 
     parts = [run(min(most, decisions - i), decisions <= most) for i in range(0, decisions, most)]
     return _one_after_another(parts, axis=1)
 
 
-def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
+def _one_after_another(parts: Sequence[EpisodeReports], axis: int = 0) -> EpisodeReports:
     """Concatenate parts along an axis, and empty them on the way; reports on some episodes only are not padded."""
     if len(parts) == 1:
         return parts[0]
@@ -271,12 +275,12 @@ def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
         for name in list(parts[0].found)
     }
     actions = [part.action for part in parts if part.action is not None]
-    return Flown(found, numpy.concatenate(actions, axis) if actions else None)
+    return EpisodeReports(found, numpy.concatenate(actions, axis) if actions else None)
 
 
 def _join_stretches(
     stretches: Iterator[dict[str, numpy.ndarray]], count: int, tick: Progress, drawn: int
-) -> Flown:
+) -> EpisodeReports:
     """Concatenate reports on stretches of measurements, arrays ``(scans, ..., N)`` by name."""
     series: dict[str, list[numpy.ndarray]] = {}
     for found in stretches:
@@ -284,14 +288,14 @@ def _join_stretches(
             kept = drawn if name.startswith(DRAWN_PREFIX) else count
             series.setdefault(name, []).append(values[..., :kept].copy())
         tick(count * len(next(iter(found.values()))))
-    return Flown(
+    return EpisodeReports(
         {name: _episodes_first(numpy.concatenate(values), count) for name, values in series.items()}, None
     )
 
 
 def _step_episodes(
     steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, drawn: int
-) -> Flown:
+) -> EpisodeReports:
     """Run episodes step by step and collect the reports."""
     series: dict[str, list[numpy.ndarray]] = {}
     actions = []
@@ -304,7 +308,7 @@ def _step_episodes(
         actions.append(numpy.asarray(action))
         tick(count)
     together = {name: _episodes_first(numpy.stack(values), count) for name, values in series.items()}
-    return Flown(together, numpy.stack(actions, axis=1) if is_policy else None)
+    return EpisodeReports(together, numpy.stack(actions, axis=1) if is_policy else None)
 
 
 def _compiled_policy_of(model: Model, competitor: Any, name: str) -> Specialised | None:

@@ -156,15 +156,15 @@ class Part(NamedTuple):
         """Add the episodes that come next."""
         return self._replace(reduction=self.reduction.merge(later.reduction))
 
-    def summary(self, asked: EvaluationRequest) -> Summary:
+    def summary(self, request: EvaluationRequest) -> Summary:
         """Return the summary of all episodes of the request."""
-        results, bootstrap = self.reduction.results(), resampling(asked.episodes)
-        contender = contender_of(results, self.head, bootstrap, asked.metrics)
-        curves = competitor_curves(results) if asked.curves else None
-        return Summary(contender, curves, self.head, asked.episodes)
+        results, bootstrap = self.reduction.results(), resampling(request.episodes)
+        contender = contender_of(results, self.head, bootstrap, request.metrics)
+        curves = competitor_curves(results) if request.curves else None
+        return Summary(contender, curves, self.head, request.episodes)
 
 
-def summarise(asked: EvaluationRequest, tick: Progress) -> Summary | Part:
+def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
     """Run a request and reduce it to a summary; for a piece of the episodes only, return their contribution.
 
     Raises:
@@ -172,56 +172,56 @@ def summarise(asked: EvaluationRequest, tick: Progress) -> Summary | Part:
     """
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
-        yield from record_statistics(run, asked.episodes, asked.metrics)
-        if asked.curves:
-            yield from curve_statistics(run, asked.episodes)
+        yield from record_statistics(run, request.episodes, request.metrics)
+        if request.curves:
+            yield from curve_statistics(run, request.episodes)
 
-    part = reduce_episodes(asked, declare, tick)
-    if asked.end - asked.first < asked.episodes:
+    part = reduce_episodes(request, declare, tick)
+    if request.end - request.first < request.episodes:
         return part
-    return part.summary(asked)
+    return part.summary(request)
 
 
 def reduce_episodes(
-    asked: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
+    request: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
     """Run a request and reduce it to statistics, a block of episodes at a time.
 
     Args:
-        asked: request of one competitor over episodes.
+        request: request of one competitor over episodes.
         declare: function from some of its episodes to their statistics.
         tick: called with the number of measurements done.
 
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
     """
-    plan = plan_of(asked.experiment, {asked.name: asked.maker}, asked.first, asked.end)
+    plan = plan_of(request.experiment, {request.name: request.maker}, request.first, request.end)
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
-    bootstrap = resampling(asked.episodes)
-    block = block_of(plan.models[asked.name].task.horizon)
+    bootstrap = resampling(request.episodes)
+    block = block_of(plan.models[request.name].task.horizon)
 
     def part(first: int) -> Part:
         """Run a block of episodes and reduce it; its measurements are freed at the end of the call."""
-        piece = plan.piece(asked.name, first, min(block, asked.end - first), True)
+        piece = plan.piece(request.name, first, min(block, request.end - first), True)
         count = len(piece.seeds)
-        kept = plan.arrays(count, asked.experiment.drawn_episodes - first)
-        kept.write(asked.name, slice(count), run_piece(piece, tick))
+        kept = plan.arrays(count, request.experiment.drawn_episodes - first)
+        kept.write(request.name, slice(count), run_piece(piece, tick))
         run = plan.dataset(kept, piece.seeds).isel(policy=0)
         reduction = reduce_run(run, declare, bootstrap, first)
         others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
         head = run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
         return Part(reduction, head)
 
-    parts = (part(first) for first in range(asked.first, asked.end, block))
+    parts = (part(first) for first in range(request.first, request.end, block))
     found = functools.reduce(Part.merge, parts)
-    if asked.experiment.timed and asked.first == 0:
-        return found._replace(head=with_times(found.head, [plan.time(asked.name)]))
+    if request.experiment.timed and request.first == 0:
+        return found._replace(head=with_times(found.head, [plan.time(request.name)]))
     return found
 
 
 def summaries(
-    asked: Sequence[EvaluationRequest],
+    requests: Sequence[EvaluationRequest],
     workers: Workers,
     progress: Progress | None = None,
     store: Store | None = None,
@@ -229,7 +229,7 @@ def summaries(
     """Summarise competitors, of any environments.
 
     Args:
-        asked: the requests, started in this order.
+        requests: the requests, started in this order.
         workers: processes that do the work.
         progress: called with the number of measurements done.
         store: stores each summary, so that a second call reads it. Default: nothing is stored.
@@ -242,9 +242,9 @@ def summaries(
             :func:`.evaluate.run_experiment`.
     """
     store = store or Store()
-    work = [one.work() for one in asked]
+    work = [one.work() for one in requests]
     missing = []
-    for i, one in enumerate(asked):
+    for i, one in enumerate(requests):
         found = store.read(work[i], Summary)
         if found is None:
             missing.append(i)
@@ -254,13 +254,13 @@ def summaries(
         yield i, found
     if not workers.alone:
         for i in missing:
-            check_sendable(asked[i].experiment.task, {asked[i].name: asked[i].maker})
-    pieces = [(i, piece) for i in missing for piece in asked[i].pieces()]
+            check_sendable(requests[i].experiment.task, {requests[i].name: requests[i].maker})
+    pieces = [(i, piece) for i in missing for piece in requests[i].pieces()]
     batches = [[piece] for piece in pieces] if workers.alone else _batches(pieces)
     items = [[piece for _, piece in batch] for batch in batches]
     waiting: dict[int, dict[int, tuple[Part, int]]] = {}
     added: dict[int, Part] = {}
-    done = [0] * len(asked)
+    done = [0] * len(requests)
     sizes = [sum(piece.measurements for piece in batch) for batch in items]
     run = workers.run(lambda batch, tick: [summarise(one, tick) for one in batch], items, sizes, progress)
     for (i, piece), found in (
@@ -275,9 +275,9 @@ def summaries(
         while done[i] in waiting[i]:
             later, done[i] = waiting[i].pop(done[i])
             added[i] = added[i].merge(later) if i in added else later
-        if done[i] == asked[i].episodes:
+        if done[i] == requests[i].episodes:
             with one_thread():
-                whole = added.pop(i).summary(asked[i])
+                whole = added.pop(i).summary(requests[i])
             store.write(work[i], whole)
             yield i, whole
 
@@ -328,7 +328,7 @@ def _actions_by_control(
     ]
 
 
-class Alone(NamedTuple):
+class SeparateResults(NamedTuple):
     """Data of one competitor over flights, a recording or one episode, which are resampled with those of the others."""
 
     reduced: Reduced
@@ -342,7 +342,7 @@ class Alone(NamedTuple):
     """Its part of the evaluation, without the values of every episode, at ``DRAWN_TIMES`` measurements at most."""
 
 
-def reduce_alone(run: xarray.Dataset, asked: EvaluationRequest) -> Alone:
+def reduce_alone(run: xarray.Dataset, request: EvaluationRequest) -> SeparateResults:
     """Reduce one competitor's part of an evaluation."""
     episodes, times = run.sizes["episode"], run.sizes["time"]
     flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
@@ -352,14 +352,14 @@ def reduce_alone(run: xarray.Dataset, asked: EvaluationRequest) -> Alone:
     if costs is not None and numpy.isnan(costs).all():  # bounds have no cost
         costs = None
     chosen, curves = spread(times, DRAWN_TIMES), None
-    if asked.curves:
+    if request.curves:
         declare = functools.partial(curve_statistics, episodes=episodes)
         results = reduce_run(run, declare, bootstrap_of_episodes(run)).results()
         curves = competitor_curves(results).at_measurements(chosen, times)
     others = [name for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
-    return Alone(
-        reduce_competitor(run, asked.metrics).without_variables(),
-        [reduce_competitor(part, asked.metrics).without_variables() for part in flights],
+    return SeparateResults(
+        reduce_competitor(run, request.metrics).without_variables(),
+        [reduce_competitor(part, request.metrics).without_variables() for part in flights],
         likelihood_sums(run) if recorded else None,
         costs,
         count_losses(losses_in(run)),
@@ -368,14 +368,14 @@ def reduce_alone(run: xarray.Dataset, asked: EvaluationRequest) -> Alone:
     )
 
 
-def _run_alone(asked: EvaluationRequest, tick: Progress) -> Alone:
-    found = run_competitors(asked.experiment, {asked.name: asked.maker}, tick)
-    return reduce_alone(found.isel(policy=0), asked)
+def _run_alone(request: EvaluationRequest, tick: Progress) -> SeparateResults:
+    found = run_competitors(request.experiment, {request.name: request.maker}, tick)
+    return reduce_alone(found.isel(policy=0), request)
 
 
 @one_thread()
 def _combine_alone(
-    found: Mapping[str, Alone],
+    found: Mapping[str, SeparateResults],
     curves: Sequence[CompetitorCurves],
     evaluation: xarray.Dataset,
     metrics: OwnMetrics | None,
@@ -405,7 +405,7 @@ def _combine_alone(
 
 
 def run_requests(
-    asked: Sequence[EvaluationRequest],
+    requests: Sequence[EvaluationRequest],
     workers: Workers,
     progress: Progress | None = None,
     store: Store | None = None,
@@ -414,7 +414,7 @@ def run_requests(
     """Evaluate the competitors of one experiment.
 
     Args:
-        asked: one request for each competitor.
+        requests: one request for each competitor.
         workers: processes that share the work.
         progress: called with the number of measurements done.
         store: stores each summary, so that a second call reads it. Default: nothing is stored.
@@ -423,20 +423,20 @@ def run_requests(
     Raises:
         ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
     """
-    first, names = asked[0], [one.name for one in asked]
+    first, names = requests[0], [one.name for one in requests]
     if whole:
-        makers = {one.name: one.maker for one in asked}
+        makers = {one.name: one.maker for one in requests}
         evaluation = run_competitors(first.experiment, makers, progress, workers)
-        remains = [reduce_alone(evaluation.sel(policy=one.name), one) for one in asked]
+        remains = [reduce_alone(evaluation.sel(policy=one.name), one) for one in requests]
         curves = [one.curves for one in remains if one.curves is not None]
     elif first.episodes > 1 and not first.experiment.make_task().flights:
-        found = dict(summaries(asked, workers, progress, store))
+        found = dict(summaries(requests, workers, progress, store))
         return combine_summaries([found[i] for i in range(len(found))])
     else:  # one competitor after the other, without storing arrays as long as the episodes
         if not workers.alone:
-            check_sendable(first.experiment.task, {one.name: one.maker for one in asked})
-        done = dict(workers.run(_run_alone, asked, [one.measurements for one in asked], progress))
-        remains = [done[i] for i in range(len(asked))]
+            check_sendable(first.experiment.task, {one.name: one.maker for one in requests})
+        done = dict(workers.run(_run_alone, requests, [one.measurements for one in requests], progress))
+        remains = [done[i] for i in range(len(requests))]
         curves = [one.curves for one in remains if one.curves is not None]
         if curves:
             curves = _actions_by_control(curves, [str(one.head["control"].values) for one in remains])

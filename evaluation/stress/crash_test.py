@@ -108,7 +108,7 @@ class StreamFilter(OnlineFilter):
 
     def begin(self, initial: Any) -> None:
         """Start the tracks from the task's own initial estimate."""
-        self._go_on(self._begin(initial, {}))
+        self._set_state(self._begin(initial, {}))
 
     def _check_input(self, memory: Any) -> None:
         """Do nothing: without an input there is no memory of it to check."""
