@@ -35,9 +35,9 @@ from ..evaluation.competitors.kinds import (
     RandomPolicy,
     check_competitor,
     expose_spaces,
+    is_traceable,
     kind_of,
     make_competitor,
-    says_traceable,
 )
 from ..evaluation.competitors.steered_filter import Decider
 from ..evaluation.running.evaluate import control_of
@@ -240,7 +240,7 @@ class Gated(Policy):
             raise ValueError(f"the policy is made for control {own!r}, but the task has {model.control!r}")
         self.gate: Gate = Gate(model, fallback, alarm, window)
         parts = self.policy, self.gate.fallback
-        self.traceable: bool = all(map(says_traceable, parts))  # type: ignore[misc]  # of these two
+        self.traceable: bool = all(map(is_traceable, parts))  # type: ignore[misc]  # of these two
         expose_spaces(self, self.policy)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory] | None:
@@ -336,7 +336,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         self.network: Policy = agent.network
         self.decider: Decider = agent.decider
         policy: Any = agent.network
-        self.in_python: bool = fallback.in_python or not says_traceable(policy.policy)
+        self.in_python: bool = fallback.in_python or not is_traceable(policy.policy)
 
     def start(self, initial: Any) -> GatedState:
         """Start both from the initial estimate."""
@@ -357,9 +357,9 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         xp, measurement = self.xp, given.measurement
         agent, fallback = self.agent.update(state.agent, given), self.fallback.update(state.fallback, given)
         mean, other_mean = self.agent.mean(agent), self.fallback.mean(fallback)
-        own = Likelihood.told(self.agent.records(agent, measurement))
-        other = Likelihood.told(self.fallback.records(fallback, measurement))
-        if isinstance(self.fallback, Adapter) and not self.fallback.tells:
+        own = Likelihood.of_records(self.agent.records(agent, measurement))
+        other = Likelihood.of_records(self.fallback.records(fallback, measurement))
+        if isinstance(self.fallback, Adapter) and not self.fallback.has_likelihood:
             other = Likelihood(None)
         # A lost track, whose estimate is not finite, is not trusted.
         odds, sound = state.odds, xp.all(xp.isfinite(mean), axis=0)

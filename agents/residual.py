@@ -12,7 +12,7 @@ import numpy
 
 from ..baselines.problem import Problem
 from ..envs.contract.model import Model
-from ..evaluation.competitors.kinds import Policy, expose_spaces, kind_of, make_competitor, says_traceable
+from ..evaluation.competitors.kinds import Policy, expose_spaces, is_traceable, kind_of, make_competitor
 
 
 def check_residual(model: Model, policy: Any) -> None:
@@ -70,7 +70,7 @@ class ResidualPolicy(Policy):
         self.control: str = model.control  # type: ignore[misc]
         self.policy = policy
         self.agent = agent
-        self.traceable: bool = says_traceable(policy) and says_traceable(agent)  # type: ignore[misc]  # of these two
+        self.traceable: bool = is_traceable(policy) and is_traceable(agent)  # type: ignore[misc]  # of these two
         expose_spaces(self, agent)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, Any] | None:

@@ -18,7 +18,7 @@ from ..envs.engine.compiled import can_step
 from ..envs.engine.lanes import Lanes
 from ..envs.engine.rollout import Rollout, TrainingObjective
 from ..envs.interface.vector_environment import TaskVectorEnv
-from ..evaluation.competitors.filters import put_in_loop
+from ..evaluation.competitors.filters import close_loop
 from ..evaluation.competitors.kinds import kind_of
 from .gate import Gate
 
@@ -278,7 +278,7 @@ class Teacher:
             raise ValueError(
                 f"{name!r} cannot teach in {env.task.id}: the measurements depend on its own estimates"
             )
-        model = put_in_loop(env.model, competitor, kind, name, env.num_envs)
+        model = close_loop(env.model, competitor, kind, name, env.num_envs)
         if not can_step(model, _estimate):
             raise ValueError(f"{name!r} cannot teach: it does not run as compiled code")
         self._lanes = Lanes(model, env.num_envs, report=_estimate)

@@ -11,7 +11,7 @@ from types import ModuleType
 
 from ..envs.contract.task import Task
 from ..envs.engine.catalogue import folders, nearest, task_class
-from ..evaluation.competitors.kinds import TOLD_MORE, RandomPolicy, kind_of
+from ..evaluation.competitors.kinds import INFORMED_KINDS, RandomPolicy, kind_of
 from .table import Baselines, PaperAction
 
 USER_BASELINES: dict[str, Baselines] = {}
@@ -82,6 +82,6 @@ def add_baselines(task: type[Task], table: Baselines) -> None:
                 raise ValueError(
                     f"{name!r} stands in the table as {kind}, but its kind is {kind_of(maker)!r}"
                 )
-            if kind in TOLD_MORE and not getattr(maker, "knows", ""):
+            if kind in INFORMED_KINDS and not getattr(maker, "knows", ""):
                 raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
     USER_BASELINES[task.id] = table

@@ -1,4 +1,5 @@
-"""How competitors are run and what their episodes come to: takes objects and knows no names.
+"""Evaluation of competitors: runs, statistics and figures of their episodes.
 
-Its rooms, in this order: ``storage``, ``statistics``, ``competitors``, ``running``, ``figures``.
+It takes objects, not names of competitors. Its rooms, in this order: ``storage``, ``statistics``, ``competitors``,
+``running``, ``figures``.
 """

@@ -13,7 +13,7 @@ from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.faults import Disturbance, Disturbances
 from filtergym.envs.maneuvering_target import world
 from filtergym.envs.maneuvering_target.disturbances import DISTURBANCES
-from filtergym.evaluation.competitors.filters import put_in_loop
+from filtergym.evaluation.competitors.filters import close_loop
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -153,4 +153,4 @@ def test_a_reference_that_does_not_know_what_may_happen_is_refused(monkeypatch):
     with pytest.raises(
         ValueError, match="'known-turn' does not know the disturbance 'frozen' of filtergym/Man"
     ):
-        put_in_loop(make_model(ID), KnownTurn, "reference", "known-turn", 1)
+        close_loop(make_model(ID), KnownTurn, "reference", "known-turn", 1)

@@ -349,7 +349,7 @@ def test_a_class_of_one_track_is_refused_with_its_adapter(given):
     exec(f"def start(self, x0, P0): pass\ndef update(self, {given}): pass", made)  # as students write it
     found = type("OneTrack", (), {name: made[name] for name in ("start", "update")})
     sentence = (
-        rf"'one': update\({given}\) is of a filter that knows one track, .*adapters\.SingleTrackEstimator"
+        rf"'one': update\({given}\) is of a single-track filter, .*adapters\.SingleTrackEstimator"
     )
     with pytest.raises(ValueError, match=sentence):
         filtergym.evaluate(ID, {"one": found}, episodes=1)

@@ -144,7 +144,7 @@ def test_who_is_told_apart_may_be_asked_for(curves):
     assert choose_highlights(curves, ["adaptive", "imm"]) == ["adaptive", "imm"]
     with pytest.raises(ValueError, match="cannot highlight 'mine': there are fixed-low"):
         choose_highlights(curves, ["mine"])
-    with pytest.raises(ValueError, match="at most 6 lines can be told apart, got 7"):
+    with pytest.raises(ValueError, match="at most 6 lines can be highlighted, got 7"):
         choose_highlights(curves, NAMES[:7])
 
 

@@ -118,7 +118,7 @@ def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a,b\n1,2\n", "holds no estimate of position_x"),
+        ("a,b\n1,2\n", "contains no estimate of position_x"),
         ("track,seconds,position_x,position_y\nfoo,1,2,3\n", "tracks foo, and those of the evaluation are 0, 1"),
         ("seconds,position_x,position_y\n1,2,3\n", "names no tracks"),
         ("track,seconds,velocity_x\n0,1,2\n", "holds no position_x, position_y, velocity_y, without which"),

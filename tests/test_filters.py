@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 import filtergym
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.filter import Likelihood
-from filtergym.evaluation.competitors.filters import find_fault, is_lacking, put_in_loop
+from filtergym.evaluation.competitors.filters import close_loop, find_fault, is_lacking
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds
@@ -71,7 +71,7 @@ def test_shipped_filters_are_traced(env_id):
     for kind, group in groups.items():
         for name, maker in list(group.items())[:: 3 if env_id in SHORT else 1]:
             keywords = {**getattr(maker, "task_keywords", {}), **usual}
-            fast = put_in_loop(make_model(env_id, **keywords, backend="compiled"), maker, kind, name, 8)
+            fast = close_loop(make_model(env_id, **keywords, backend="compiled"), maker, kind, name, 8)
             assert kind_of(maker) == kind
             assert not fast.filter.in_python, name
             assert fast.backend == "compiled", name
@@ -87,10 +87,10 @@ def test_a_traceable_class_is_compiled_and_says_what_it_says_in_python():
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e4 * np.finfo(float).eps * size)
     assert np.isnan(found["log_likelihood"].values).any()
     model = make_model(TARGET, backend="compiled")
-    assert not put_in_loop(model, Kalman, "estimator", "mine", 8).filter.in_python
-    assert put_in_loop(model, InPython, "estimator", "mine", 8).filter.in_python
+    assert not close_loop(model, Kalman, "estimator", "mine", 8).filter.in_python
+    assert close_loop(model, InPython, "estimator", "mine", 8).filter.in_python
     # An object was made for arrays of NumPy, whatever its class says.
-    assert put_in_loop(model, Kalman(model.task), "estimator", "mine", 8).filter.in_python
+    assert close_loop(model, Kalman(model.task), "estimator", "mine", 8).filter.in_python
 
 
 def test_what_cannot_be_traced_though_it_says_so_runs_in_python_with_a_warning():
@@ -253,5 +253,5 @@ def test_something_is_lacking_where_a_number_of_a_measurement_is_nan():
 
 def test_a_compiled_filter_is_kept_for_the_next_chunk_of_episodes():
     model = make_model(TARGET, backend="compiled")
-    first, second = (put_in_loop(model, Kalman, "estimator", "mine", 8) for _ in range(2))
+    first, second = (close_loop(model, Kalman, "estimator", "mine", 8) for _ in range(2))
     assert first.programs is second.programs

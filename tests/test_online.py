@@ -327,7 +327,7 @@ def test_a_users_own_runs_is_saved_and_restored():
     assert filter.update(10.0, x=3.0, y=4.0).mean.tolist() == [3.0, 4.0, -198.0, 50.0]
     filter.restore(saved)
     assert filter.update(10.0).mean.tolist() == [1.0, 2.0, -198.0, 50.0]
-    with pytest.raises(ValueError, match="cannot start single tracks anew"):
+    with pytest.raises(ValueError, match="cannot restart single tracks"):
         filter.start(STATE, COVARIANCE, tracks=[0])
 
 
@@ -477,7 +477,7 @@ def test_what_is_older_than_the_buffer_is_counted_and_refused(lag, kept):
     assert max(sizes[kept:]) - min(sizes[kept:]) < 200
     before = filter.predict().mean
     for count in (1, 2):
-        said = rf"of 50.0 s comes too late: .* until 104.0 s is settled; {count} were"
+        said = rf"of 50.0 s comes too late: .* until 104.0 s are final; {count} were"
         with pytest.raises(ValueError, match=said):
             filter.update(50.0, x=0.0, y=0.0)
         assert filter.too_late == filter.save().too_late == count
@@ -605,7 +605,7 @@ def test_a_state_goes_back_to_the_filter_that_it_is_of():
     filter.start(STATE, COVARIANCE)
     other = filtergym.online(RADAR, "kalman-imm-turn")
     for wrong in (5, None, "x", ()):
-        with pytest.raises(ValueError, match="restore takes what save has returned, got"):
+        with pytest.raises(ValueError, match="restore takes a state that save has returned, got"):
             filter.restore(wrong)
     with pytest.raises(
         ValueError, match=r"this state is of .*, imm, 1 track, .* and the filter is .*kalman-imm-turn"
@@ -652,7 +652,7 @@ def test_a_forged_state_is_refused_in_a_sentence_and_the_filter_goes_on(name):
         parts |= {"policy": [5, "x"]}
     for part, values in parts.items():
         for value in values:
-            with pytest.raises(ValueError, match="cannot go on from this state, which is not what save has"):
+            with pytest.raises(ValueError, match="cannot continue from this state, which is not one that save"):
                 filter.restore(saved._replace(**{part: value}))
     one, two = (each.update(20.0, x=20200.0, y=30700.0) for each in (filter, other))
     np.testing.assert_array_equal(one.mean, two.mean)
@@ -714,5 +714,5 @@ def test_times_since_1970_are_of_the_unit_that_they_must_have():
             np.testing.assert_allclose(one.mean, other.mean, atol=0.5 if unit == 10**6 else 1e-3)
     filter = filtergym.online("filtergym/ManeuveringTarget-v0", "kalman-imm-turn")
     filter.start(mean, covariance)
-    with pytest.raises(ValueError, match=r"is since 1970, and the last one, 0\.0 s, is not: start the track"):
+    with pytest.raises(ValueError, match=r"counts from 1970, but the last one, 0\.0 s, does not: start the track"):
         filter.update(start, x=21e3, y=30.5e3)

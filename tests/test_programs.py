@@ -178,11 +178,11 @@ def test_a_program_steers_the_tracking_loops_where_it_says_a_number(tmp_path):
         ("hang", LATE, 2, "it has not answered within 0.3 s"),
         ("shape", WRONG, 2, "its 'mean' is not 8 lists of 2 numbers"),
         ("words", WRONG, 2, "its 'mean' is not 8 lists of 2 numbers"),
-        ("prints", WRONG, 2, "it has answered with no object of JSON: 'debugging"),
+        ("prints", WRONG, 2, "its answer is no JSON object: 'debugging"),
         ("twice", WRONG, 3, "it has written more than an answer"),
         ("afterwards", WRONG, 3, "it has written more than an answer"),
         ("flood", WRONG, 2, "it has answered with a line of more than"),
-        ("no hello", WRONG, 0, "it has answered with no object of JSON: 'welcome"),
+        ("no hello", WRONG, 0, "its answer is no JSON object: 'welcome"),
         ("no licence", ENDED, 0, "it has ended with exit status 1: RuntimeError: no licence"),
         pytest.param("memory", ENDED, 2, "exit status 1: MemoryError", marks=LINUX),
     ],
@@ -225,7 +225,7 @@ def test_what_is_no_program_is_refused_before_anything_runs():
     ):
         with pytest.raises(ValueError, match=words):
             competitor(ID, f"exec:{name}")
-    with pytest.raises(ValueError, match="a time limit is above zero"), limit_programs(0.0, 0.0):
+    with pytest.raises(ValueError, match="a time limit must be above zero"), limit_programs(0.0, 0.0):
         pass
     with limit_programs(3.0, 70.0):
         assert Program("true").limits == LIMITS.get() == (3.0, 70.0)

@@ -107,7 +107,7 @@ def test_an_environment_of_the_program_that_runs_is_not_sent(turns):
     filtergym.register_task(turns)
     with (
         Workers(2) as two,
-        pytest.raises(ValueError, match=r"^mine/Turns-v0 is registered by the program that runs"),
+        pytest.raises(ValueError, match=r"^mine/Turns-v0 is registered by the running program"),
     ):
         filtergym.evaluate(turns.id, ["random"], episodes=2, workers=two)
 

@@ -89,7 +89,7 @@ def test_what_is_no_result_is_made_again(tmp_path, content):
 
 def test_objects_are_neither_written_nor_read(tmp_path):
     store = Store(tmp_path)
-    with pytest.raises(NotImplementedError, match="a Store cannot be kept"):
+    with pytest.raises(NotImplementedError, match="a Store cannot be stored"):
         store.write(WORK, store)
     assert not list(tmp_path.iterdir())
     store.write(WORK, ("|O", (1,), b"\0" * 8))

@@ -104,7 +104,7 @@ def test_a_long_episode_is_resampled_in_units():
 
 def test_one_episode_has_intervals_of_what_is_a_mean_over_time_and_says_whose(monkeypatch):
     few = evaluate(ENV, ["imm", "fixed-low"], episodes=1, horizon=400)
-    assert "has no intervals: it holds 12 blocks of 34 measurements" in few.attrs["notes"]
+    assert "has no intervals: it contains 12 blocks of 34 measurements" in few.attrs["notes"]
     assert {r.low for r in tidy_records(few) if r.metric in ("rmse", "cost", "anees")} == {None}
     assert {r.value for r in tidy_records(few) if r.metric == "best_share"} == {None}
     monkeypatch.setattr(time_blocks, "FEWEST_BLOCKS", 10)

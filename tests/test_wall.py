@@ -290,7 +290,7 @@ def test_a_prophet_knows_nothing_in_its_second_run(layers, absent):
     prophet = isolate_source(f"KEY = {os.getpid()}\n{PROPHET}", "Prophet", "prophet")
     if layers == LAYERS[1:]:
         with pytest.warns(
-            UserWarning, match="no whole wall here, without Landlock and a filter of system calls"
+            UserWarning, match="the isolation is incomplete, without Landlock and a filter of system calls"
         ):
             assert [answer(prophet), answer(prophet)] == [1.0, 1.0]
     else:
@@ -317,7 +317,7 @@ def test_a_prophet_knows_nothing_in_its_second_run(layers, absent):
 def test_what_stays_open_is_a_sentence_before_the_run(layers, without, could, absent):
     absent(*layers)
     honest = PROPHET.replace("libc.shmget(KEY, 4096, 0o1600)", "-1")
-    with pytest.warns(UserWarning, match=f"no whole wall here, without {without}: it could {could}"):
+    with pytest.warns(UserWarning, match=f"the isolation is incomplete, without {without}: it could {could}"):
         assert answer(isolate_source(honest, "Prophet", "honest")) == 1.0
 
 

@@ -1,5 +1,5 @@
-"""Who may compete: policies, estimators, smoothers, references, bounds, and how each is made a filter in the loop.
+"""Competitors: policies, estimators, smoothers, references and bounds, and their adapters to filters in the loop.
 
-Knows ``storage`` and ``statistics`` and runs no episode by itself. Begin with :mod:`.kinds`; :mod:`.filters` puts each
-kind into the loop, :mod:`.online` and :mod:`.stepping` take one measurement at a time.
+It imports ``storage`` and ``statistics`` and does not run episodes. Begin with :mod:`.kinds`; :mod:`.filters` adapts
+each kind to the loop, :mod:`.online` and :mod:`.stepping` process one measurement at a time.
 """

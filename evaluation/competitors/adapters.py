@@ -1,7 +1,7 @@
-"""Estimators that are written for one episode, in the table beside those that take all of them at once.
+"""Adapters for estimators of a single track, which the evaluation runs as if for many episodes side by side.
 
-One object an episode, each asked in turn: honest, and slow. An estimator in a process of its own has this module, too
-(:data:`.isolation.SHARED`), so it imports nothing else of the package.
+There is one object for each episode, and each is updated in turn, which is slow. An estimator in a process of its own
+may also import this module (:data:`.isolation.SHARED`), so it imports nothing else of the package.
 """
 
 import inspect
@@ -20,8 +20,9 @@ Array = Any
 
 
 def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
-    """Return nested tuples and dictionaries of arrays with some entries of their last axis, each an array of its own,
-    or with one entry, without that axis.
+    """Select entries of the last axis of nested tuples and dictionaries of arrays, as new arrays.
+
+    One number selects one entry, without that axis.
     """
     if part is None:
         return None
@@ -34,20 +35,22 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
 
 
 def takes_problem(maker: Any) -> bool:
-    """Whether a class or function is given the problem: its first argument has no default, or is called so."""
+    """Return whether a class or function takes the problem: its first argument has no default, or is named task or
+    model.
+    """
     try:
         first = next(iter(inspect.signature(maker).parameters.values()), None)
-    except ValueError:  # of a class that is compiled
+    except ValueError:  # for a compiled class
         return True
     return first is not None and (first.default is first.empty or first.name in ("task", "model"))
 
 
 READINGS = ("z", "zk", "y", "meas", "measurement", "obs", "observation")
-"""Names of what the ``update`` of a filter of one track takes first; its own state is in the object."""
+"""Names of the first argument of ``update`` of a single-track filter, whose object contains its state."""
 
 
 def check_update_order(found: Any) -> None:
-    """Raise ValueError if the names of what ``update`` takes put the memory behind the measurement, or have none."""
+    """Raise ValueError if the arguments of ``update`` have the memory after the measurement, or no memory."""
     try:
         names = [name for name in inspect.signature(found.update).parameters if name != "self"]
     except (AttributeError, TypeError, ValueError):  # without one, or compiled
@@ -59,20 +62,20 @@ def check_update_order(found: Any) -> None:
         )
     if names and names[0].lower() in READINGS:
         raise ValueError(
-            f"update({', '.join(names)}) is of a filter that knows one track, and here N tracks run side by side: put "
+            f"update({', '.join(names)}) is of a single-track filter, but N tracks run side by side: put "
             "it behind filtergym.adapters.SingleTrackEstimator, whose begin(initial), step(track, measurement) and "
             "estimate(track) call yours (docs/adapters.md)"
         )
 
 
 class SingleTrackEstimator(ABC):
-    """Base of estimators that know one track only: an :class:`.Estimator` that keeps an object for each episode.
+    """Base of single-track estimators: an :class:`.Estimator` with an object for each episode.
 
-    Subclasses say how a track begins, what a measurement does to it and what it estimates. They may change a track
-    in place. Those that draw numbers seed them for each track, so that an episode is the same in any company.
+    Subclasses define how a track begins, how a measurement updates it and what it estimates. They may change a track in
+    place. Those with random numbers must seed them for each track, so that an episode does not depend on the others.
 
     Args:
-        task: as ``self.task``; ``task.parameters`` holds every constant.
+        task: stored as ``self.task``; ``task.parameters`` contains every constant.
 
     Raises:
         ValueError: if ``state`` lacks a component of the task.
@@ -80,8 +83,8 @@ class SingleTrackEstimator(ABC):
 
     kind: ClassVar[Literal["estimator"]] = "estimator"
     state: Sequence[str] = ()
-    """Names of the numbers of the estimator's state, in its order: the task's components in any order, and whatever
-    else there is. Default: the task's components in theirs."""
+    """Names of the numbers of the estimator's state, in order: the task's components in any order, and any others.
+    Default: the task's components in their order."""
 
     def __init__(self, task: "Task") -> None:
         self.task = task
@@ -101,15 +104,15 @@ class SingleTrackEstimator(ABC):
 
         Args:
             initial: the initial estimate, without the axis of episodes; ``mean`` ``(n,)`` and ``covariance``
-                ``(n, n)`` are those of ``state``, zero for what is no component of the task.
+                ``(n, n)`` are those of ``state``, zero for numbers that are no component of the task.
         """
 
     @abstractmethod
     def step(self, track: Any, measurement: Any) -> Any:
-        """Predict to the time of a measurement and take it in.
+        """Predict to the time of a measurement and update with it.
 
         Args:
-            track: what :meth:`begin` or the last call returned.
+            track: as returned by :meth:`begin` or the last call.
             measurement: the task's ``Measurement``, without the axis of episodes.
 
         Returns:
@@ -118,21 +121,21 @@ class SingleTrackEstimator(ABC):
 
     @abstractmethod
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """Mean, n numbers, and covariance, ``(n, n)``, of ``state``."""
+        """Return the mean, n numbers, and covariance, ``(n, n)``, of ``state``."""
 
     def reading(self, measurement: Any) -> tuple[Array, Array]:
-        """What is measured of a linear function of the state, ``(m,)`` or None, and its covariance, ``(m, m)``.
+        """Return the measurement of a linear function of the state, ``(m,)`` or None, and its covariance, ``(m, m)``.
 
-        Here the position, for tasks whose measurement has ``position`` and ``variance``; None where it is not
+        By default the position, for tasks whose measurement has ``position`` and ``variance``; None where it is not
         ``available``.
 
         Raises:
-            ValueError: if it has not.
+            ValueError: if the measurement lacks these fields.
         """
         if not hasattr(measurement, "position") or not hasattr(measurement, "variance"):
             raise ValueError(
-                f"{self.task.id} measures {', '.join(measurement._fields)}: {type(self).__name__} must say by a method "
-                "`reading` or `step` what that means"
+                f"{self.task.id} measures {', '.join(measurement._fields)}: {type(self).__name__} must define a method "
+                "`reading` or `step` for it"
             )
         missed = getattr(measurement, "available", 1.0) == 0.0
         return None if missed else measurement.position, numpy.diag(measurement.variance)
@@ -150,7 +153,7 @@ class SingleTrackEstimator(ABC):
         return tracks
 
     def update(self, memory: list[Any], measurement: Any) -> tuple[Array, Array, list[Any]]:
-        """Ask every track in turn; see :meth:`.Estimator.update`."""
+        """Update every track in turn; see :meth:`.Estimator.update`."""
         tracks, estimates = [], []
         for lane, track in enumerate(memory):
             moved = self.step(track, select_lanes(measurement, lane))
@@ -160,7 +163,7 @@ class SingleTrackEstimator(ABC):
         return numpy.stack(means, axis=-1), numpy.stack(covariances, axis=-1), tracks
 
     def _components(self, track: Any) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Mean and covariance of the task's components."""
+        """Return the mean and covariance of the task's components."""
         mean, covariance = (numpy.asarray(part, dtype=float) for part in self.estimate(track))
         n = len(self.state)
         if mean.size != n or covariance.shape != (n, n):
@@ -172,12 +175,13 @@ class SingleTrackEstimator(ABC):
 
 
 class FilterpyEstimator(SingleTrackEstimator):
-    """Filters of filterpy: KalmanFilter, ExtendedKalmanFilter, UnscentedKalmanFilter, IMMEstimator.
+    """Base of estimators by filters of filterpy: KalmanFilter, ExtendedKalmanFilter, UnscentedKalmanFilter,
+    IMMEstimator.
 
     Subclasses return in :meth:`begin` a filter whose ``x`` and ``P`` are at the start of the track, of an IMMEstimator
-    those of each of its filters. Where measurements come at irregular times :meth:`predict` says what that means. Where
-    a measurement is more than :meth:`reading` and the filter's H, such as
-    with a control or in an ExtendedKalmanFilter, they define :meth:`step` in filterpy's own calls.
+    those of each of its filters. For measurements at irregular times subclasses define :meth:`predict`. Where a
+    measurement is more than :meth:`reading` and the filter's H, such as with a control or in an ExtendedKalmanFilter,
+    they define :meth:`step` in filterpy's own calls.
     """
 
     def step(self, track: Any, measurement: Any) -> None:
@@ -189,7 +193,7 @@ class FilterpyEstimator(SingleTrackEstimator):
         if z is not None:
             track.update(z)
         elif hasattr(track, "filters"):
-            # filterpy takes over the predicted probabilities of its modes in an update only.
+            # filterpy stores the predicted probabilities of its modes only in an update.
             track.mu = track.cbar.copy()
             track._compute_mixing_probabilities()
             track._compute_state_estimate()
@@ -199,7 +203,7 @@ class FilterpyEstimator(SingleTrackEstimator):
 
         Args:
             track: filter of filterpy.
-            interval: s since the measurement before; None where the measurement does not say.
+            interval: s since the measurement before; None where the measurement does not contain it.
 
         Raises:
             ValueError: for another interval: a subclass sets F and Q for it first, or ``dt`` of an unscented filter.
@@ -208,10 +212,10 @@ class FilterpyEstimator(SingleTrackEstimator):
         if interval is not None and usual is not None and not math.isclose(interval, usual, rel_tol=1e-9):
             raise ValueError(
                 f"{type(self).__name__} predicts over {usual:g} s, and a measurement comes after {interval:g} s: it "
-                "must say by a method `predict(track, interval)` what that means"
+                "must define a method `predict(track, interval)` for that"
             )
         track.predict()
 
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """``x`` and ``P``."""
+        """Return ``x`` and ``P``."""
         return track.x, track.P

@@ -1,8 +1,8 @@
-"""A competitor that answers with estimates from a file: what any other program has made of the same measurements.
+"""Estimates in a file as a competitor: those of any other program on the same measurements.
 
-A row of the file belongs to a measurement by its track and its time. Where there is none for a measurement the last row
-before it is held, as whoever listens to that program would have to, and counted; before the first row the initial
-estimate stands. Soon after the last row of a track the episode is lost.
+A row of the file belongs to a measurement by its track and its time. A measurement without a row has the estimate of
+the last row before it, as a user of that program would have, and is counted; before the first row the initial estimate
+applies. Soon after the last row of a track the episode is lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,22 +20,22 @@ from ..storage.estimate_tables import EstimateTable, read_estimates
 from .kinds import Competitor
 
 SAME_TIME = 1e-3
-"""s, within which a row is of a measurement; at most a quarter of the time between two."""
+"""Largest difference of the times of a row and its measurement, s; at most a quarter of the time between two."""
 ENDED = 10
-"""Sampling intervals after the last row of a track from which on it is lost: some programs answer less often."""
+"""Sampling intervals after the last row of a track, after which it is lost: some programs estimate less often."""
 LEAST_SHARE = 0.5
-"""Of the measurements, that must have a row: with fewer the times are of another clock, or of another log."""
+"""Least share of measurements with a row: with fewer the times belong to another clock or another log."""
 SINCE_FIRST = "since its first measurement"
-"""Name of the clock that begins with a log, in errors."""
+"""Name in errors of the clock that starts with a log."""
 SHOWN = 5
-"""Names of tracks in an error."""
+"""Number of names of tracks in an error."""
 
 
 class FileEstimates:
-    """What makes a competitor of a file of estimates, see :mod:`..storage.estimate_tables`.
+    """Maker of a competitor from a file of estimates, see :mod:`..storage.estimate_tables`.
 
     Args:
-        path: of the file.
+        path: path of the file.
     """
 
     kind = "estimator"
@@ -51,7 +51,8 @@ class FileEstimates:
             tracks: name of each by the seed of its episode.
 
         Raises:
-            ValueError: if it cannot be read, is of other tracks or another clock, or does not say what an error costs.
+            ValueError: if it cannot be read, has other tracks or another clock, or lacks components that the cost
+                needs.
         """
         name = str(self.path)
         table = read_estimates(self.path, [component.name for component in task.components])
@@ -66,9 +67,7 @@ class FileEstimates:
         nothing = numpy.where(table.known, 0.0, numpy.nan)[:, None] + numpy.zeros(8)
         if task.has_truth and not numpy.isfinite(task.world.error_cost(nothing)).all():
             missing = [c.name for c, there in zip(task.components, table.known, strict=True) if not there]
-            raise ValueError(
-                f"{name} holds no {', '.join(missing)}, without which {task.id} does not say what an error costs"
-            )
+            raise ValueError(f"{name} lacks {', '.join(missing)}, which the cost of {task.id} needs")
         return TrackEstimates(table, dict(tracks), _recorded_times(task, table, name))
 
 
@@ -78,19 +77,19 @@ class TrackEstimates(NamedTuple):
     table: EstimateTable
     tracks: Mapping[int, str]
     times: Mapping[str, numpy.ndarray] | None
-    """Of the measurements of a recording by its tracks, s by the clock of the file; None of a simulation."""
+    """Times of the measurements of a recording by its tracks, s by the clock of the file; None for a simulation."""
     kind: str = "estimator"
 
     def of_episodes(self, task: Task, seeds: Sequence[int]) -> "FileTrack":
-        """Return the filter that answers in the episodes of these seeds."""
+        """Return the filter for the episodes of these seeds."""
         return FileTrack(task, self, [self.tracks[seed] for seed in seeds])
 
 
 def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, numpy.ndarray] | None:
-    """Times of the measurements of a recording by the clock of the estimates, of each track.
+    """Return the times of the measurements of a recording by the clock of the estimates, of each track.
 
-    Seconds may count from the first measurement of the log, or be those of the log: the clock by which most
-    measurements have a row is taken.
+    Seconds may count from the first measurement of the log, or be those of the log: the clock with which most
+    measurements have a row applies.
 
     Raises:
         ValueError: if the estimates are of another clock, or fewer than half of the measurements have a row.
@@ -100,7 +99,7 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
     recording = task.recording
     if recording is None:
         if table.clock != "seconds":
-            raise ValueError(f"the times of {name} are {table.clock}, and those of a simulation seconds")
+            raise ValueError(f"the times of {name} are {table.clock}, but those of a simulation are seconds")
         _check_simulated(task, table, name)
         return None
     log_clock, clocks = "seconds", {}
@@ -112,7 +111,8 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
         log_clock = found[0][1]
         clocks["by the log"] = {track: time for track, _, time in found}
     if table.clock in ("seconds", "log"):
-        # Of a log in seconds either may be meant; a column with the name of the log's time means that.
+        # For a log in seconds both clocks are possible; a column with the name of the log's time decides for the log's
+        # clock.
         since = recording.seconds + recording.started[:, None]
         elapsed = zip(recording.names, since, recording.rows, strict=True)
         clocks = {
@@ -129,15 +129,15 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
     if shares[best] < LEAST_SHARE:
         spans = (f"{_span([*times.values()], table.clock)} {which}" for which, times in clocks.items())
         raise ValueError(
-            f"{100.0 * shares[best]:.0f} % of the measurements have a row in {name} within {tolerance:.3g} s, and "
-            f"{100.0 * LEAST_SHARE:.0f} % must: its times go from {_span([table.time], table.clock)}, those of the "
-            f"log from {', or from '.join(spans)}"
+            f"{100.0 * shares[best]:.0f} % of the measurements have a row in {name} within {tolerance:.3g} s, "
+            f"but {100.0 * LEAST_SHARE:.0f} % must have one: its times are from {_span([table.time], table.clock)}, "
+            f"those of the log from {', or from '.join(spans)}"
         )
     return clocks[best]
 
 
 def _tolerance(task: Task) -> float:
-    """Time within which a row is of a measurement, s."""
+    """Return the largest difference of the times of a row and its measurement, s."""
     return min(SAME_TIME, 0.25 * _usual_interval(task))
 
 
@@ -152,19 +152,19 @@ def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
     end = (task.horizon + 1) * _usual_interval(task)
     if numpy.mean((table.time >= 0.0) & (table.time <= 2.0 * end)) < LEAST_SHARE:
         raise ValueError(
-            f"the times of {name} go from {_span([table.time], 'seconds')}, and those of an episode from 0 to {end:g} s"
+            f"the times of {name} are from {_span([table.time], 'seconds')}, those of an episode from 0 to {end:g} s"
         )
 
 
 def _span(times: Sequence[numpy.ndarray], clock: str) -> str:
-    """First and last time, in words."""
+    """Return the first and last time, in words."""
     return " to ".join(
         describe_time(clock, time) for time in (min(t.min() for t in times), max(t.max() for t in times))
     )
 
 
 def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], tolerance: float) -> float:
-    """Share of the measurements of all tracks that have a row."""
+    """Return the share of the measurements of all tracks that have a row."""
     found = total = 0
     for track, time in times.items():
         rows = numpy.sort(table.time if {*table.track} == {""} else table.time[table.track == track])
@@ -175,14 +175,14 @@ def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], toler
 
 
 class FileState(NamedTuple):
-    """Where the episodes are."""
+    """Positions of the episodes in the file."""
 
     measurements: int
-    """So far."""
+    """Number of measurements so far."""
     seconds: numpy.ndarray
-    """Time of the last, ``(N,)``."""
+    """Time of the last measurement, s, ``(N,)``."""
     row: numpy.ndarray
-    """Of the file, that is the estimate, ``(N,)``; -1 before the first."""
+    """Row of the file with the estimate, ``(N,)``; -1 before the first."""
     missing: numpy.ndarray
     """One where the file has no row for this measurement, ``(N,)``."""
     over: numpy.ndarray
@@ -191,12 +191,12 @@ class FileState(NamedTuple):
 
 
 class FileTrack(Filter[Task, Any, FileState]):
-    """A filter that answers with the rows of a file.
+    """A filter whose estimates are the rows of a file.
 
     Args:
         task: the estimation problem.
-        given: the rows.
-        names: of the track of each episode.
+        given: estimates of the file.
+        names: name of the track of each episode.
     """
 
     in_python = True
@@ -210,7 +210,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         held = {name: numpy.flatnonzero(table.track == name) for name in {*names}}
         if {*table.track.tolist()} == {""}:
             held = {name: numpy.arange(len(table.time)) for name in held}
-        # All rows one after another, each track in a stretch of time of its own, so that one search finds all.
+        # All rows in one array, each track in a separate interval of time, so that one search finds all.
         self._begin = float(table.time.min(initial=0.0))
         self._span = float(table.time.max(initial=0.0)) - self._begin + 2.0
         order, keys, self._last = [], [], []
@@ -224,7 +224,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         self._interval, self._tolerance = _usual_interval(task), _tolerance(task)
 
     def start(self, initial: Any) -> FileState:
-        """Nothing is measured yet."""
+        """Return the state before the first measurement."""
         width = initial.mean.shape[-1]
         none = numpy.zeros(width)
         return FileState(0, none, numpy.full(width, -1), none, none, initial)
@@ -243,7 +243,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         return FileState(state.measurements + 1, seconds, row, 1.0 - fresh, 1.0 * over, state.initial)
 
     def _times(self, state: FileState, measurement: Any) -> numpy.ndarray:
-        """Times of the measurements, s by the clock of the file."""
+        """Return the times of the measurements, s by the clock of the file."""
         width = measurement[0].shape[-1]
         if self.given.times is None:
             interval = getattr(measurement, "interval", None)
@@ -258,24 +258,24 @@ class FileTrack(Filter[Task, Any, FileState]):
         return numpy.array(now)[numpy.minimum(numpy.arange(width), len(now) - 1)]
 
     def mean(self, state: FileState) -> Array:
-        """That of the row."""
+        """Return the mean in the row."""
         unknown = ~numpy.array(self.given.table.known)[:, None]
         initial = numpy.where(unknown, numpy.nan, state.initial.mean)
         return numpy.where(state.row >= 0, self.given.table.mean[:, state.row], initial)
 
     def covariance(self, state: FileState) -> Array:
-        """Likewise; NaN where none is stated."""
+        """Return the covariance in the row; NaN where the file states none."""
         unknown = ~numpy.logical_and.outer(*2 * [self.given.table.deviations])[:, :, None]
         initial = numpy.where(unknown, numpy.nan, state.initial.covariance)
         return numpy.where(state.row >= 0, self.given.table.covariance[..., state.row], initial)
 
     def records(self, state: FileState, measurement: Any) -> dict[str, Array]:
-        """What the file tells of the measurement, and whether it has a row for it."""
-        told = {
+        """Return the file's numbers about the measurement, and whether it has a row for it."""
+        numbers = {
             name: numpy.where(state.missing > 0.0, numpy.nan, values[state.row])
             for name, values in self.given.table.likelihood.items()
         }
-        return {**told, "missing": state.missing, "lost": state.over * NO_ROW}
+        return {**numbers, "missing": state.missing, "lost": state.over * NO_ROW}
 
 
 def find_estimates(name: str, path: str, problem: Any, find: Any) -> Competitor:

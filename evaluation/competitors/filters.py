@@ -1,8 +1,8 @@
-"""Competitors as filters: what puts an estimator, a reference or a bound in the place of a task's bank.
+"""Adapters that put an estimator, a reference or a bound in the place of a task's bank.
 
-What ships is a filter. What a user brings becomes one here (:func:`as_filter`): it is compiled like a bank if it says
-that it is ``traceable``. The rest runs as Python code between compiled steps of the world, and keeps its memory to
-itself: it may be anything.
+Shipped estimators are filters. :func:`as_filter` makes a filter from a user's estimator, which is compiled like a bank
+if it is declared ``traceable``. Other estimators run as Python code between compiled steps of the world, and their
+memory may be any object.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,53 +21,53 @@ from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
 from .adapters import select_lanes
-from .kinds import TOLD_MORE, Kind, check_competitor, compilation_key, is_program, make_competitor
+from .kinds import INFORMED_KINDS, Kind, check_competitor, compilation_key, is_program, make_competitor
 
 AFTER_MISSED = 5.0
-"""Number of the reason among :data:`..storage.dataset.FAULTS` that a missed measurement explains."""
-UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
-"""What starts and updates with nothing but the initial estimate and the measurements."""
+"""Number among :data:`..storage.dataset.FAULTS` of the reason that a missed measurement explains."""
+TRUTH_FREE_KINDS: tuple[Kind, ...] = ("estimator", "smoother")
+"""Kinds that use only the initial estimate and the measurements."""
 
 
-class Adapted(NamedTuple):
-    """State of what a user brings."""
+class AdaptedState(NamedTuple):
+    """State of a user's estimator, reference or bound."""
 
     mean: Array
-    """``(C, N)``."""
+    """Mean of the components, ``(C, N)``; of a bound its limit."""
     covariance: Array
-    """``(C, C, N)``; None of a bound."""
+    """Covariance of the components, ``(C, C, N)``; None for a bound."""
     memory: Any
-    """Its own, or None where that is kept in Python."""
+    """Memory of the estimator, or None where Python code stores it."""
     likelihood: Likelihood
-    """Of the last measurement, NaN where it is not told."""
+    """Log-likelihood of the last measurement; NaN where the estimator returns none."""
 
 
-class Adapter(Filter[Task, Any, Adapted]):
+class Adapter(Filter[Task, Any, AdaptedState]):
     """A user's estimator as a filter, see :class:`.kinds.Estimator`.
 
     Args:
         task: the estimation problem.
-        own: the estimator, made for it.
+        own: the estimator, made for the task.
     """
 
     def __init__(self, task: Task, own: Any) -> None:
         super().__init__(task)
         self.own = own
         self.in_python: bool = not getattr(own, "traceable", False)
-        self.tells: bool = False
-        """Whether it has told how well it predicted, ever."""
+        self.has_likelihood: bool = False
+        """Whether the estimator has ever returned a log-likelihood."""
 
-    def start(self, initial: Any) -> Adapted:
-        """Start where everyone starts."""
+    def start(self, initial: Any) -> AdaptedState:
+        """Start from the initial estimate."""
         return self.first(initial, self.own.start(initial, initial.mean.shape[-1]))
 
-    def first(self, initial: Any, memory: Any) -> Adapted:
-        """State before the first measurement."""
-        return Adapted(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
+    def first(self, initial: Any, memory: Any) -> AdaptedState:
+        """Return the state before the first measurement."""
+        return AdaptedState(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: Adapted, given: FilterInput) -> Adapted:
-        """Take its answer."""
-        answer = self.ask(given, state.memory)
+    def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
+        """Update the estimator."""
+        answer = self.call_update(given, state.memory)
         if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
             count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
             raise TypeError(
@@ -77,21 +77,21 @@ class Adapter(Filter[Task, Any, Adapted]):
         mean, covariance, memory, *reported = answer
         likelihood = state.likelihood
         if reported:
-            self.tells, likelihood = True, Likelihood.of(*reported)
+            self.has_likelihood, likelihood = True, Likelihood.of(*reported)
             likelihood = likelihood if self.in_python else likelihood.fill_unknown(mean[0])
-        return Adapted(mean, covariance, memory, likelihood)
+        return AdaptedState(mean, covariance, memory, likelihood)
 
     @property
     def fault(self) -> int:
-        """Number of the reason among ``FAULTS`` for which it has no answer at all, as a program may have; 0: none."""
+        """Number among ``FAULTS`` of the reason for a missing response, as of a program; 0: none."""
         return getattr(self.own, "fault", 0)
 
-    def ask(self, given: FilterInput, memory: Any) -> Any:
-        """Its answer to a measurement."""
+    def call_update(self, given: FilterInput, memory: Any) -> Any:
+        """Call the estimator's ``update``."""
         return self.own.update(memory, given.measurement)
 
-    def smooth(self, measurements: Sequence[Any], states: Sequence[Adapted]) -> tuple[Array, Array]:
-        """Smooth the track, of a smoother."""
+    def smooth(self, measurements: Sequence[Any], states: Sequence[AdaptedState]) -> tuple[Array, Array]:
+        """Smooth the track by the smoother's method ``smooth``."""
         answer: tuple[Array, Array] = self.own.smooth(measurements, [state.memory for state in states])
         return answer
 
@@ -103,45 +103,45 @@ class ReferenceAdapter(Adapter):
         super().__init__(task, own)
         self.knows: str = getattr(own, "knows", "") or "the truth"
 
-    def initialise(self, given: FilterInput) -> Adapted:
-        """Start where everyone starts, with the truth."""
+    def initialise(self, given: FilterInput) -> AdaptedState:
+        """Start from the initial estimate, with the truth."""
         return self.first(given.measurement, self.own.start(given.measurement, given.truth))
 
-    def ask(self, given: FilterInput, memory: Any) -> Any:
-        """Its answer to a measurement and the truth."""
+    def call_update(self, given: FilterInput, memory: Any) -> Any:
+        """Call the reference's ``update`` with the truth."""
         return self.own.update(memory, given.measurement, given.truth)
 
 
 class BoundAdapter(ReferenceAdapter):
     """A bound as a filter whose mean is the limit, see :class:`.kinds.Bound`."""
 
-    def first(self, initial: Any, memory: Any) -> Adapted:
-        """Nothing is known before the first measurement."""
-        return Adapted(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
+    def first(self, initial: Any, memory: Any) -> AdaptedState:
+        """Return the state before the first measurement, with an infinite limit."""
+        return AdaptedState(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
 
-    def ask(self, given: FilterInput, memory: Any) -> Any:
-        """Its limit, without a covariance."""
-        limit, memory = super().ask(given, memory)
+    def call_update(self, given: FilterInput, memory: Any) -> Any:
+        """Call the bound's ``update``; there is no covariance."""
+        limit, memory = super().call_update(given, memory)
         return limit, None, memory
 
 
 def as_filter(task: Task, own: Any, kind: Kind = "estimator") -> Filter[Any, Any, Any]:
-    """Return what was made for a task as a filter: itself, if it is one."""
+    """Return an estimator, reference or bound as a filter: itself, if it is one."""
     if isinstance(own, Filter):
         return own
     adapters = {"reference": ReferenceAdapter, "bound": BoundAdapter}
     return adapters.get(kind, Adapter)(task, own)
 
 
-class HeldInPython(Filter[Task, Any, Adapted]):
-    """A filter asked in Python: its state stays here, and may be anything; its answers are checked.
+class PythonFilter(Filter[Task, Any, AdaptedState]):
+    """A filter that runs in Python: this object stores its state, which may be anything, and checks its estimates.
 
     Args:
         task: the estimation problem.
         own: the filter; None beside traced steps.
-        name: what it is and its name, in errors.
-        count: number of episodes; lanes beyond are given the last of them. None: all lanes as they are.
-        stated: what it states, where ``own`` is None.
+        name: kind and name, in errors.
+        count: number of episodes; lanes beyond repeat the last of them. None: all lanes as they are.
+        stated: the reported quantities, where ``own`` is None.
     """
 
     in_python = True
@@ -161,48 +161,49 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         self.stated: Stated | None = getattr(own, "stated", stated)
         self.memory: Any = None
         self.step_number: int = 0
-        self.told: Mapping[str, Array] = {}
-        """What it has said beside its last estimate."""
+        self.extra: Mapping[str, Array] = {}
+        """Log-likelihood returned with its last estimate."""
         self.knows: str = getattr(own, "knows", "")
 
     @property
     def fault(self) -> int:
-        """Number of the reason among ``FAULTS`` for which a program has no answer at all; 0: it has."""
+        """Number among ``FAULTS`` of the reason for a program's missing response; 0: none."""
         return self.own.fault if isinstance(self.own, Adapter) else 0
 
     def _repeat_last(self, given: FilterInput) -> FilterInput:
-        """Copies, which may be changed in place."""
+        """Return the copies, which may be changed in place."""
         if self.count is None:
             return given
         width = given.measurement[0].shape[-1]
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
         return given._replace(measurement=select_lanes(given.measurement, lanes))
 
-    def initialise(self, given: FilterInput) -> Adapted:
-        """Keep its state."""
+    def initialise(self, given: FilterInput) -> AdaptedState:
+        """Start the filter and store its state."""
         with explain_errors(f"{self.name} failed at the start of the track"):
             self.memory = self.own.initialise(self._repeat_last(given))
         initial = given.measurement
-        return Adapted(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
+        return AdaptedState(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
 
-    def start(self, initial: Any) -> Adapted:
-        """Start without the truth."""
+    def start(self, initial: Any) -> AdaptedState:
+        """Start from the initial estimate, without the truth."""
         return self.initialise(FilterInput(initial))
 
-    def update(self, state: Adapted, given: FilterInput) -> Adapted:
-        """Its answer.
+    def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
+        """Update the filter and check its estimate.
 
         Raises:
-            ValueError: if what it answers is no array of the right shape.
+            ValueError: if its estimate is no array of the right shape.
         """
         self.step_number += 1
         given = self._repeat_last(given)
         with explain_errors(f"{self.name} failed at measurement {self.step_number}"):
             self.memory = after = self.own.step(self.memory, given)
             mean, covariance = self.own.mean(after), self.own.covariance(after)
-            self.told = self.own.records(after, given.measurement)
+            self.extra = self.own.records(after, given.measurement)
         C, width = len(self.task.components), given.measurement[0].shape[-1]
-        # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
+        # Copies, since the estimator may change its own arrays; in their layout, on which rounding in matrix products
+        # depends.
         mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
         if covariance is None:  # of a bound
             covariance = state.covariance
@@ -210,21 +211,21 @@ class HeldInPython(Filter[Task, Any, Adapted]):
             covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
         known = (
             None if values is None else self._numbers(name, values, (width,))
-            for name, values in Likelihood.told(self.told)._asdict().items()
+            for name, values in Likelihood.of_records(self.extra)._asdict().items()
         )
-        return Adapted(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
+        return AdaptedState(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
 
-    def feedback(self, state: Adapted, measurement: Any) -> Array | None:
-        """What a program has reported to steer the world."""
+    def feedback(self, state: AdaptedState, measurement: Any) -> Array | None:
+        """Return the feedback that a program has reported."""
         own: Any = self.own.own if isinstance(self.own, Adapter) else None
         return own.feedback if is_program(own) else None
 
     def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
-        """Return what was answered as float64, or raise ValueError if it has another shape."""
+        """Return an array of the estimate as float64; raise ValueError if it has another shape."""
         where = f"{self.name}: the {word} at measurement {self.step_number}"
         try:
             given = numpy.asanyarray(values)
-            # What float64 has no room for would vanish in it: masks, imaginary parts, words.
+            # float64 would drop masks, imaginary parts and words.
             if isinstance(given, numpy.ma.MaskedArray) or given.dtype.kind not in "fiub":
                 masked = "a masked array of " * isinstance(given, numpy.ma.MaskedArray)
                 raise TypeError(f"expected an array of real numbers, got {masked}{given.dtype}")
@@ -241,28 +242,29 @@ class HeldInPython(Filter[Task, Any, Adapted]):
 
 
 class Checked(NamedTuple):
-    """State of a filter whose answers are checked."""
+    """State of a filter whose estimates are checked."""
 
     own: Any
-    """Of the filter."""
+    """State of the filter."""
     mean: Array
-    """Last valid answer, ``(C, N)``; before any the initial estimate."""
+    """Last valid mean, ``(C, N)``; before the first the initial estimate."""
     covariance: Array
     """``(C, C, N)``."""
     fault: Array
-    """Number of the reason among ``FAULTS`` why the episode is lost, from 1 on; 0 where it is not, ``(N,)``."""
+    """Number among ``FAULTS`` of the reason why the episode is lost, from 1 on; 0 where it is not, ``(N,)``."""
     missed: Array
     """One where a measurement was not received in full so far, ``(N,)``."""
     missing: Array = None
-    """One where it has no estimate of this measurement and holds its last one, ``(N,)``; None of what always has."""
+    """One where it has no estimate at this measurement and repeats its last one, ``(N,)``; None for filters that always
+    have."""
 
 
 class CheckedFilter(Filter[Task, Any, Checked]):
-    """A filter in the loop that competes: it never sees what was not received, and its answers are checked.
+    """A competing filter in the loop: missing measurements are masked, and its estimates are checked.
 
-    An episode in which an answer is not finite, or no covariance, is lost from that measurement on: the last valid
-    answer, or else the initial estimate, is held to the end. Any estimator could give that answer itself, so
-    that losing an episode is no advantage.
+    An episode in which an estimate is not finite, or its covariance is invalid, is lost from that measurement on: the
+    last valid estimate, or else the initial one, is repeated to the end. Any estimator could return that estimate
+    itself, so losing an episode is no advantage.
     """
 
     def __init__(self, task: Task, own: Filter[Any, Any, Any]) -> None:
@@ -272,32 +274,32 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         self.stated: Stated | None = own.stated
 
     def start(self, initial: Any) -> Checked:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         zero = 0.0 * initial.mean[0]
         missing = None if self.stated is None else zero
         return Checked(self.own.start(initial), initial.mean, initial.covariance, zero, zero, missing)
 
     def predict(self, state: Checked, measurement: Any) -> Checked:
-        """Let it predict."""
+        """Predict in the filter."""
         return state._replace(own=self.own.predict(state.own, self.task.world.mask_missing(measurement)))
 
     def update(self, state: Checked, given: FilterInput) -> Checked:
-        """Check its answer, and keep the last valid one."""
+        """Update the filter, check its estimate, and store the last valid one."""
         received = self.task.world.mask_missing(given.measurement)
         own = self.own.update(state.own, FilterInput(received))
         mean, covariance = self.own.mean(own), self.own.covariance(own)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         before, missing = state.fault, None
-        if isinstance(self.own, HeldInPython):
-            before = numpy.where(before > 0.0, before, self.own.told.get("lost", float(self.own.fault)))
-            missing = self.own.told.get("missing")
+        if isinstance(self.own, PythonFilter):
+            before = numpy.where(before > 0.0, before, self.own.extra.get("lost", float(self.own.fault)))
+            missing = self.own.extra.get("missing")
         fault = find_fault(*self._stated(mean, covariance), before, missed, self.xp)
         lost = fault > 0.0
         mean = self._held(lost, state.mean, mean)
         return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed, missing)
 
     def _stated(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Mean and covariance with valid numbers in place of what is never stated."""
+        """Return the mean and covariance with valid numbers in place of components that the filter never reports."""
         if self.stated is None:
             return mean, covariance
         known, deviations = map(numpy.array, self.stated)
@@ -306,29 +308,29 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         return numpy.where(known[:, None], mean, 0.0), numpy.where(both, covariance, apart)
 
     def _held(self, lost: Array, last: Array, answer: Array) -> Array:
-        """The last valid answer where the episode is lost."""
-        if self.in_python:  # it is a copy, and keeps its layout, by which matrix products round
+        """Return the last valid estimate where the episode is lost."""
+        if self.in_python:  # a copy retains its layout, on which rounding in matrix products depends
             answer[..., lost] = last[..., lost]
             return answer
         return self.xp.where(lost, last, answer)
 
     def feedback(self, state: Checked, measurement: Any) -> Array | None:
-        """What a program reports, where that is a number and the episode not lost; else what the estimate says."""
-        own = self.own.feedback(state.own, measurement) if isinstance(self.own, HeldInPython) else None
+        """Return a program's feedback where it is a number and the episode not lost; elsewhere that of the estimate."""
+        own = self.own.feedback(state.own, measurement) if isinstance(self.own, PythonFilter) else None
         if own is None:
             return None
         usable = numpy.isfinite(own).all(axis=0) & (state.fault == 0.0)
         return numpy.where(usable, own, self.task.feedback(state.mean, state.covariance, measurement))
 
     def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
-        """How likely the measurement was, and why the episode is lost."""
-        told = Likelihood.told(self.own.records(state.own, measurement)).fill_unknown(state.fault)
+        """Return the log-likelihood of the measurement, and the reason why the episode is lost."""
+        likelihood = Likelihood.of_records(self.own.records(state.own, measurement)).fill_unknown(state.fault)
         missing = {} if state.missing is None else {"missing": state.missing}
-        return {**told._asdict(), "lost": state.fault, **missing}
+        return {**likelihood._asdict(), "lost": state.fault, **missing}
 
 
 def is_lacking(received: Any, xp: Any) -> Array:
-    """Return whether something in a measurement is NaN, ``(N,)``."""
+    """Return whether a measurement contains NaN, ``(N,)``."""
     lacking: Any = False
     for _, values in named_arrays(received):
         axes = tuple(range(len(values.shape) - 1))
@@ -338,24 +340,24 @@ def is_lacking(received: Any, xp: Any) -> Array:
 
 
 def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp: Any) -> Array:
-    """Return what is wrong with an estimate, or was before.
+    """Return the number of the fault of an estimate, or of an earlier one.
 
     Args:
         mean: ``(C, N)``.
         covariance: ``(C, C, N)``.
-        before: number of the reason why the episode was lost before, ``(N,)``.
-        missed: above zero where not everything was received so far, ``(N,)``.
+        before: number of the reason why the episode was lost earlier, ``(N,)``.
+        missed: above zero where a measurement was missing so far, ``(N,)``.
         xp: array namespace.
 
     Returns:
-        Numbers of :data:`..storage.dataset.FAULTS` from 1 on, zero where nothing is, ``(N,)``.
+        Numbers of :data:`..storage.dataset.FAULTS` from 1 on, zero without a fault, ``(N,)``.
     """
     finite = xp.all(xp.isfinite(mean), axis=0), xp.all(xp.isfinite(covariance), axis=(0, 1))
     identity = xp.eye(len(mean), dtype=xp.float64)[:, :, None]
     P = xp.where(finite[1], covariance, identity)
     with numpy.errstate(invalid="ignore", divide="ignore", over="ignore"):
         pivots = [row[-1] for row in cholesky(P)]
-        # A root of what is negative is NaN, and so is all that follows.
+        # The root of a negative number is NaN, and so are all results of it.
         definite = pivots[-1] > 0.0
         for pivot in pivots[:-1]:
             definite = definite & (pivot > 0.0)
@@ -374,25 +376,25 @@ class AroundBank(Filter[Task, Any, State]):
     """A filter in the loop whose estimate is that of a bank; its state, a NamedTuple, has the bank's as ``bank``.
 
     Attributes:
-        bank: what flies the loop.
+        bank: the bank whose estimate closes the loop.
     """
 
     bank: Any
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Predict in the bank."""
+        """Predict with the bank."""
         return state._replace(bank=self.bank.predict(state.bank, measurement))
 
     def mean(self, state: Any) -> Array:
-        """That of the bank."""
+        """Return the mean of the bank."""
         return self.bank.mean(state.bank)
 
     def covariance(self, state: Any) -> Array:
-        """That of the bank."""
+        """Return the covariance of the bank."""
         return self.bank.covariance(state.bank)
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """That of the bank."""
+        """Return the feedback of the bank."""
         return self.bank.feedback(state.bank, measurement)
 
 
@@ -400,9 +402,9 @@ class LimitState(NamedTuple):
     """State of a bound in the loop."""
 
     bank: Any
-    """Of the bank, which flies the loop."""
+    """State of the bank, whose estimate closes the loop."""
     own: Any
-    """Of the bound."""
+    """State of the bound."""
 
 
 class BoundFilter(AroundBank[LimitState]):
@@ -411,7 +413,7 @@ class BoundFilter(AroundBank[LimitState]):
     Args:
         task: the estimation problem.
         own: the bound as a filter.
-        bank: what flies the loop.
+        bank: the bank whose estimate closes the loop.
     """
 
     def __init__(self, task: Task, own: Filter[Any, Any, Any], bank: Any) -> None:
@@ -422,15 +424,15 @@ class BoundFilter(AroundBank[LimitState]):
         self.knows: str = own.knows or "the truth"
 
     def initialise(self, given: FilterInput) -> LimitState:
-        """Start where everyone starts, with the truth."""
+        """Start from the initial estimate, with the truth."""
         return LimitState(self.bank.start(given.measurement), self.own.initialise(given))
 
     def start(self, initial: Any) -> LimitState:
-        """Start without the truth."""
+        """Start from the initial estimate, without the truth."""
         return self.initialise(FilterInput(initial))
 
     def update(self, state: LimitState, given: FilterInput) -> LimitState:
-        """Compute the limit at this measurement."""
+        """Update the bank, and compute the limit at this measurement."""
         own = self.own.update(state.own, given)
         space, N = self.bank.action_space, self.own.mean(own).shape[-1]
         dtype = self.xp.int64 if isinstance(space, gymnasium.spaces.Discrete) else self.xp.float64
@@ -438,36 +440,36 @@ class BoundFilter(AroundBank[LimitState]):
         return LimitState(self.bank.act(state.bank, given.measurement, neutral), own)
 
     def records(self, state: LimitState, measurement: Any) -> dict[str, Array]:
-        """The limit."""
+        """Return the limit."""
         return {"mean_square": self.own.mean(state.own)}
 
 
-def surround(kind: Kind, model: Model, own: Filter[Any, Any, Any]) -> Filter[Any, Any, Any]:
-    """Return what runs in a model's loop: a competitor checked, a bound beside the bank, a reference as it is."""
+def wrap_for_loop(kind: Kind, model: Model, own: Filter[Any, Any, Any]) -> Filter[Any, Any, Any]:
+    """Return the filter for a loop: a competitor with checks, a bound beside the bank, a reference unchanged."""
     if kind == "bound":
         return BoundFilter(model.task, own, model.filter)
-    return CheckedFilter(model.task, own) if kind in UNTOLD else own
+    return CheckedFilter(model.task, own) if kind in TRUTH_FREE_KINDS else own
 
 
 @dataclass(frozen=True)
 class _Maker:
-    """Makes the filter of a competitor for a model; equal ones are traced once."""
+    """Maker of a competitor's filter for a model; equal makers are traced once."""
 
     kind: Kind
     maker: Any
-    """Of a competitor that can be traced; None of one that runs in Python."""
+    """Maker of a competitor that can be traced; None for one that runs in Python."""
     stated: Stated | None = None
-    """Of one that runs in Python."""
+    """Reported quantities of a competitor that runs in Python."""
 
     def __call__(self, model: Model) -> Filter[Any, Any, Any]:
-        """Make it, on any arrays."""
+        """Make the filter, on any arrays."""
         task = model.task
         own = (
-            HeldInPython(task, stated=self.stated)
+            PythonFilter(task, stated=self.stated)
             if self.maker is None
             else make_competitor(self.maker, task)
         )
-        return surround(self.kind, model, as_filter(task, own, self.kind))
+        return wrap_for_loop(self.kind, model, as_filter(task, own, self.kind))
 
 
 def _can_be_traced(maker: Any, own: Filter[Any, Any, Any]) -> bool:
@@ -481,16 +483,16 @@ def _can_be_traced(maker: Any, own: Filter[Any, Any, Any]) -> bool:
 
 
 def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
-    """Check that a reference or a bound says of every disturbance of the world that it knows it.
+    """Check that a reference or a bound declares every disturbance of the world.
 
     Args:
-        name: of it, in errors.
+        name: its name in errors.
         own: reference or bound, see :class:`.kinds.Reference`.
-        kind: which of them.
-        task: whose world it is.
+        kind: its kind.
+        task: task of the world.
 
     Raises:
-        ValueError: if it does not: a disturbance that is new would make it worse than who is told nothing.
+        ValueError: if it does not: a new disturbance could make it worse than estimators without that knowledge.
     """
     known = getattr(own, "disturbances", ())
     for part in task.world.disturbances.parts if known is not None else ():
@@ -501,7 +503,7 @@ def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
             )
 
 
-def put_in_loop(
+def close_loop(
     model: Model, competitor: Any, kind: Kind, name: str, count: int, last: int | None = None
 ) -> Model:
     """Return a model whose filter is a competitor.
@@ -509,18 +511,18 @@ def put_in_loop(
     Args:
         model: task with a bank.
         competitor: estimator, smoother, reference or bound, or a class or function that makes it.
-        kind: what it is.
-        name: of it, in errors.
+        kind: its kind.
+        name: its name in errors.
         count: number of episodes.
-        last: number of their last measurement; None: not known.
+        last: number of their last measurement; None: unknown.
 
     Raises:
-        ValueError: if it cannot be made, has not the methods of its kind, or is a reference that knows not all that may
-            happen.
+        ValueError: if it cannot be made, lacks a method of its kind, or is a reference that does not declare every
+            disturbance.
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):
         own = make_competitor(competitor, model.task)
-    if kind in TOLD_MORE:
+    if kind in INFORMED_KINDS:
         check_knowledge(name, own, kind, model.task)
     if is_program(own):
         own.tracks, own.last = count, last
@@ -531,6 +533,6 @@ def put_in_loop(
         except NotTraceable as error:
             warn_of(f"{name!r} of {model.task.id}", error)
     looped = model.with_filter(_Maker(kind, None, own.stated))
-    held = HeldInPython(model.task, own, f"{kind} {name!r}", count if kind in UNTOLD else None)
-    looped.filter = surround(kind, model, held)
+    held = PythonFilter(model.task, own, f"{kind} {name!r}", count if kind in TRUTH_FREE_KINDS else None)
+    looped.filter = wrap_for_loop(kind, model, held)
     return looped

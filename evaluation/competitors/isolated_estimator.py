@@ -1,19 +1,20 @@
-"""A process that cannot reach the one that runs it: of a program, or of a Python estimator behind a wall.
+"""Entry point of a sandboxed process, for a program or for a Python estimator.
 
-:mod:`.program_process` starts this file with the interpreter's ``-I -S``, the bytes of memory that it may take, and
-the words of a program (docs/programs.md), which is executed in a PID namespace: it sees no other process and ends with
-its first one, with all that it has begun. Without one, this process adopts what is left and ends that.
+:mod:`.program_process` starts this file with the interpreter's ``-I -S``, the limit of memory in bytes, and the words
+of a program (docs/programs.md). The program is executed in a PID namespace: it sees no other process, and all its
+processes end with the first. On a system without such namespaces this process adopts the remaining processes and ends
+them.
 
-Without words it serves an estimator. Its first line of input is a request in JSON: the source text of the estimator,
-or its file; the folders where libraries are; and what may be read at all. Then comes the hello. Of the package there
-is only what the request carries as text, ``filtergym.adapters``, which knows no world and no seed, so it does not
-matter how the package was installed. The rest cannot be imported. On Linux each layer closes what it can:
+Without words it runs an estimator. Its first line of input is a request in JSON: the source text of the estimator, or
+its file; the folders of libraries; and the paths that may be read. Then comes the hello. The only part of the package
+that can be imported is the text in the request, ``filtergym.adapters``, which contains no world and no seed; so the way
+in which the package was installed does not matter. On Linux three layers restrict the process:
 
 * namespaces (namespaces(7)) of the network, of System V and POSIX memory, and of processes;
 * Landlock (landlock(7)): it reads libraries and the folder of the estimator, and writes nothing;
-* a filter of system calls (seccomp(2)): what no table here names is refused, above all new processes.
+* a filter of system calls (seccomp(2)): calls outside the tables below fail, above all those for new processes.
 
-Elsewhere the package is only not on the path.
+On other systems the package is only missing from the path.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ if TYPE_CHECKING:
     from typing import Any, BinaryIO
 
 LANES = 8
-"""The number of episodes is filled up to a multiple, as the package does: rounding depends on it."""
+"""The number of episodes is filled up to a multiple of this, as in the package: rounding depends on it."""
 READ, LIST = 1 << 2, 1 << 3
-"""Rights of Landlock to read a file and to list a folder; those handled are all that a version knows."""
+"""Rights of Landlock to read a file and to list a folder."""
 RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
-"""Rights over files, by the version of Landlock; later ones have as many as the last."""
+"""Number of rights over files, by the version of Landlock; versions beyond the last have as many as the last."""
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
 """System calls."""
 NEW_USER, NEW_PID, NEW_OTHERS = 0x10000000, 0x20000000, 0x48000000
@@ -59,17 +60,20 @@ clock_gettime 228 113, clock_getres 229 114, clock_nanosleep 230 115, nanosleep 
 getrandom 318 278, rt_sigaction 13 134, rt_sigprocmask 14 135, rt_sigreturn 15 139, sigaltstack 131 132,
 restart_syscall 219 128, kill 62 129, tgkill 234 131, exit 60 93, exit_group 231 94
 """
-"""All that an estimator may call, with its numbers on both machines: reading, memory, threads, time and its own end."""
+"""System calls that an estimator may make, with their numbers on both machines: reading, memory, threads, time,
+exit."""
 ANY, WRITING, THREAD = 0xFFFFFFFF, os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0x10000
 """Bits of arguments: all, to open a file for writing, and to begin a thread instead of a process."""
 FORBIDDEN, MISSING, PERMITTED = 0x50001, 0x50026, 0x7FFF0000
-"""Answers of a filter: EPERM, ENOSYS, and the call."""
+"""Return values of a seccomp filter: EPERM, ENOSYS, and allow."""
 
 
 def enter_namespaces(libc: Any, wanted: int) -> bool:
-    """Give this process namespaces of its own, in one of users unless it may without; returns whether the system does.
+    """Enter namespaces of this process alone, and return whether the system permits it.
 
-    Its children are the first in one of processes.
+    A process without the privilege enters a namespace of users first.
+
+    Its first child is the first process in the namespace of processes.
     """
     user, group = os.getuid(), os.getgid()
     if libc.unshare(wanted) == 0:
@@ -84,13 +88,13 @@ def enter_namespaces(libc: Any, wanted: int) -> bool:
         try:
             with open(f"/proc/self/{name}", "w") as file:
                 file.write(words)
-        except OSError:  # it keeps its rights over files without
+        except OSError:  # without it the process retains its rights over files
             pass
     return True
 
 
 def leave_to_child(libc: Any, apart: bool) -> None:
-    """Go on as a child; this process waits for it, ends what it leaves behind, and then itself in the same way."""
+    """Continue as a child process; the parent waits for it, ends its remaining children, and exits with its status."""
     libc.prctl(ADOPT, 1, 0, 0, 0)
     if (child := os.fork()) == 0:
         libc.prctl(END_WITH_PARENT, KILL, 0, 0, 0)
@@ -150,12 +154,12 @@ def landlock_version() -> int:
 
 
 def restrict_files(libc: Any, version: int, readable: list[str], listable: list[str]) -> None:
-    """Let this process read some files and write none, by Landlock.
+    """Restrict this process by Landlock to reading some files and writing none.
 
     Args:
         libc: the C library.
-        version: of Landlock.
-        readable: files and folders that may be read, with all below them.
+        version: version of Landlock.
+        readable: files and folders that may be read, with everything below them.
         listable: folders of which the names may be read, with those of all folders below them.
     """
     rights = RIGHTS[min(version, max(RIGHTS))]
@@ -179,7 +183,7 @@ def restrict_files(libc: Any, version: int, readable: list[str], listable: list[
 
 
 def filter_calls(libc: Any) -> bool:
-    """Refuse this process all system calls but those of the table, for good; returns whether the system does."""
+    """Restrict this process permanently to the system calls of the table, and return whether the system supports it."""
     import struct
 
     column, machine = MACHINES.get(os.uname().machine, (0, 0))
@@ -190,7 +194,9 @@ def filter_calls(libc: Any) -> bool:
     # Of some calls words of their arguments: which, the bits that count, and what those may be.
     checks: dict[str, list[tuple[int, int, tuple[int, ...]]]] = {
         "clone": [(0, THREAD, (THREAD,))],
-        "fcntl": [(2, ANY, (0, 1, 2, 3, 4, 1030))],  # to duplicate, and flags; the others watch and signal
+        "fcntl": [
+            (2, ANY, (0, 1, 2, 3, 4, 1030))
+        ],  # duplicate and flags; other commands watch files and send signals
         "kill": [(0, ANY, own)],
         "open": [(2, WRITING, (0,))],
         "openat": [(4, WRITING, (0,))],
@@ -214,12 +220,12 @@ def filter_calls(libc: Any) -> bool:
 
 
 def wall(readable: list[str], listable: list[str], apart: bool) -> str:
-    """Close this process in, for good, and return what stays open, in one sentence; empty if nothing does.
+    """Restrict this process permanently, and return one sentence on what remains possible; empty if nothing does.
 
     Args:
-        readable: as of :func:`restrict_files`, likewise what follows.
-        listable: likewise.
-        apart: whether it is in namespaces of its own.
+        readable: files and folders that may be read, with everything below them.
+        listable: folders of which the names may be read, with those of all folders below them.
+        apart: whether the process is in namespaces of its own.
     """
     version, filtered = landlock_version(), False
     if sys.platform == "linux":
@@ -239,15 +245,17 @@ def wall(readable: list[str], listable: list[str], apart: bool) -> str:
     }
     without, could = ([name for name, closed in own.items() if not closed] for own in (missing, gaps))
     return (
-        f"no whole wall here, without {' and '.join(without)}: it could {', '.join(could)}" if could else ""
+        f"the isolation is incomplete, without {' and '.join(without)}: it could {', '.join(could)}"
+        if could
+        else ""
     )
 
 
 class SharedModules:
-    """Finds the modules of the package that a request carries as text, with the packages around them.
+    """Finder and loader of the modules that a request contains as text, and of the packages around them.
 
     Args:
-        texts: by the names of modules.
+        texts: source texts by the names of modules.
     """
 
     def __init__(self, texts: dict[str, str]) -> None:
@@ -262,7 +270,7 @@ class SharedModules:
         return self.new(name, self, is_package=around) if around or name in self.texts else None
 
     def create_module(self, spec: ModuleSpec) -> None:
-        """Leave it to Python to make a module."""
+        """Return None: Python makes the module."""
 
     def exec_module(self, module: ModuleType) -> None:
         """Run the text of a module; that of a package is empty."""
@@ -292,12 +300,12 @@ class Parameters:
         self.__dict__.update(values)
 
     def value(self, name: str) -> Any:
-        """Value of a constant."""
+        """Return the value of a constant."""
         return getattr(self, name)
 
 
 def make_task(hello: dict[str, Any], numpy: ModuleType) -> Any:
-    """Return what the constructor of an estimator is given in place of the task."""
+    """Return the object that the constructor of an estimator receives in place of the task."""
     from types import SimpleNamespace
 
     parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in hello["parameters"].items()}
@@ -313,7 +321,7 @@ def make_task(hello: dict[str, Any], numpy: ModuleType) -> Any:
 
 
 class Frames:
-    """Reads the frames that a hello announces."""
+    """Reader of the frames that a hello announces."""
 
     def __init__(self, hello: dict[str, Any], numpy: ModuleType, channel: BinaryIO) -> None:
         self.hello = hello
@@ -323,7 +331,7 @@ class Frames:
         self.lanes: int = -(-self.tracks // LANES) * LANES
 
     def read(self, name: str) -> Any:
-        """Return the next one as a NamedTuple of arrays ``(..., N)``, filled up by its last track; None at the end."""
+        """Return the next frame as a NamedTuple of arrays ``(..., N)``, padded with its last track; None at the end."""
         numpy, size = self.numpy, 8 * self.tracks * self.hello["numbers"][name]
         content = self.channel.read(size)
         if len(content) < size:
@@ -334,7 +342,7 @@ class Frames:
         place = 0
         for own in self.hello[name]:
             shape = own["shape"]
-            if shape is None:  # it is there in other scenarios
+            if shape is None:  # the field exists in other scenarios only
                 values[own["name"]] = None
                 continue
             count = int(numpy.prod(shape, dtype=int))
@@ -354,14 +362,14 @@ def load(request: dict[str, Any]) -> Any:
     exec(compile(request["source"], request["file"], "exec", dont_inherit=True), module.__dict__)
     found = getattr(module, request["name"], None)
     if not callable(getattr(found, "update", None)) or not callable(getattr(found, "start", None)):
-        raise TypeError(f"{request['name']!r} is no estimator, which has the methods start and update")
+        raise TypeError(f"{request['name']!r} is no estimator: it must have the methods start and update")
     if getattr(found, "kind", "estimator") != "estimator" or getattr(found, "task_keywords", None):
-        raise TypeError("only an estimator, in the environment as it is, runs in a process of its own")
+        raise TypeError("isolated: runs estimators only, without task_keywords of their own")
     return found
 
 
 def make(found: Any, task: Any) -> Any:
-    """Make an estimator of its class, for the task if the constructor takes it."""
+    """Make an estimator of its class, with the task if the constructor takes an argument."""
     from filtergym.evaluation.competitors.adapters import check_update_order, takes_problem
 
     check_update_order(found)
@@ -371,7 +379,7 @@ def make(found: Any, task: Any) -> Any:
 
 
 def run_program(words: list[str]) -> None:
-    """Become a program."""
+    """Replace this process by a program."""
     for number in (13, 25):  # SIGPIPE and SIGXFSZ, which Python ignores
         ctypes.CDLL(None).signal(number, None)
     try:
@@ -382,10 +390,10 @@ def run_program(words: list[str]) -> None:
 
 
 def main(memory: str, *words: str) -> None:
-    """Run a program, or serve one estimator.
+    """Run a program or one estimator.
 
     Args:
-        memory: bytes of address space; 0: as many as there are. Only Linux limits them.
+        memory: limit of address space in bytes; 0: none. Only Linux applies it.
         words: of the program.
     """
     apart = False
@@ -401,11 +409,11 @@ def main(memory: str, *words: str) -> None:
 
 
 def serve(apart: bool) -> None:
-    """Serve one estimator, in namespaces of its own or not."""
+    """Run one estimator, inside or outside namespaces of its own."""
     import json
 
     questions, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what an estimator prints is no answer
+    os.dup2(2, 1)  # an estimator's prints go to standard error, not into the answers
     request, hello = json.loads(questions.readline()), json.loads(questions.readline())
     gaps = wall(request["readable"], request["listable"], apart)
     sys.path[:] = request["path"]
@@ -415,13 +423,13 @@ def serve(apart: bool) -> None:
     try:
         own = make(load(request), make_task(hello, numpy))
     except Exception as error:  # a module is a program: it can raise anything
-        said: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
+        response: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
     else:
-        said = {"filtergym": 1, "format": "float64"} | ({"warning": gaps} if gaps else {})
-    answers.write(json.dumps(said).encode() + b"\n")
+        response = {"filtergym": 1, "format": "float64"} | ({"warning": gaps} if gaps else {})
+    answers.write(json.dumps(response).encode() + b"\n")
     answers.flush()
     frames = Frames(hello, numpy, questions)
-    if "error" in said or (initial := frames.read("initial")) is None:
+    if "error" in response or (initial := frames.read("initial")) is None:
         return
     memory = own.start(initial, frames.lanes)
     while (measurement := frames.read("measurement")) is not None:

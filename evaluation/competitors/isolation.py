@@ -1,8 +1,8 @@
-"""Python estimators in a process of their own, which is told what is measured and nothing else.
+"""Python estimators in a process of their own, which receives the measurements and nothing else.
 
-What :mod:`.isolated_estimator` needs is put together here: the text of the estimator, which this process never
-executes, what the other one may read (Python's library, the installed packages but this one, and the folder of the
-estimator), and the texts of the modules of this package that are meant for estimators.
+This module composes the request for :mod:`.isolated_estimator`: the text of the estimator, which this process never
+executes, the paths that the other process may read (Python's library, the installed packages but this one, and the
+folder of the estimator), and the texts of this package's modules for estimators.
 """
 
 import json
@@ -20,11 +20,11 @@ from .kinds import Competitor
 from .programs import LIMITS, Program
 
 ISOLATED = "isolated:"
-"""Before ``module:Class`` of an estimator, for one in a process of its own."""
+"""Prefix of ``module:Class`` for an estimator in a process of its own."""
 SHARED = ("adapters", "evaluation.competitors.adapters", "evaluation.competitors.stone_soup")
-"""Modules of this package that an isolated estimator may import: they know one track, no world and no seed."""
+"""Modules of this package that an isolated estimator may import: they contain no world and no seed."""
 INIT = "__init__.py"
-"""File that each folder of this package has."""
+"""Name of the file in each folder of this package."""
 SYSTEM = (
     "/lib",
     "/lib64",
@@ -35,13 +35,13 @@ SYSTEM = (
     "/dev/null",
     "/dev/urandom",
 )
-"""What libraries read."""
+"""Files and folders that libraries read."""
 ONE_THREAD = tuple((name, "1") for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"))
-"""So that nothing runs before the wall stands, and products round as here."""
+"""Variables for one thread: no thread starts before the restrictions, and products round as in this process."""
 
 
 def isolate_estimator(name: str) -> Program:
-    """Return what makes the estimator of a user's module, in a process of its own.
+    """Return the program that runs the estimator of a user's module in a process of its own.
 
     Args:
         name: ``module:Class``, of a module in one file.
@@ -61,13 +61,13 @@ def isolate_estimator(name: str) -> Program:
 
 
 def isolate_source(text: str, attribute: str, name: str, file: Path | None = None) -> Program:
-    """Return what makes the estimator of a text, in a process of its own.
+    """Return the program that runs the estimator of a source text in a process of its own.
 
     Args:
-        text: of its module.
+        text: source text of its module.
         attribute: name of its class.
-        name: in errors.
-        file: whose text it is, if there is one; its folder may be read.
+        name: its name in errors.
+        file: file of the text, if there is one; its folder may be read.
     """
     folder = [] if file is None else [str(file.parent.absolute())]
     libraries = _libraries()
@@ -98,7 +98,7 @@ def isolate_source(text: str, attribute: str, name: str, file: Path | None = Non
 
 
 def _libraries() -> list[str]:
-    """Folders of Python's library and of installed packages, in the order in which they are searched."""
+    """Return the folders of Python's library and of installed packages, in the order in which they are searched."""
     own = [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
     extensions = [str(Path(place) / "lib-dynload") for place in own]
     packages = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
@@ -113,7 +113,7 @@ def _shared_modules() -> dict[str, str]:
 
 
 def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
-    """Give a folder, or where something in it is forbidden what else is in it, however deep."""
+    """Yield a folder, or where it contains forbidden paths, all other paths in it, at any depth."""
     real = place.resolve()
     if not real.exists() or any(real.is_relative_to(other) for other in forbidden):
         return

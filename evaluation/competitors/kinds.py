@@ -1,11 +1,11 @@
-"""What a policy, an estimator, a smoother, a reference and a bound are.
+"""Protocols and bases of policies, estimators, smoothers, references and bounds.
 
-A **policy** sees observations and returns actions; learned or classical, it answers Stable-Baselines3's
-call. An **estimator** sees what a policy's filters see, the start of the track and every measurement, and answers with
-mean and covariance; it is ranked with the policies, and marked. A **smoother** is an estimator that answers after the
-last measurement and uses later ones, too: it is not causal, and never ranked. A **reference** is an estimator
-that may be told what no competitor knows; it is never ranked. A **bound** is computed. Each says what it is by its
-``kind``; what says nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, such as a model of
+A **policy** observes and returns actions; learned or classical, it has Stable-Baselines3's method ``predict``. An
+**estimator** receives what a policy's filters receive, the initial estimate and every measurement, and returns mean and
+covariance; it is ranked with the policies, and marked. A **smoother** is an estimator that returns its estimates after
+the last measurement and also uses later ones: it is not causal, and never ranked. A **reference** is an estimator that
+may know what no competitor measures; it is never ranked. A **bound** is computed. The attribute ``kind`` gives the
+kind; an object without it is an estimator if it has ``start`` and ``update``, otherwise a policy, such as a model of
 Stable-Baselines3.
 """
 
@@ -24,15 +24,15 @@ from .adapters import check_update_order, takes_problem
 
 Kind = Literal["policy", "estimator", "smoother", "reference", "bound"]
 RANKED: tuple[Kind, ...] = ("policy", "estimator")
-"""What is ranked: it knows nothing that is hidden, and nothing before it is measured."""
-TOLD_MORE: tuple[Kind, ...] = ("reference", "bound")
-"""What may be told more than is measured, and says so in ``knows``."""
+"""Kinds that are ranked: they know nothing hidden, and nothing before it is measured."""
+INFORMED_KINDS: tuple[Kind, ...] = ("reference", "bound")
+"""Kinds that may know more than is measured; their attribute ``knows`` describes it."""
 NOT_CAUSAL = "Not causal, with later measurements"
-"""What is said of smoothers wherever they are reported, before their names."""
+"""Words before the names of smoothers in every report."""
 
 
 class Competitor(NamedTuple):
-    """A name with what it stands for in a problem."""
+    """A competitor by its name in a problem."""
 
     name: str
     maker: Any
@@ -40,27 +40,27 @@ class Competitor(NamedTuple):
     learned: bool = False
     """Whether it was trained."""
     identity: str | None = None
-    """Words that change whenever the maker does; None where nothing says whether it is what it was."""
+    """Words that change whenever the maker does; None where such a change cannot be recognised."""
     log: Any = None
     """How the log was read that the competitor was fitted to (:class:`.envs.contract.log_format.LogSetup`), or None."""
 
 
 class CompetitorFiles(NamedTuple):
-    """Competitors that are kept in files and folders."""
+    """Functions that find and load competitors stored in files and folders."""
 
     find: Callable[[str, Any, bool, Callable[[str, str], Competitor]], Competitor | None]
-    """The competitor of a name in a problem, or None. Takes also whether to load what can execute code, and a function
-    that returns the shipped competitor of a name; its second argument names the thing in errors."""
+    """The competitor of a name in a problem, or None. Also takes whether to load files that can execute code, and a
+    function that returns the shipped competitor of a name; its second argument names the thing in errors."""
     endings: Sequence[str]
-    """Of the names of its files."""
+    """Endings of the names of such files."""
     names: Callable[[str], list[str]] = lambda id: []
-    """Names of those that are shipped for a Gymnasium id."""
+    """Names of the shipped competitors of a Gymnasium id."""
     adopt: Callable[[Any], Any] = lambda found: found
-    """Puts an object of a known library behind its adapter, and returns others as they are."""
+    """Wraps an object of a known library in its adapter, and returns other objects unchanged."""
 
 
 def kind_of(competitor: Any) -> Kind:
-    """Say what a competitor is, or what a maker makes."""
+    """Return the kind of a competitor, or of the competitors that a maker makes."""
     estimates = _has(competitor, "start", "update") and (
         is_filter(competitor) or not hasattr(competitor, "predict")
     )
@@ -68,13 +68,13 @@ def kind_of(competitor: Any) -> Kind:
 
 
 def is_filter(competitor: Any) -> bool:
-    """Whether it is a filter, or makes one; what else estimates is put into one (:func:`.filters.as_filter`)."""
+    """Return whether it is a filter, or makes one; :func:`.filters.as_filter` wraps other estimators in a filter."""
     made = getattr(competitor, "func", competitor)
     return issubclass(made if isinstance(made, type) else type(made), Filter)
 
 
 def is_program(found: Any) -> bool:
-    """Whether it computes in a process of its own, whose time that process tells."""
+    """Return whether it computes in a process of its own, which reports its time."""
     return getattr(found, "is_program", False) is True
 
 
@@ -87,32 +87,32 @@ def make_competitor(maker: Any, problem: Task | Model) -> Any:
 
     Args:
         maker: a class or function that takes the problem, or nothing; or the competitor itself. One whose first
-            argument has a default is given nothing, unless it is called ``task`` or ``model``.
-        problem: of a policy the model that it acts in, of anything else the task.
+            argument has a default is called without arguments, unless that argument is named ``task`` or ``model``.
+        problem: for a policy the model that it acts in, for any other kind the task.
     """
     if not callable(maker):
         return maker
     return maker(problem) if takes_problem(maker) else maker()
 
 
-def answers_by_track(competitor: Any) -> bool:
-    """Whether a competitor, such as one from a file, must be told which episodes it runs in.
+def is_made_for_episodes(competitor: Any) -> bool:
+    """Return whether a competitor, such as one from a file, is made for given episodes.
 
-    It has ``of_episodes(task, seeds)``, which makes the competitor in the episodes of these seeds.
+    Such a competitor has ``of_episodes(task, seeds)``, which makes the competitor for the episodes of these seeds.
     """
     return _has(competitor, "of_episodes")
 
 
 def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
-    """Return what a user has named or made, if it can compete; it is not called yet.
+    """Check that an object that a user has named or made can compete, and return it; it is not called yet.
 
     Args:
-        name: in the table.
+        name: its name in the table of results.
         found: a competitor, or a class of one.
-        kind: as which it must compete; default: what it says it is.
+        kind: as which it must compete; default: its own.
 
     Raises:
-        ValueError: if it has not the methods of its kind: ``predict``, or ``start`` and ``update``, and ``smooth`` of a
+        ValueError: if it lacks a method of its kind: ``predict``, or ``start`` and ``update``, and ``smooth`` of a
             smoother; or if its ``update`` takes the memory after the measurement.
     """
     kind = kind or kind_of(found)
@@ -132,12 +132,12 @@ def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
 
 
 def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
-    """Let a policy be asked like the model inside it, whose spaces say how.
+    """Copy the spaces of an inner model to the policy around it, so that both are called alike.
 
     Args:
         outer: the policy.
-        inner: what may be a model of Stable-Baselines3.
-        further: attributes that go over, too, where there are any.
+        inner: for example a model of Stable-Baselines3.
+        further: other attributes to copy where the inner model has them.
     """
     for name in ("observation_space", "action_space", *further):
         if hasattr(inner, name):
@@ -147,11 +147,11 @@ def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
 class Policy:
     """Base of the classical policies, batch first: observations and actions are ``(N, ...)``, as in Gymnasium.
 
-    A policy is made for a model, and deterministic unless it says otherwise. Filters have the batch last; where a
-    policy acts inside a filter, :mod:`.steered_filter` turns the axes.
+    A policy is made for a model, and deterministic unless documented otherwise. Filters have the batch last; where a
+    policy acts inside a filter, :mod:`.steered_filter` transposes the axes.
 
-    Subclasses set ``control`` and answer :meth:`predict`; those with memory keep it in the ``state`` that
-    goes in and out, so that one object serves any number of episodes.
+    Subclasses set ``control`` and define :meth:`act`. A policy with memory takes and returns it as ``state``, so that
+    one object serves any number of episodes.
     """
 
     kind: ClassVar[Kind] = "policy"
@@ -160,16 +160,18 @@ class Policy:
     traceable: ClassVar[bool] = False
     """Whether :meth:`act` is compiled where the steps of the model are: it computes with NumPy alone, no value decides
     what is executed, its memory is nested tuples of arrays, batch first, of which only the values depend on the
-    observations, and nothing is kept in the object. A class with another ``act`` says it anew."""
+    observations, and the object stores nothing. A class with another ``act`` must declare it again."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
         self.task: Any = model.task
 
     def begin(self, seeds: Sequence[int]) -> Any:
-        """Memory at the start of the episodes with these seeds, for the first :meth:`predict` of an evaluation.
+        """Return the memory at the start of the episodes with these seeds, for the first :meth:`predict` of an
+        evaluation.
 
-        A policy that draws numbers draws them from the seeds, so that an episode stays what it is in any company.
+        A policy with random numbers draws them from the seeds, so that an episode does not depend on the others beside
+        it.
         """
         return None
 
@@ -184,7 +186,7 @@ class Policy:
 
         Args:
             observation: ``(N, len(model.fields))``, or one observation without the batch axis.
-            state: what the last call returned; None at the first.
+            state: as returned by the last call; None at the first.
             episode_start: ``(N,)`` booleans, true where a new episode begins.
             deterministic: as in Stable-Baselines3; classical policies ignore it.
 
@@ -200,20 +202,22 @@ class Policy:
         return (action[0] if single else action), state
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Answer a batch; ``start`` is true where memory must begin anew."""
+        """Return the actions of a batch and the memory; ``start`` is true where memory must be reset."""
         raise NotImplementedError
 
 
 def compilation_key(maker: Any) -> Any:
-    """Return what code compiled of a competitor is kept by: what makes it, or of a function, which may make another one
-    next time, an object of this call's own.
+    """Return the key of compiled code in its cache: the maker of the competitor; for a function, which may make a
+    different one next time, a new object.
     """
     return functools.partial(maker) if isinstance(maker, types.FunctionType) else maker
 
 
-def says_traceable(policy: Any) -> bool:
-    """Whether a policy says of its own methods, not of those that they replace, that they can be traced; or of itself,
-    where that depends on what it is made of.
+def is_traceable(policy: Any) -> bool:
+    """Return whether a policy declares that its methods can be traced.
+
+    The declaration must stand in the object, or in the class that defines the methods or one derived from it: it does
+    not hold for methods that a subclass replaces.
     """
     own = getattr(policy, "__dict__", {})
     if "traceable" in own:
@@ -227,13 +231,14 @@ def says_traceable(policy: Any) -> bool:
 
 
 class FunctionPolicy(Policy):
-    """Actions by a function of the observation: how an agent of any library is evaluated.
+    """Policy that computes its actions by a function of the observation, to evaluate an agent of any library.
 
     Args:
-        function: given observations ``(N, fields)``, returns actions, batch first, as an array or a tensor on the CPU.
-        control: that the actions are meant for; default: the environment's first.
-        task_keywords: parameters of the task that it acts with, as :attr:`.SteppingPolicy.task_keywords` of the policy
-            that it is a copy of; default: none but those of the evaluation.
+        function: takes observations ``(N, fields)`` and returns actions, batch first, as an array or a tensor on the
+            CPU.
+        control: the control that the actions are for; default: the environment's first.
+        task_keywords: parameters of the task that the policy requires, such as :attr:`.SteppingPolicy.task_keywords` of
+            the policy that it copies; default: only those of the evaluation.
     """
 
     def __init__(
@@ -248,12 +253,12 @@ class FunctionPolicy(Policy):
             self.control = control  # type: ignore[misc]  # of the function, not of the class
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Ask the function."""
+        """Call the function."""
         return host_array(self.function(observation)), None
 
 
 class ConstantPolicy(Policy):
-    """The same action always."""
+    """Policy with one constant action."""
 
     traceable = True
     action: tuple[float, ...]
@@ -264,17 +269,17 @@ class ConstantPolicy(Policy):
 
 
 DRAWN_AT_ONCE = 32
-"""Decisions for which random actions are drawn together."""
+"""Number of decisions whose random actions are drawn in one call."""
 
 
 class RandomActions:
-    """Actions of episodes side by side, each drawn by a generator of its own, for several decisions at once.
+    """Random actions of episodes side by side, drawn by one generator for each episode.
 
-    The numbers are those of one draw after another.
+    Several decisions are drawn in one call; the numbers equal those of one draw after another.
 
     Args:
         generators: one for each episode.
-        space: of one action.
+        space: Gymnasium space of one action.
     """
 
     def __init__(self, generators: Sequence[numpy.random.Generator], space: Any) -> None:
@@ -282,7 +287,7 @@ class RandomActions:
         self._drawn: list[numpy.ndarray] = []
 
     def next(self) -> numpy.ndarray:
-        """Actions of the next decision, one row for each episode."""
+        """Return the actions of the next decision, one row for each episode."""
         if not self._drawn:
             space = self._space
             each: list[numpy.ndarray]
@@ -296,7 +301,7 @@ class RandomActions:
 
 
 class RandomPolicy(Policy):
-    """Uniform actions; the floor that any policy should beat."""
+    """Policy of uniformly random actions; every policy should have a lower cost."""
 
     seed = 0
 
@@ -305,34 +310,34 @@ class RandomPolicy(Policy):
         self.control: str = model.control  # type: ignore[misc]  # it suits every control
 
     def begin(self, seeds: Sequence[int]) -> RandomActions:
-        """Give every episode a generator of its own, of the policy's seed and the episode's."""
+        """Make a generator for every episode from the policy's seed and the episode's."""
         generators = [numpy.random.default_rng([self.seed, seed]) for seed in seeds]
         return RandomActions(generators, self.model.action_space)
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Draw from the action space, each row from its generator."""
+        """Draw actions from the action space, each row by the generator of its episode."""
         actions = self.begin(range(len(observation))) if state is None else state
         return actions.next(), actions
 
 
 class Estimator(Protocol):
-    """An estimator that a user brings, batch last: any object with these two methods, for arrays ``(..., N)``.
+    """Protocol of a user's estimator, batch last: any object with these two methods, for arrays ``(..., N)``.
 
-    A class is made for the task if its constructor takes an argument: ``task.parameters`` holds every constant,
-    ``task.components`` what is estimated, in which unit. Nothing else of the task is needed.
+    A class is made for the task if its constructor takes an argument: ``task.parameters`` contains every constant,
+    ``task.components`` the estimated components with their units. Nothing else of the task is needed.
 
     N episodes are estimated side by side. N is a multiple of eight: the last episode is
-    repeated to fill up, so that rounding in matrix products does not depend on how many there are.
+    repeated to fill up, so that rounding in matrix products does not depend on the number of episodes.
     """
 
     kind: ClassVar[Kind] = "estimator"
     traceable: ClassVar[bool] = False
     """Whether it is compiled with the steps of the world: its memory is nested tuples of arrays ``(..., N)``, its
-    methods compute with the array functions of ``task.xp`` alone, no value decides what is executed, and nothing is
-    kept in the object. What is not runs as Python code."""
+    methods compute with the array functions of ``task.xp`` alone, no value decides what is executed, and the object
+    stores nothing. Other estimators run as Python code."""
 
     def start(self, initial: Any, N: int) -> Any:
-        """Memory at the start of the track.
+        """Return the memory at the start of the track.
 
         Args:
             initial: the initial estimate given to every filter: :class:`~filtergym.envs.contract.filter.Initial` or a
@@ -341,37 +346,37 @@ class Estimator(Protocol):
         """
 
     def update(self, memory: Any, measurement: Any) -> tuple[Array, Array, Any]:
-        """Estimate after a measurement.
+        """Return the estimate after a measurement.
 
         Args:
-            memory: what the last call returned.
+            memory: as returned by the last call.
             measurement: the task's ``Measurement``, arrays with N as their last axis; not to be changed in place.
 
         Returns:
             Mean ``(C, N)`` and covariance ``(C, C, N)`` of the task's components in their units, and the memory. A
-            fourth entry may tell how well the measurement was predicted: its log-likelihood ``(N,)`` in nats, or a
-            :class:`Likelihood`. Then the estimator is judged by it too, also on recordings without truth.
+            fourth entry may give the log-likelihood of the measurement, ``(N,)`` in nats, or a :class:`Likelihood`.
+            Then the estimator is also evaluated by its predictions, on recordings without truth, too.
         """
         ...
 
 
 class Smoother(Estimator, Protocol):
-    """An estimator that answers after the last measurement, each time with all measurements or some scans later.
+    """Protocol of an estimator that estimates each time with all measurements, or with those of some scans later.
 
-    It runs forward like any estimator, and what it has kept is given back to it. It says so by ``kind = "smoother"``;
-    an estimator with a method ``smooth`` alone is judged by what it says at the time. In a closed loop, where the
-    estimate decides what is measured next, it is refused.
+    It runs forward like any estimator, and :meth:`smooth` then receives all its memories. It declares ``kind =
+    "smoother"``; without that declaration an estimator with a method ``smooth`` is evaluated by its causal estimates. A
+    closed loop, where the estimate decides what is measured next, raises an error for a smoother.
     """
 
     kind: ClassVar[Kind] = "smoother"
 
     def smooth(self, measurements: Sequence[Any], memories: Sequence[Any]) -> tuple[Array, Array]:
-        """Estimate again when all is measured.
+        """Return the smoothed estimates, after the last measurement.
 
         Args:
             measurements: the K measurements that :meth:`update` was given, in their order.
-            memories: what :meth:`start` and every :meth:`update` have returned, K + 1 of them. A memory that is changed
-                in place shows only its last state.
+            memories: K + 1 memories returned by :meth:`start` and every :meth:`update`. A memory that is changed in
+                place contains only its last state.
 
         Returns:
             Means ``(C, K, N)`` and covariances ``(C, C, K, N)`` at the measurements.
@@ -382,19 +387,20 @@ class Smoother(Estimator, Protocol):
 class Reference(Protocol):
     """An estimator that runs on the episode's measurements and may know what no competitor does.
 
-    It starts where everyone starts. In a closed loop it flies a truth of its own, on the same noise.
+    It starts from the initial estimate of every filter. In a closed loop it flies a truth of its own, on the same
+    noise.
     """
 
     kind: ClassVar[Kind] = "reference"
     knows: ClassVar[str]
-    """What it is told, in words; printed wherever it is reported."""
+    """Hidden knowledge that it has, in words; printed in every report."""
     disturbances: ClassVar[Collection[str] | None] = ()
-    """Names of the world's disturbances that it is told of or ignores on purpose; None: sensors are nothing to it."""
+    """Names of the world's disturbances that it knows or ignores on purpose; None: it uses no sensors."""
 
     def __init__(self, task: Task) -> None: ...
 
     def start(self, initial: Any, truth: Any) -> Any:
-        """Memory at the start of the track.
+        """Return the memory at the start of the track.
 
         Args:
             initial: the initial estimate given to every filter.
@@ -402,7 +408,7 @@ class Reference(Protocol):
         """
 
     def update(self, memory: Any, measurement: Any, truth: Any) -> tuple[Array, Array, Any]:
-        """Estimate after a measurement; returns as of :meth:`Estimator.update`."""
+        """Return mean ``(C, N)``, covariance ``(C, C, N)`` and memory after a measurement, as an estimator."""
         ...
 
 
@@ -416,8 +422,8 @@ class Bound(Protocol):
     def __init__(self, task: Task) -> None: ...
 
     def start(self, initial: Any, truth: Any) -> Any:
-        """Memory at the start of the track; arguments as of :meth:`Reference.start`."""
+        """Return the memory at the start of the track; arguments as of :meth:`Reference.start`."""
 
     def update(self, memory: Any, measurement: Any, truth: Any) -> tuple[Array, Any]:
-        """Bound of the mean square of ``task.components``, ``(C, N)``, and the memory."""
+        """Return the bound of the mean square error of ``task.components``, ``(C, N)``, and the memory."""
         ...

@@ -1,10 +1,9 @@
-"""How likely recorded measurements are, as a function of an estimator's parameters.
+"""Likelihood of recorded measurements as a function of an estimator's parameters.
 
-A recording is cut into windows, which run side by side: a window begins some measurements before those that count, so
-that the start of its track no longer matters. Lanes are windows times candidates: an estimator that takes its
-parameters as arrays ``(N,)`` runs all candidates at once, compiled where it can be traced. So a gradient by finite
-differences costs one run. A long run goes through its measurements stretch by stretch, so that its memory does not grow
-with them.
+A recording is cut into windows, which run side by side. A window begins some measurements before those that count, so
+that the effect of the initial estimate has decayed. Lanes are windows times candidates: an estimator whose parameters
+may be arrays ``(N,)`` runs all candidates at once, compiled where it can be traced. So a gradient by finite differences
+costs one run. A long run processes its measurements in stretches, so that its memory does not grow with their number.
 """
 
 import copy
@@ -30,11 +29,12 @@ from ...envs.engine.compiled import AVAILABLE, warn_of
 from .filters import as_filter
 
 Apply = Callable[[Mapping[str, Any]], tuple[dict[str, Any], Callable[[Task], Any]]]
-"""From parameters to keywords of the task and what makes the estimator, see :class:`~..baselines.table.Tunable`."""
+"""Function from parameters to keywords of the task and the estimator's maker, see
+:class:`~..baselines.table.Tunable`."""
 
 
 STRETCH_NUMBERS = 1 << 19
-"""Lanes times measurements that are run at once: 4 MB of each number of a measurement."""
+"""Lanes times measurements in one stretch: 4 MB for each number of a measurement."""
 
 
 class Span(NamedTuple):
@@ -48,19 +48,19 @@ class Span(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Pieces of a recording side by side, W of them, the longest of T measurements."""
+    """W windows of a recording side by side, the longest of T measurements."""
 
     initial: Any
-    """The initial estimate of each, the task's NamedTuple of arrays ``(..., W)``."""
+    """Initial estimate of each window, the task's NamedTuple of arrays ``(..., W)``."""
     measurements: Any
     """The task's ``Measurement`` of arrays ``(T, ..., W)``."""
     counts: numpy.ndarray
     """Whether a measurement's likelihood counts, ``(T, W)``."""
     tiles: dict[int, tuple[Any, Any]]
-    """Initial estimates and measurements of so many candidates, of the last number that was run at once."""
+    """Initial estimates and measurements repeated for several candidates, for the last number of candidates."""
 
     def measurement(self, k: int) -> Any:
-        """Measurement k of each, the task's ``Measurement`` of arrays ``(..., W)``."""
+        """Return the measurement k of each window, the task's ``Measurement`` of arrays ``(..., W)``."""
         return map_arrays(lambda array: array[k], self.measurements)
 
 
@@ -70,12 +70,12 @@ def cut_windows(
     """Cut a recording into windows, each with an initial estimate from its own first measurements.
 
     Args:
-        recording: of the task.
-        task: on NumPy arrays, whose log format says how a track starts; where it has none, or a window begins with the
-            recording, the recording's own initial estimate stands.
-        spans: what counts.
-        warm_up: measurements that a window begins earlier, where there are as many.
-        every: of those with a field ``available`` one in so many is received, the others are missing.
+        recording: recording of the task.
+        task: on NumPy arrays; its log format defines the start of a track. Without one, or where a window begins with
+            the recording, the recording's own initial estimate applies.
+        spans: measurements whose likelihood counts.
+        warm_up: number of measurements before those that count, where there are as many.
+        every: of measurements with a field ``available``, one in ``every`` is received, the others are missing.
     """
     template, like = measure_once(type(task)(task.parameters), recording.measurements)
     starts, pieces, counted = [], [], []
@@ -105,7 +105,7 @@ def cut_windows(
 
 
 def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
-    """Keep of what is available, ``(T, W)``, the first, and each so many measurements after the last kept."""
+    """Return a selection of the available measurements, ``(T, W)``: the first, then one in ``every``."""
     kept = numpy.zeros_like(available)
     since = numpy.full(available.shape[1], every)
     for row, values in zip(kept, available, strict=True):
@@ -116,14 +116,14 @@ def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
 
 
 def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[Mapping[str, Any], int]:
-    """Initial estimate of a window, and the number of its first measurement."""
+    """Return the initial estimate of a window, and the number of its first measurement."""
     own = {name: values[span.episode] for name, values in recording.initial.items()}
     log_format = find_companion(task, LogFormat)
     if log_format is None or span.first <= warm_up:
         return own, 0
     first = span.first - warm_up
     available = recording.measurements.get("available")
-    # A track starts from what was measured: the window begins earlier where its first measurements are missing.
+    # A track starts from measurements: the window begins earlier where its first measurements are missing.
     while (
         available is not None and first > 0 and not (available[span.episode, first : first + 2] > 0.0).all()
     ):
@@ -146,7 +146,7 @@ def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[
 
 
 def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
-    """Repeat the last measurement up to a length; what is repeated never counts."""
+    """Repeat the last measurement up to a length; repetitions never count."""
     missing = length - len(values)
     return values if missing == 0 else numpy.concatenate([values, numpy.repeat(values[-1:], missing, axis=0)])
 
@@ -154,7 +154,7 @@ def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
 def _update(
     task: Task, names: tuple[str, ...], apply: Apply, values: Array, measurement: Any, memory: Any
 ) -> tuple[Any, Array]:
-    """Memory after a measurement, and its log-likelihood; parameters ``(P, N)``."""
+    """Return the memory after a measurement, and its log-likelihood; parameters ``(P, N)``."""
     own = apply({name: values[i] for i, name in enumerate(names)})[1](task)
     return _step(as_filter(task, own), measurement, memory)
 
@@ -170,17 +170,17 @@ class WindowLikelihood:
 
     Args:
         task: on NumPy arrays, without a recording.
-        windows: of a recording.
-        start: values of the parameters under which the likelihood is finite, by name.
-        apply: from parameters to what makes the estimator.
+        windows: windows of a recording.
+        start: values of the parameters with a finite likelihood, by name.
+        apply: function from parameters to the estimator's maker.
         in_lanes: whether every parameter may be an array ``(N,)``; else candidates run one after another.
 
     Attributes:
-        names: of the parameters.
-        count: measurements that count.
+        names: names of the parameters.
+        count: number of measurements that count.
 
     Raises:
-        ValueError: if the estimator does not say how likely measurements were, or none counts.
+        ValueError: if the estimator returns no log-likelihood of measurements, or none counts.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class WindowLikelihood:
         self._take(windows)
 
     def _take(self, windows: Windows) -> None:
-        """Compute it of other windows from now on."""
+        """Set the windows."""
         self._counts = windows.counts
         self.windows = windows
         known = numpy.concatenate([~numpy.isnan(found[:, :, 0]) for found in self._stretches(self._start)])
@@ -213,16 +213,17 @@ class WindowLikelihood:
             raise ValueError("the recording has no measurement that counts")
 
     def on(self, windows: Windows) -> "WindowLikelihood":
-        """Return the same of other windows, without tracing and compiling it anew; errors as of the class."""
+        """Return the likelihood on other windows, without tracing and compiling it again; errors as of the class."""
         other = copy.copy(self)
         other._take(windows)
         return other
 
     def __call__(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood of all measurements that count, nats, ``(C,)``; minus infinity where it is not finite.
+        """Return the log-likelihood of all measurements that count, nats, ``(C,)``; minus infinity where it is not
+        finite.
 
         Args:
-            values: of the parameters, candidates last, ``(P, C)``.
+            values: parameters, candidates last, ``(P, C)``.
         """
         if not self.in_lanes and values.shape[1] > 1:
             return numpy.concatenate([self(values[:, [i]]) for i in range(values.shape[1])])
@@ -236,12 +237,12 @@ class WindowLikelihood:
     def gradient(
         self, values: numpy.ndarray, step: float = 1e-4, of: Sequence[int] | numpy.ndarray | None = None
     ) -> tuple[float, numpy.ndarray]:
-        """Log-likelihood of a candidate, and its gradient by central differences, in one run.
+        """Return the log-likelihood of a candidate, and its gradient by central differences, in one run.
 
         Args:
-            values: ``(P,)``.
-            step: of every parameter; its rounding error is 1e-12 of the log-likelihood over the step.
-            of: numbers of the parameters in the gradient; default: all.
+            values: parameters, ``(P,)``.
+            step: step of every parameter; the rounding error is 1e-12 of the log-likelihood over the step.
+            of: indices of the parameters in the gradient; default: all.
         """
         moves = step * numpy.eye(len(values))[:, slice(None) if of is None else of]
         found = self(
@@ -251,7 +252,7 @@ class WindowLikelihood:
         return float(found[0]), (found[1 : 1 + count] - found[1 + count :]) / (2.0 * step)
 
     def _stretches(self, values: numpy.ndarray) -> Iterator[numpy.ndarray]:
-        """Yield the log-likelihood of every measurement, ``(rows, W, C)``, some rows of the T after the others."""
+        """Yield the log-likelihood of every measurement, ``(rows, W, C)``, in stretches of the T rows."""
         count, W = values.shape[1], self._counts.shape[1]
         width = round_up_lanes(count * W)
         given = numpy.ascontiguousarray(values[:, numpy.minimum(numpy.arange(width) // W, count - 1)])
@@ -266,8 +267,9 @@ class WindowLikelihood:
     def _run(
         self, values: numpy.ndarray, initial: Any, measurements: Any, memory: Any
     ) -> tuple[numpy.ndarray, Any]:
-        """Run all lanes through some measurements, ``(rows, lanes)``, and return the memory after them; None: from the
-        start on.
+        """Run all lanes through some measurements, ``(rows, lanes)``, and return the memory after them.
+
+        A memory of None begins at the start.
         """
         found = numpy.empty((len(leaves(measurements)[0]), initial.mean.shape[-1]))
         given = values if self.in_lanes else values[:, 0]
@@ -282,8 +284,8 @@ class WindowLikelihood:
                 warn_of(type(own).__name__, error)
                 self._compiled = None
         for k in range(len(found)):
-            memory, told = _step(own, map_arrays(lambda array: array[k], measurements), memory)  # noqa: B023
-            found[k] = numpy.nan if told is None else told
+            memory, log_likelihood = _step(own, map_arrays(lambda array: array[k], measurements), memory)  # noqa: B023
+            found[k] = numpy.nan if log_likelihood is None else log_likelihood
         return found, memory
 
     def _run_compiled(
@@ -294,8 +296,8 @@ class WindowLikelihood:
         memory: Any,
         found: numpy.ndarray,
     ) -> Any:
-        """Run all lanes through code that is bound to two memories, to and fro, write what was found, and return the
-        memory after it.
+        """Run all lanes in compiled code between two alternating memories, write the results, and return the last
+        memory.
         """
         program = function.specialise(values, map_arrays(lambda array: array[0], measurements), memory)
         lanes, inner = found.shape[1], len(program.outputs) - 1
@@ -319,9 +321,7 @@ class WindowLikelihood:
         return map_arrays(lambda array: next(after).astype(array.dtype), memory)
 
     def _tile_windows(self, count: int, first: int, rows: int) -> tuple[Any, Any]:
-        """Initial estimates of so many candidates, one after another, and so many of their measurements from the first
-        on, arrays ``(rows, ..., lanes)``.
-        """
+        """Return the initial estimates and first measurements repeated for the candidates, ``(rows, ..., lanes)``."""
         tiles = self.windows.tiles
         if count in tiles:
             return tiles[count]
@@ -332,7 +332,7 @@ class WindowLikelihood:
 
         part = map_arrays(lambda array: tile(array[first : first + rows]), self.windows.measurements)
         tiled = map_arrays(tile, self.windows.initial), part
-        if rows >= len(self._counts):  # all of them: kept for the next call
+        if rows >= len(self._counts):  # all of them: stored for the next call
             tiles.clear()
             tiles[count] = tiled
         return tiled

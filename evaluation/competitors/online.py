@@ -1,6 +1,6 @@
-"""A filter in a loop of one's own: measurements come one by one, and estimates go out.
+"""A filter in a user's loop, which takes measurements one by one and returns estimates.
 
-It is what competes in an evaluation, run by the same code: of the same measurements come the same bits.
+It is the filter of an evaluation, run by the same code: the same measurements give the same bits.
 """
 
 import copy
@@ -25,34 +25,34 @@ from ...envs.engine.compiled import can_step
 from ...filters.array_namespace import select_nested
 from ..storage.dataset import FAULTS
 from .adapters import select_lanes
-from .filters import find_fault, put_in_loop
+from .filters import close_loop, find_fault
 from .kinds import check_competitor, kind_of, make_competitor
 from .online_state import Estimate, History, OnlineState, Taken, Watch
 from .steered_filter import compile_policy, trace_policy
 from .stepping import CompiledUpdate, MeasurementMemory, ModelUpdate, SteppingPolicy
 
 LEAST_INTERVAL = 1e-6
-"""Of the sampling interval: measurements that are closer in time are the same moment, written twice."""
+"""Share of the sampling interval: measurements that are closer in time belong to the same moment."""
 MOST_MISSED = 1000
-"""Scans without a measurement, after which a track is another one."""
+"""Number of scans without a measurement after which a new track must start."""
 REPORTED = ("nis", "nis_degrees", "log_likelihood", "mode_probability", "lost")
-"""What a filter may report beside its estimate."""
+"""Names of the quantities that a filter may report with its estimate."""
 
 
 class OnlineFilter:
-    """A filter that takes measurements as they come.
+    """A filter that processes measurements as they arrive.
 
     Args:
         model: task, a feed in its world's place, with the bank of the competitor's control.
-        competitor: policy or estimator, or what makes it.
-        name: of it, in errors.
-        tracks: how many are followed side by side.
-        watch: compares what a network inside is shown with its training; None where there is none.
-        lag: how many measurements, or how much time, a measurement may come late; see :meth:`update`. For each of those
-            kept, the filter's state is, and what the policy or estimator remembers.
+        competitor: policy or estimator, or its maker.
+        name: its name in errors.
+        tracks: number of tracks side by side.
+        watch: compares the inputs of a network inside with those of its training; None without a network.
+        lag: number of measurements, or time, by which a measurement may be late; see :meth:`update`. Each measurement
+            within the lag is stored with the states of the filter and of the policy or estimator.
 
     Raises:
-        ValueError: for what cannot run ahead of the truth or of later measurements.
+        ValueError: for a competitor that needs the truth or later measurements.
     """
 
     def __init__(
@@ -80,14 +80,16 @@ class OnlineFilter:
         self.input: LiveInput = reader.input(self.task, world.initial, world.measurement, tracks)
         self._is_policy, interval = kind == "policy", self.task.decision_interval
         self._interval, self._means = interval, DecisionMeans(model.fields, interval)
-        self.model: Model = model if self._is_policy else put_in_loop(model, competitor, kind, name, tracks)
+        self.model: Model = model if self._is_policy else close_loop(model, competitor, kind, name, tracks)
         observe, traced = None if watch is None else watch.observe, None
         is_compiled = can_step(self.model, report_estimate)
         self._policy: SteppingPolicy | None = None
-        """Asked in Python."""
+        """Policy that runs in Python."""
         if self._is_policy:
             policy = check_competitor(name, make_competitor(competitor, model), kind)
-            if is_compiled and not (watch and self._means.columns):  # means over a decision are not written
+            if is_compiled and not (
+                watch and self._means.columns
+            ):  # native code does not write means over a decision
                 traced = compile_policy(model, policy, trace_policy)
             self._policy = None if traced else SteppingPolicy(model, policy)
         self.names: tuple[str, ...] = tuple(component.name for component in self.task.components)
@@ -95,11 +97,11 @@ class OnlineFilter:
         blank = Estimate(None, self.names, self.units, numpy.empty(0), numpy.empty(0))
         self._same_of_estimates = dict(vars(blank))
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
-        self._is_asked = self._policy is not None or not is_compiled
+        self._is_in_python = self._policy is not None or not is_compiled
         self._no_action = numpy.zeros((len(self._pad), *(self.model.action_space.shape or ())))
         own: Any = self.model
         self._update: CompiledUpdate | ModelUpdate = (
-            CompiledUpdate(own, report_estimate, tracks, traced, self._is_asked, observe)
+            CompiledUpdate(own, report_estimate, tracks, traced, self._is_in_python, observe)
             if is_compiled
             else ModelUpdate(own, report_estimate, tracks, world.measurement, observe)
         )
@@ -112,21 +114,21 @@ class OnlineFilter:
         version = f"filtergym {importlib.metadata.version('filtergym')}"
         self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
         self._state: OnlineState | None = None
-        self._valid: Estimate | None = None  # the last one that no track has lost
-        """Without those of the filter and of a traced policy, which the update holds."""
+        self._valid: Estimate | None = None  # the last estimate without a lost track
+        """Last valid states, without those of the filter and of a traced policy, which the update stores."""
 
     def __repr__(self) -> str:
         takes = ", ".join(f"{name} ({text})" for name, text in self.input.values.items())
         return f"<OnlineFilter {self.name!r} of {self.task.id}; update takes {takes}>"
 
     def __reduce__(self) -> Any:
-        """Refuse copies: what a filter runs is machine code of this process."""
+        """Raise an error: a filter runs machine code of this process and cannot be copied."""
         raise TypeError(
-            "a running filter cannot be copied or pickled: make another with filtergym.online, and let it restore what "
-            "save of this one returns"
+            "a running filter cannot be copied or pickled: make another with filtergym.online, and restore the state "
+            "that save of this one returns"
         )
 
-    # --- what a user calls
+    # --- public methods
 
     def start(
         self, mean: Any = None, covariance: Any = None, time: Any = 0.0, *, tracks: Any = None, **values: Any
@@ -138,12 +140,12 @@ class OnlineFilter:
             covariance: of its error, ``(C, C)`` or ``(C, C, N)``.
             time: s, a number or ``(N,)``; a number too large for seconds since 1970 is milli-, micro- or nanoseconds
                 since then, as in a log.
-            tracks: numbers of those that start anew while the others go on; default: all. What came before them cannot
-                come late any more, of any track.
-            **values: what else the environment is given at the start, see ``input.start_values``.
+            tracks: numbers of the tracks to restart while the others continue; default: all. Measurements from before
+                the restart cannot arrive late any more, for any track.
+            **values: other values at the start that the environment takes, see ``input.start_values``.
 
         Raises:
-            ValueError: for what is missing, unknown, or of another shape.
+            ValueError: for values that are missing, unknown, or of another shape.
         """
         self.input.check_names(values, self.input.start_values)
         given = {**values, **{n: v for n, v in (("mean", mean), ("covariance", covariance)) if v is not None}}
@@ -152,10 +154,10 @@ class OnlineFilter:
         if tracks is not None:
             self._check_restart()
         begun = self._begin(initial, memory)
-        self._go_on(begun if tracks is None else self._merge(begun, tracks))
+        self._set_state(begun if tracks is None else self._merge(begun, tracks))
 
     def _begin(self, initial: Any, memory: Any) -> OnlineState:
-        """State at the start of all tracks."""
+        """Return the state at the start of all tracks."""
         own = self._policy
         policy = self._update.blank_policy if own is None else own.begin(range(self.tracks))
         state = self.model.start_filter(self._padded(initial))
@@ -165,11 +167,11 @@ class OnlineFilter:
         """Start the track from its first two measurements, as that of a log starts.
 
         Args:
-            first: its ``time`` and what the sensors say, as of :meth:`update`.
-            second: likewise.
+            first: ``time`` and values of the sensors, as of :meth:`update`.
+            second: ``time`` and values of the sensors of the second measurement.
 
         Raises:
-            ValueError: for what is missing or unknown, or where two measurements start no track.
+            ValueError: for values that are missing or unknown, or where two measurements cannot start a track.
         """
         for measured in (first, second):
             self.input.check_names(measured, {**self.input.values, "time": "s"})
@@ -185,22 +187,23 @@ class OnlineFilter:
         self.start(**self.input.start_from(first, second), time=second["time"])
 
     def update(self, time: Any = None, **values: Any) -> Estimate:
-        """Take a measurement in; one of the same time as the last is fused with it, where the sensors allow it.
+        """Update with a measurement; one of the same time as the last is fused with it, where the sensors allow it.
 
-        With a ``lag``, a measurement may be older than the last: it is taken in where it belongs, and those after it
-        are taken in again. At the time of another it supplies what that one lacks, or else is fused with it.
+        With a ``lag``, a measurement may be older than the last: the filter goes back to its time, and processes the
+        later measurements again. At the time of another measurement it supplies the values that that one lacks, or else
+        is fused with it.
 
         Args:
             time: s, a number or ``(N,)``; default: one sampling interval after the last.
-            **values: what the sensors say, by the names of ``input.values``; what did not come is None, NaN or left
-                out. Numbers, or arrays of one track; for several tracks with N last.
+            **values: values of the sensors, by the names of ``input.values``; a missing value is None, NaN or left out.
+                Numbers, or arrays of one track; for several tracks with N last.
 
         Returns:
             The estimate at that time; of a late measurement at the time of the last one.
 
         Raises:
-            ValueError: for what is missing, unknown or of another shape, or a time that does not increase, or comes
-                later than ``lag`` allows; the filter is then as it was, but for :attr:`too_late`.
+            ValueError: for values that are missing, unknown or of another shape, or a time that does not increase, or
+                is older than ``lag`` allows; the filter is then unchanged, except for :attr:`too_late`.
         """
         at = self._time_of(time)
         self.input.check_names(values, self.input.values)
@@ -210,16 +213,16 @@ class OnlineFilter:
 
     @property
     def too_late(self) -> int:
-        """Measurements since the start that were refused because ``lag`` does not reach back to them."""
+        """Number of measurements since the start that were rejected because they were older than ``lag``."""
         return self._running().too_late
 
     def _take(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Take in a measurement that is not older than the last."""
+        """Update with a measurement that is not older than the last."""
         before = self._running()
         last = before.input["time"]
         if _any((at >= SINCE_1970) & (last < SINCE_1970)):
             raise ValueError(
-                f"time {quote_shortened(_plain(at))} s is since 1970, and the last one, {_plain(last)} s, is not: "
+                f"time {quote_shortened(_plain(at))} s counts from 1970, but the last one, {_plain(last)} s, does not: "
                 "start the track with start(time=...) of the same clock"
             )
         together = self.input.fuses and before.measurements > 0 and not _any(at != last)
@@ -249,15 +252,15 @@ class OnlineFilter:
         return found
 
     def _take_late(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Take a measurement in where it belongs, and again what came after it."""
+        """Update with a late measurement at its time, and again with the later ones."""
         state = self._running()
         taken = state.history.taken
         oldest = taken[0].before.input["time"] if taken else state.input["time"]
         if _any(at <= oldest):
             self._state = state._replace(too_late=state.too_late + 1)
             raise ValueError(
-                f"the measurement of {_plain(at)} s comes too late: what came until {_plain(oldest)} s is settled; "
-                f"{state.too_late + 1:,} were refused so far, and a longer lag takes more"
+                f"the measurement of {_plain(at)} s comes too late: measurements until {_plain(oldest)} s are final; "
+                f"{state.too_late + 1:,} were rejected so far, and a longer lag accepts more"
             )
         place = sum(not _any(one.time > at) for one in taken)
         before, after = taken[:place], taken[place:]
@@ -275,13 +278,13 @@ class OnlineFilter:
         try:
             if after:
                 self._resume(after[0].before._replace(history=History(before), too_late=state.too_late))
-            return [self._take(time, said) for time, said in again][-1]
+            return [self._take(time, values) for time, values in again][-1]
         except BaseException:
             self._resume(kept)
             raise
 
     def _remember(self, one: Taken) -> None:
-        """Keep a measurement, and let go those to which ``lag`` does not reach back any more."""
+        """Store a measurement, and drop those that are older than ``lag``."""
         state = self._running()
         taken = (*state.history.taken, one)
         if isinstance(self._lag, timedelta):
@@ -292,8 +295,9 @@ class OnlineFilter:
         self._state = state._replace(history=History(taken))
 
     def _missed_scans(self, last: Any, at: Any) -> list[Any]:
-        """Times of the scans between that missed the target, as a log that is read has them, of a filter that was
-        advised for a log.
+        """Return the times of the scans without a detection since the last measurement, as in a log that is read.
+
+        Only a filter that was advised for a log has such scans.
         """
         interval = self._scan_interval
         scans = int(max(numpy.rint((at - last) / interval).max(), 1))
@@ -305,7 +309,7 @@ class OnlineFilter:
         return [last + (at - last) * number / scans for number in range(1, scans)]
 
     def _step(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Advance to a time and take in what came."""
+        """Advance to a time and update with the values received."""
         measurement, memory = self.input.measure(self._running().input, at, values)
         found = self._estimate(at, self._advance(measurement, memory))
         if any(found.lost):
@@ -314,7 +318,7 @@ class OnlineFilter:
         return found
 
     def _explain(self, found: Estimate, measurement: Any) -> Any:
-        """Reasons why tracks are lost, with what the task finds near their last valid estimates."""
+        """Return the reasons why tracks are lost, with the task's explanation from their last valid estimates."""
         near = self._valid if self._is_policy else found
         if near is None:
             return found.lost
@@ -332,42 +336,42 @@ class OnlineFilter:
         return self._each(words)
 
     def _received_of(self, measurement: Any, track: numpy.ndarray) -> Any:
-        """Return what a track has received, in arrays ``(..., 1)`` of the task's types."""
+        """Return the values that a track has received, in arrays ``(..., 1)`` of the task's types."""
         memory = MeasurementMemory(self.input.measurement, self.tracks)
         memory.put(measurement)
         return select_lanes(memory.copy(), track)
 
     def _advance(self, measurement: Any, memory: Any) -> dict[str, Any]:
-        """Take in a measurement of the task, and report on it in arrays ``(..., N)``, of one track ``(...)``."""
+        """Update with a measurement of the task, and report in arrays ``(..., N)``, for one track ``(...)``."""
         before: Any = self._running()
         update = self._update
-        # As of _replace, which takes longer than the filter: other input, one more measurement.
+        # Equal to _replace, which takes longer than the filter: other input, one more measurement.
         after = OnlineState._make((None, memory, *before[2:4], before.measurements + 1, *before[5:]))
-        update.arrive(measurement)
+        update.receive(measurement)
         if self._policy is not None:
-            after = self._decide(after, update.shown)
+            after = self._decide(after, update.observation)
         elif self.watch is not None and before.measurements % self._interval == 0:
             after = self._look(after, update.observed[: self.tracks])
-        if self._is_asked:
-            update.answer(self._no_action if self._policy is None else after.action[self._pad])
+        if self._is_in_python:
+            update.act(self._no_action if self._policy is None else after.action[self._pad])
         self._state = after
         return update.report()
 
     def _look(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
-        """Compare what a network is shown, ``(N, fields)``, with its training."""
+        """Compare the inputs of a network, ``(N, fields)``, with those of its training."""
         if self.watch is not None and state.fresh is not None:
             self.watch.look(observation, state.fresh)
         return state._replace(fresh=numpy.zeros(self.tracks, dtype=bool))
 
     def predict(self, time: Any = None, **values: Any) -> Estimate:
-        """Estimate of a time at which nothing is received; the filter stays where it is.
+        """Return the prediction to a time without a measurement; the state of the filter does not change.
 
         Args:
-            time: as of :meth:`update`.
-            **values: what comes without a receiver, where the environment needs it.
+            time: s, a number or ``(N,)``; default: one sampling interval after the last.
+            **values: values that need no receiver, such as inertial data, where the environment requires them.
 
         Raises:
-            ValueError: as of :meth:`update`.
+            ValueError: for values or a time that :meth:`update` rejects.
         """
         at = self._time_of(time)
         self.input.check_names(values, self.input.values)
@@ -378,26 +382,26 @@ class OnlineFilter:
             self._resume(kept)
 
     def save(self) -> OnlineState:
-        """Return all that it remembers, to go on from it later, also in another process."""
+        """Return the complete state, from which this or another process can continue."""
         return copy.deepcopy(self._snapshot()._replace(owner=self._owner))
 
     def _snapshot(self) -> OnlineState:
         state, update = self._running(), self._update
         state = state._replace(filter=update.state, watch=None if self.watch is None else self.watch.memory)
-        if not self._is_asked:
+        if not self._is_in_python:
             return state._replace(policy=update.policy_state)
         own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
         return copy.deepcopy(state._replace(python=None if own is None else (own.memory, own.step_number)))
 
     def restore(self, state: OnlineState) -> None:
-        """Go on from what :meth:`save` has returned.
+        """Continue from a state of :meth:`save`.
 
         Raises:
-            ValueError: for anything else, also where a part of it was changed so that the filter cannot go on, and for
-                what another filter has returned; the filter is then as it was.
+            ValueError: for any other object, for a changed state from which the filter cannot continue, and for a state
+                of another filter; the filter is then unchanged.
         """
         if not isinstance(state, OnlineState):
-            raise ValueError(f"restore takes what save has returned, got {quote_shortened(state)}")
+            raise ValueError(f"restore takes a state that save has returned, got {quote_shortened(state)}")
         if not isinstance(state.owner, tuple) or state.owner != self._owner:
             owner = ", ".join(map(str, state.owner)) if isinstance(state.owner, tuple) else "no filter"
             raise ValueError(
@@ -408,19 +412,19 @@ class OnlineFilter:
         try:
             self._try(state)
             self._resume(state)
-        except Exception as error:  # whatever a part of another form leads to
+        except Exception as error:  # a changed part can raise any error
             self._state = None
             if kept is not None:
                 self._resume(kept)
-            said = f"{type(error).__name__}: {error}"
+            reason = f"{type(error).__name__}: {error}"
             raise ValueError(
-                f"{self.name!r} cannot go on from this state, which is not what save has returned: "
-                f"{quote_shortened(said)}"
+                f"{self.name!r} cannot continue from this state, which is not one that save has returned: "
+                f"{quote_shortened(reason)}"
             ) from None
 
     def _try(self, state: OnlineState) -> None:
-        """Go on from a state by a measurement, to see whether that can be done; raises whatever goes wrong. A filter in
-        Python, which may keep something to itself, is not asked.
+        """Check a state by updating with a measurement; raises any error. A filter in Python, which may have hidden
+        state, is skipped.
         """
         taken = state.history.taken
         first_track = lambda array: array[..., [0] * self.tracks]  # noqa: E731
@@ -434,7 +438,7 @@ class OnlineFilter:
             check_integer("measurements", one.measurements, 0)
             check_integer("too_late", one.too_late, 0)
             if numpy.asarray(one.fresh).shape != (self.tracks,):
-                raise ValueError(f"fresh must say which of {self.tracks} tracks have just begun")
+                raise ValueError(f"fresh must mark which of {self.tracks} tracks have just begun")
             self._check_input(one.input)
             if not self.model.filter.in_python:
                 track = first_track if self.tracks > 1 else lambda array: array[..., 0]
@@ -445,57 +449,57 @@ class OnlineFilter:
             self.input.check_names(own.values, self.input.values)
 
     def _check_input(self, memory: Any) -> None:
-        """Raise an error where the memory of the input is none."""
+        """Raise an error for an invalid memory of the input."""
         self._times(memory["time"])
         for name, values in memory.items():
             if self.tracks > 1 and numpy.ndim(values) and numpy.shape(values)[-1] != self.tracks:
                 raise ValueError(f"{name} of the measurements before must be of {self.tracks} tracks")
-        with suppress(ValueError):  # nothing came, which some environments refuse
+        with suppress(ValueError):  # some environments reject a measurement without values
             self.input.measure(memory, memory["time"] + self._default_interval(), {})
 
     def _resume(self, state: OnlineState) -> None:
-        """Go on from a snapshot, which stays as it is."""
-        state = copy.deepcopy(state) if self._is_asked else state
+        """Continue from a snapshot, which does not change."""
+        state = copy.deepcopy(state) if self._is_in_python else state
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step_number = state.python
         if self.watch is not None:
             self.watch.memory = state.watch
-        self._go_on(state)
+        self._set_state(state)
 
-    def _go_on(self, state: OnlineState) -> None:
-        self._update.go_on(state.filter, state.policy)
+    def _set_state(self, state: OnlineState) -> None:
+        self._update.resume(state.filter, state.policy)
         self._state = state._replace(filter=None, policy=state.policy if self._policy else None)
 
     # --- one measurement
 
-    def _decide(self, state: OnlineState, shown: numpy.ndarray) -> OnlineState:
-        """Ask the policy where a decision is due, of what is shown, ``(width, fields)``."""
+    def _decide(self, state: OnlineState, inputs: numpy.ndarray) -> OnlineState:
+        """Choose an action where a decision is due, from the observation ``(width, fields)``."""
         assert self._policy is not None
-        number, observation = state.measurements - 1, shown.T
+        number, observation = state.measurements - 1, inputs.T
         if number:
             state = state._replace(total=self._means.add(state.total, observation))
         if number and number % self._interval == 0:
             observation = self._means.show(observation, state.total, numpy)
             state = state._replace(total=0.0)
         if number % self._interval == 0:
-            shown = numpy.ascontiguousarray(observation[:, : self.tracks].T)
-            action, memory = self._policy.predict(shown, state.policy, state.fresh)
-            state = self._look(state._replace(policy=memory, action=action), shown)
+            inputs = numpy.ascontiguousarray(observation[:, : self.tracks].T)
+            action, memory = self._policy.predict(inputs, state.policy, state.fresh)
+            state = self._look(state._replace(policy=memory, action=action), inputs)
         return state
 
     def _estimate(self, time: Any, found: dict[str, Any]) -> Estimate:
         lost, count = found.pop("lost"), self.tracks
         words = [FAULTS[int(i) - 1] if i else "" for i in (lost if count > 1 else (lost,))]
         departure = self._each([""] * count if self.watch is None else self.watch.describe())
-        said = {"time": _plain(time), "lost": self._each(words), "departure": departure}
+        further = {"time": _plain(time), "lost": self._each(words), "departure": departure}
         estimate = object.__new__(Estimate)  # whose __init__ takes twice as long as the filter
-        estimate.__dict__.update(self._same_of_estimates, **found, **said)
+        estimate.__dict__.update(self._same_of_estimates, **found, **further)
         return estimate
 
     def _each(self, words: list[str]) -> Any:
         return words[0] if self.tracks == 1 else words
 
-    # --- what is given
+    # --- checks of the arguments
 
     def _running(self) -> OnlineState:
         if self._state is None:
@@ -503,10 +507,10 @@ class OnlineFilter:
         return self._state
 
     def _times(self, time: Any) -> Any:
-        """Return times that were given, s, ``(N,)``, of one track a float.
+        """Return times in s, ``(N,)``, for one track a float.
 
         Raises:
-            ValueError: for what is no time.
+            ValueError: for a time that is not finite, or of another shape.
         """
         found = read_numbers("time", time)
         if found.shape not in ((), (self.tracks,)) or not numpy.isfinite(found).all():
@@ -522,7 +526,7 @@ class OnlineFilter:
         return self._usual
 
     def _time_of(self, time: Any) -> Any:
-        """Return the time of a measurement, s, as of :meth:`_times`."""
+        """Return the time of a measurement, s, ``(N,)``, for one track a float."""
         if time is None:
             return self._running().input["time"] + self._default_interval()
         if self.tracks == 1 and isinstance(time, float | int) and 0.0 <= time < SINCE_1970:
@@ -530,9 +534,7 @@ class OnlineFilter:
         return self._times(time)
 
     def _refuse_interval(self, at: Any) -> None:
-        """Raise ValueError for times that are closer than any sensor is read, where motion is rounding, or than the
-        gains of the filter allow.
-        """
+        """Raise ValueError for times closer than the sampling of any sensor, or than the gains of the filter allow."""
         last, share = self._running().input["time"], self.model.filter.least_interval
         why = f": the gains of {self.name!r} are made for {self._usual:g} s and make speeds of noise below"
         raise ValueError(
@@ -541,11 +543,12 @@ class OnlineFilter:
         )
 
     def _check_covariance(self, initial: Any) -> None:
-        """Raise ValueError for an initial covariance that is none."""
+        """Raise ValueError for an invalid initial covariance."""
         covariance = getattr(initial, "covariance", None)
         if covariance is None:
             return
-        # Where an environment begins with what is known exactly, it may be: the others must be definite.
+        # Components that the environment knows exactly at the start may have variance zero: the others must be
+        # definite.
         known = numpy.einsum("iin->in", self.input.initial.covariance)[:, :1] == 0.0
         exact = known & (numpy.einsum("iin->in", covariance) == 0.0) & (covariance == 0.0).all(axis=1)
         fault = _fault_of(initial.mean, covariance + numpy.eye(len(exact))[:, :, None] * exact)
@@ -562,17 +565,17 @@ class OnlineFilter:
         return map_arrays(lambda array: numpy.ascontiguousarray(array[..., self._pad]), part)
 
     def _check_restart(self) -> None:
-        """Raise ValueError where single tracks cannot start anew."""
+        """Raise ValueError where single tracks cannot restart."""
         self._running()
         if self._interval > 1 or self.model.filter.in_python:
             raise ValueError(
-                f"{self.name!r} cannot start single tracks anew "
-                f"({'decisions hold for several measurements' if self._interval > 1 else 'it runs in Python'}): follow "
-                "each with a filter of its own"
+                f"{self.name!r} cannot restart single tracks "
+                f"({'decisions hold for several measurements' if self._interval > 1 else 'it runs in Python'}): run "
+                "each with its own filter"
             )
 
     def _merge(self, begun: OnlineState, tracks: Any) -> OnlineState:
-        """Let some tracks begin, and the others go on."""
+        """Merge the states of restarted tracks with those of the others."""
         chosen = numpy.zeros(self.tracks, dtype=bool)
         try:
             numbers = numpy.asarray(tracks)
@@ -601,39 +604,39 @@ class OnlineFilter:
 
 
 def _shapes(part: Any) -> list[tuple[int, ...]]:
-    """Shapes of nested tuples of arrays."""
+    """Return the shapes of nested tuples of arrays."""
     return [numpy.shape(array) for array in leaves(part)]
 
 
 def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
-    """Report the estimate, and what the filter says of the measurement."""
+    """Return the estimate, and the filter's statistics of the measurement."""
     records = model.filter.records(episode.filter, episode.measurement)
     mean, covariance = model.filter.mean(episode.filter), model.filter.covariance(episode.filter)
     known = {name: records[name] for name in REPORTED if name in records}
-    if "lost" not in known:  # a policy and an agent steer a filter that nobody else looks at
+    if "lost" not in known:  # the filter inside a policy is not checked elsewhere
         nothing = 0.0 * model.task.xp.ones_like(mean[0])
         known["lost"] = find_fault(mean, covariance, nothing, nothing, model.task.xp)
     return {"mean": mean, "covariance": covariance, **known}
 
 
 def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
-    """Numbers of what is wrong with estimates, see :func:`.filters.find_fault`, ``(N,)``."""
+    """Return the numbers of the faults of estimates, see :func:`.filters.find_fault`, ``(N,)``."""
     nothing = numpy.zeros(mean.shape[-1])
     return numpy.asarray(find_fault(mean, covariance, nothing, nothing, numpy))
 
 
 def _any(condition: Any) -> bool:
-    """Whether a condition holds of one track at least."""
+    """Return whether a condition holds for at least one track."""
     return condition if condition.__class__ is bool else bool(numpy.count_nonzero(condition))
 
 
 def _plain(values: Any) -> Any:
-    """A number where all are the same."""
+    """Return a number where all are equal."""
     return values if values.__class__ is float or (values != values[0]).any() else float(values[0])
 
 
 def _check_lag(lag: Any) -> int | timedelta:
-    """Return how late a measurement may come, or raise ValueError for what is neither a number nor a time."""
+    """Return the lag, or raise ValueError if it is neither a number of measurements nor a time."""
     if not isinstance(lag, timedelta):
         return check_integer("lag", lag, 0)
     if lag < timedelta(0):
@@ -642,7 +645,7 @@ def _check_lag(lag: Any) -> int | timedelta:
 
 
 def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Measurement that has what another lacks, both of one time; None where it lacks nothing, or they differ."""
+    """Return a measurement completed by another of the same time; None where it is complete, or they differ."""
     both, new = dict(given), False
     for name, value in late.items():
         first, second = _numbers(given.get(name)), _numbers(value)
@@ -659,7 +662,7 @@ def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _numbers(value: Any) -> numpy.ndarray:
-    """What a sensor said, as numbers; NaN where it is none, which whoever takes it in says."""
+    """Return the value of a sensor as numbers; NaN where it is no number, which the environment reports."""
     try:
         return read_numbers("it", numpy.nan if value is None else value)
     except ValueError:

@@ -1,4 +1,4 @@
-"""What a running filter says after a measurement, and all that it remembers."""
+"""Estimate of a running filter after a measurement, and the filter's complete state."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,58 +10,58 @@ from ...envs.engine.programs import Report
 
 
 class Watch(Protocol):
-    """Compares what a network is shown with its training."""
+    """Functions that compare the inputs of a network with those of its training."""
 
     memory: Any
-    """What it has seen so far."""
+    """Memory of the inputs so far."""
     observe: Report | None
-    """Function of model and episode: what the network of an estimator is shown, ``(fields, N)``; None: the network is a
-    policy, and is shown what policies are."""
+    """Function of model and episode that returns the inputs of an estimator's network, ``(fields, N)``; None: the
+    network is a policy, whose inputs are the observations."""
 
     def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
-        """Look at what is shown, ``(N, fields)``; ``start`` where the track has just begun."""
+        """Update the memory with inputs ``(N, fields)``; ``start`` where the track has just begun."""
         ...
 
     def describe(self) -> list[str]:
-        """Return what is unusual, in words, for each track; empty where nothing is."""
+        """Return a description of unusual inputs for each track; empty where there are none."""
         ...
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a filter says after a measurement; C components, and for N tracks side by side a last axis of N."""
+    """Estimate of a filter after a measurement; C components, and for N tracks side by side a last axis of N."""
 
     time: Any
-    """s."""
+    """Time, s."""
     names: tuple[str, ...]
-    """Of the components."""
+    """Names of the components."""
     units: tuple[str, ...]
-    """Of the components."""
+    """Units of the components."""
     mean: numpy.ndarray
-    """``(C,)``."""
+    """Mean of the components, ``(C,)``."""
     covariance: numpy.ndarray
-    """``(C, C)``."""
+    """Covariance of the components, ``(C, C)``."""
     nis: Any = None
-    """Normalised innovation squared of the measurement; NaN where none was received, None where the filter does not
-    say it; likewise what follows."""
+    """Normalised innovation squared of the measurement; NaN where none was received. This and the following are None
+    where the filter does not report them."""
     nis_degrees: Any = None
-    """Numbers of the measurement that it counts: its mean, if the filter is consistent."""
+    """Degrees of freedom of ``nis``: its mean, if the filter is consistent."""
     log_likelihood: Any = None
-    """Log-density of the measurement as it was predicted, nats."""
+    """Log-density of the measurement under its prediction, nats."""
     mode_probability: Any = None
     """Probabilities of the hypotheses, ``(M,)``."""
     lost: Any = ""
-    """Why an estimator's answers are no estimates any more; a list for several tracks."""
+    """Reason why an estimator's track is lost; a list for several tracks."""
     departure: Any = ""
-    """What is unlike the training of a network inside; likewise."""
+    """Difference of a network's inputs from those of its training; a list for several tracks."""
 
     @property
     def sigma(self) -> numpy.ndarray:
-        """Standard deviations that the filter states, ``(C,)``."""
+        """Standard deviations that the filter reports, ``(C,)``."""
         return numpy.sqrt(numpy.einsum("ii...->i...", self.covariance))
 
     def __getitem__(self, name: str) -> Any:
-        """Mean of a component, by its name."""
+        """Return the mean of a component, by its name."""
         return self.mean[self.names.index(name)]
 
     def __str__(self) -> str:
@@ -72,14 +72,14 @@ class Estimate:
 
 
 class Taken(NamedTuple):
-    """A measurement that was taken in."""
+    """A measurement that the filter has processed."""
 
     time: numpy.ndarray
-    """s, ``(N,)``."""
+    """Time, s, ``(N,)``."""
     values: Mapping[str, Any]
-    """What the sensors said."""
+    """Values of the sensors."""
     before: "OnlineState"
-    """Without a history."""
+    """State before the measurement, without a history."""
 
 
 @dataclass(frozen=True)
@@ -93,32 +93,32 @@ class History:
 
 
 class OnlineState(NamedTuple):
-    """All that a running filter remembers; it can be pickled.
+    """Complete state of a running filter; it can be pickled.
 
-    ``owner`` says whose it is: environment and its interface, filter, tracks, version of the package.
+    ``owner`` identifies the filter: environment and its interface, filter, tracks, version of the package.
     """
 
     filter: Any
-    """Of the filter, arrays ``(..., N)``."""
+    """State of the filter, arrays ``(..., N)``."""
     input: Any
-    """Of the measurements before: ``time`` and whatever else."""
+    """Memory of the measurements before: ``time`` and other values."""
     policy: Any = None
-    """What a policy remembers."""
+    """Memory of a policy."""
     fresh: numpy.ndarray | None = None
-    """Which tracks have just begun, for the policy, ``(N,)``."""
+    """True for tracks that have just begun, for the policy, ``(N,)``."""
     measurements: int = 0
-    """So far."""
+    """Number of measurements so far."""
     action: Any = None
-    """In force, where one holds for several measurements."""
+    """Action in force, where one holds for several measurements."""
     total: Any = 0.0
-    """Sums of what is shown as a mean since the last decision."""
+    """Sums since the last decision of the fields observed as means."""
     python: Any = None
     """Memory of an estimator that runs in Python."""
     watch: Any = None
     """Memory of the watch."""
     owner: tuple[str, ...] = ()
-    """Of which filter it is; no other goes on from it."""
+    """Identity of the filter; no other filter accepts the state."""
     history: History = History()
-    """Of a filter that takes late measurements, what these may have to be followed by again."""
+    """Measurements that must be processed again after a late one, for a filter with a lag."""
     too_late: int = 0
-    """Measurements so far that were older than the history."""
+    """Number of measurements so far that were older than the history."""

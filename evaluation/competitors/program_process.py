@@ -1,8 +1,8 @@
-"""A program in a process of its own, and the pipes to it.
+"""A program in its own process, and the pipes to it.
 
-A question is written and an answer read at the same time, so that neither side waits for the other with a full pipe.
-What goes wrong, a program that ends, is late or says too much, is a :class:`Failure` with its reason. The process
-and whatever it has begun end with the object, or with Python.
+A request is written and a response read at the same time, so that neither side waits for the other with a full pipe. A
+program that ends, is late or writes too much raises a :class:`Failure` with its reason. The process and all that it has
+started end with the object, or with Python.
 """
 
 import os
@@ -22,14 +22,14 @@ from . import isolated_estimator
 
 
 def quickest_form(source: str) -> str:
-    """Return the compiled form of a source file, which starts in half the time, where it is of this text; else it."""
+    """Return the compiled form of a source file, which starts in half the time, if it is up to date; else the file."""
     compiled = cache_from_source(source)
     try:
         with open(compiled, "rb") as file:
             header, now = file.read(16), os.stat(source)
     except OSError:
         return source
-    # As the import system tells: no flags, then date and size of the source.
+    # The header that the import system writes: no flags, then date and size of the source.
     mark = struct.pack("<LLL", 0, int(now.st_mtime) & 0xFFFFFFFF, now.st_size & 0xFFFFFFFF)
     return compiled if header[4:] == mark else source
 
@@ -38,27 +38,27 @@ LAUNCHER = quickest_form(isolated_estimator.__file__)
 ENDED, LATE, WRONG = 6, 7, 8
 """Numbers of the reasons among :data:`..storage.dataset.FAULTS`."""
 START_SECONDS = 30.0
-"""For the first answer, where the limit is shorter: an interpreter takes its time to start."""
+"""Limit for the first response, s, where the usual one is shorter: an interpreter starts slowly."""
 END_SECONDS = 1.0
-"""That a program has to end in peace."""
+"""Time that a program has to end by itself, s."""
 PIPE_BYTES = 1 << 20
-"""Of a pipe, where the system can be asked for it: a message of a thousand tracks is one piece then."""
+"""Size of a pipe, bytes, where the system can set it: then a message of a thousand tracks is one piece."""
 MORE = "it has written more than an answer"
 LAST_WORDS = 2000
-"""Bytes of standard error that are kept."""
+"""Bytes of standard error that are stored."""
 
 
 class Limits(NamedTuple):
-    """What a program may take."""
+    """Limits of a program's time and memory."""
 
     seconds: float = 10.0
-    """s from a question to its whole answer."""
+    """Time from a request to its whole response, s."""
     memory: float = 4000.0
-    """MB of address space; 0: as much as there is. Only Linux limits it."""
+    """Address space, MB; 0: no limit. Only Linux applies it."""
 
 
-class Failure(Exception):  # noqa: N818  (no error of ours: what a program has done)
-    """Why there is no answer."""
+class Failure(Exception):  # noqa: N818  (a program's failure, not an error of this package)
+    """A missing or wrong response, with its reason."""
 
     def __init__(self, fault: int, words: str) -> None:
         super().__init__(words)
@@ -66,12 +66,12 @@ class Failure(Exception):  # noqa: N818  (no error of ours: what a program has d
 
 
 class ProgramProcess:
-    """A program that runs.
+    """A running program.
 
     Args:
-        command: its words; nothing of it is given to a shell. None: an estimator, see :mod:`.isolated_estimator`.
-        limits: that it has.
-        environment: variables; None: those of this process.
+        command: its words; no shell runs it. None: an estimator, see :mod:`.isolated_estimator`.
+        limits: of its time and memory.
+        environment: environment variables; None: those of this process.
 
     Raises:
         OSError: if it cannot be started.
@@ -90,7 +90,7 @@ class ProgramProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env=None if environment is None else dict(environment),
-            start_new_session=True,  # Ctrl-C is for us, and we end the whole group
+            start_new_session=True,  # Ctrl-C is for this process, which ends the whole group
         )
         self._answers = selectors.DefaultSelector()
         self.end = weakref.finalize(self, _end, process, self._answers)
@@ -105,15 +105,15 @@ class ProgramProcess:
         self._seconds = max(limits.seconds, START_SECONDS)
 
     def exchange(self, question: bytes, size: int | None, most: int = 0) -> bytes:
-        """Write a question, and return the answer.
+        """Write a request, and return the response.
 
         Args:
-            question: bytes.
-            size: bytes of the answer; None: it is a line.
-            most: bytes that a line may have.
+            question: bytes of the request.
+            size: bytes of the response; None: it is a line.
+            most: maximal bytes of a line.
 
         Raises:
-            Failure: if there is no such answer in time.
+            Failure: if there is no such response in time.
         """
         unsent, until = memoryview(question), time.monotonic() + self._seconds
         self._read(self._from)
@@ -131,19 +131,20 @@ class ProgramProcess:
             for key, _ in self._answers.select(left):
                 self._read(key.fd)
 
-    def tell(self, message: bytes) -> None:
-        """Write what has no answer.
+    def send(self, message: bytes) -> None:
+        """Write a message without a response.
 
         Raises:
-            Failure: if it is not taken in time.
+            Failure: if the program does not read it in time.
         """
         self.exchange(message, 0)
 
     def finish(self) -> None:
-        """End its input, and see that nothing follows its last answer; a program may take ``END_SECONDS`` to end.
+        """Close its input, and check that nothing follows its last response; a program has ``END_SECONDS`` to end.
 
         Raises:
-            Failure: if something does: then an earlier answer was one too many, and later ones were of other questions.
+            Failure: if something does: then an earlier response was one too many, and later ones belong to other
+                requests.
         """
         if self._process.stdin is not None:
             self._process.stdin.close()
@@ -160,12 +161,12 @@ class ProgramProcess:
             raise Failure(WRONG, MORE)
 
     def _write(self, unsent: memoryview) -> memoryview:
-        """Write what fits into the pipe, and wait for room for the rest."""
+        """Write as much as the pipe takes, and wait for room for the rest."""
         try:
             unsent = unsent[os.write(self._to, unsent) :]
         except BlockingIOError:
             pass
-        except OSError:  # nobody reads any more
+        except OSError:  # the program has closed its input
             raise self._explain_end() from None
         waits = self._to in self._answers.get_map()
         if unsent and not waits:
@@ -191,7 +192,7 @@ class ProgramProcess:
             self._buffer += found
 
     def _whole_answer(self, size: int | None, most: int) -> bytes | None:
-        """Take an answer out of what was read; None where it is not all there."""
+        """Return a response from the bytes read so far; None where it is incomplete."""
         buffer = self._buffer
         if size is None:
             end = buffer.find(b"\n")
@@ -207,7 +208,7 @@ class ProgramProcess:
         return found
 
     def _explain_end(self) -> Failure:
-        """Say how the program has ended, with the last line that it wrote to standard error."""
+        """Return how the program has ended, with the last line that it wrote to standard error."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         if self._errors in self._answers.get_map():
@@ -226,7 +227,7 @@ class ProgramProcess:
 
     @property
     def apart(self) -> bool:
-        """Whether it is in a PID namespace of its own, once it has answered; True where only Linux could say."""
+        """Whether it is in its own PID namespace, after its first response; True on systems other than Linux."""
         try:
             return os.readlink(f"/proc/{self._process.pid}/ns/pid_for_children") != os.readlink(
                 "/proc/self/ns/pid"
@@ -236,7 +237,7 @@ class ProgramProcess:
 
     @property
     def processor_seconds(self) -> float:
-        """Processor time of the process and of all that it has begun, s; NaN where the system does not say."""
+        """Processor time of the process and of all that it has started, s; NaN where the system does not report it."""
         if sys.platform != "linux":
             return float("nan")
         children: dict[int, list[int]] = {}
@@ -247,7 +248,7 @@ class ProgramProcess:
                 children.setdefault(int(state[1]), []).append(int(name))
                 ended[int(name)] = int(state[13]) + int(state[14])
         seconds, processes = 0.0, [self._process.pid]
-        for process in processes:  # which grow, each with those of its children that have ended
+        for process in processes:  # each count includes the children that have ended
             processes += children.get(process, [])
             try:
                 seconds += time.clock_gettime((~process << 3) | 2)  # clock_getcpuclockid(3)
@@ -258,7 +259,7 @@ class ProgramProcess:
 
 
 def _widen(pipe: int) -> None:
-    """Ask for a larger pipe, where that can be."""
+    """Enlarge a pipe, where the system can."""
     if sys.platform == "linux":
         import fcntl
 
@@ -267,14 +268,14 @@ def _widen(pipe: int) -> None:
 
 
 def _end(process: "subprocess.Popen[bytes]", answers: selectors.BaseSelector) -> None:
-    """Close the pipes and end the process with all that it has begun; it leaves no zombie."""
+    """Close the pipes and end the process with all that it has started; no zombie remains."""
     answers.close()
     for stream in (process.stdin, process.stdout, process.stderr):
         if stream is not None:
             stream.close()
     with suppress(subprocess.TimeoutExpired):
         process.wait(END_SECONDS)  # a program ends when its standard input does
-    process.terminate()  # what waits for it ends what it has begun
+    process.terminate()  # its parent process ends all that it has started
     with suppress(subprocess.TimeoutExpired):
         process.wait(END_SECONDS)
     with suppress(OSError):

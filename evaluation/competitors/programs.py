@@ -1,20 +1,20 @@
-"""Programs of any language as competitors: each in a process of its own, over standard input and output.
+"""Programs in any language as competitors, each in its own process, by standard input and output.
 
-The protocol is version 1; docs/programs.md says the same to whoever writes a program.
+This is version 1 of the protocol; docs/programs.md describes it for authors of programs.
 
-1. We write a line of JSON, the **hello**: what is estimated, the fields of what will come, and how many tracks
-   there are.
-2. The program answers with a line: the version, and in which format it wants the rest, ``json`` or ``float64``; or with
-   an ``error``, one sentence, and then takes no part.
-3. We write the initial estimate, which has no answer, and then one measurement after another. Each is answered with
-   means and covariances, before the next one comes.
-4. At the end we close the program's standard input, and it ends.
+1. This package writes a line of JSON, the **hello**: the estimated components, the fields of the messages, and the
+    number of tracks.
+2. The program writes a line: the version, and the format of all further messages, ``json`` or ``float64``; or an
+    ``error``, one sentence, and then takes no part.
+3. This package writes the initial estimate, which has no response, and then one measurement after another. For each the
+    program writes means and covariances before the next one is sent.
+4. At the end this package closes the program's standard input, and the program ends.
 
 As ``json`` a message is a line, as ``float64`` a frame of little-endian numbers without a head: for every track its
 fields, or mean and covariance, row by row. So thousands of tracks are one message.
 
-Where the task says what feedback means (:class:`.ArrayMeanings`), the hello offers it, and a program that answers
-``"feedback": true`` gives after mean and covariance what else steers the world.
+Where the task defines feedback (:class:`.ArrayMeanings`), the hello offers it. A program that responds with
+``"feedback": true`` writes its feedback after mean and covariance.
 """
 
 import json
@@ -39,28 +39,28 @@ from .kinds import Competitor, Kind
 from .program_process import WRONG, Failure, Limits, ProgramProcess
 
 VERSION = 1
-"""Of the protocol."""
+"""Version of the protocol."""
 LONGEST_HELLO = 10_000
-"""Bytes of the answer to the hello."""
+"""Maximal length of the response to the hello, bytes."""
 BYTES_OF_NUMBER = 40
-"""Of JSON, at most, with what stands around it."""
+"""Maximal bytes of a number in JSON, with its separators."""
 NO_NAMESPACES = "no PID namespace here: it could end or slow this process"
-"""What a system without them cannot close, before a program runs."""
+"""Warning before a program runs on a system without namespaces: what remains possible."""
 USUAL = Limits()
 LIMITS: ContextVar[Limits] = ContextVar("limits", default=USUAL)
-"""Of the programs that are named while it is in force."""
+"""Limits of the programs that are named while it is in force."""
 
 
 @contextmanager
 def limit_programs(seconds: float, memory: float) -> Iterator[None]:
-    """Give limits to the programs that are named inside, see :class:`.program_process.Limits`.
+    """Set the limits of the programs that are named inside the context, see :class:`.program_process.Limits`.
 
     Raises:
-        ValueError: for what is no limit.
+        ValueError: for a time that is not above zero, or a negative memory.
     """
     if not seconds > 0.0 or not memory >= 0.0:
         raise ValueError(
-            f"a time limit is above zero and a memory limit not below, got {seconds} and {memory}"
+            f"a time limit must be above zero and a memory limit not negative, got {seconds} and {memory}"
         )
     token = LIMITS.set(Limits(seconds, memory))
     try:
@@ -70,8 +70,9 @@ def limit_programs(seconds: float, memory: float) -> Iterator[None]:
 
 
 def search_path() -> str:
-    """Return the folders where programs are looked for, with those of the virtual environment first that runs this
-    process: ``python`` is the interpreter that has the package, whether the environment is activated or not.
+    """Return the search path for programs, with the folder of this process's virtual environment first.
+
+    So ``python`` is the interpreter that has the package, whether the environment is activated or not.
     """
     usual = os.environ.get("PATH", os.defpath)
     return (
@@ -81,12 +82,12 @@ def search_path() -> str:
 
 @dataclass(frozen=True)
 class Program:
-    """A program that competes, as an estimator; made for a task it waits for a track to begin.
+    """A program that competes as an estimator; called with a task it returns the estimator.
 
     Args:
-        command: the program and its arguments, one text as in a shell; nothing of it is given to one.
-        limits: of its time for an answer and of its memory.
-        words: see below, likewise the others.
+        command: the program and its arguments, one text as in a shell; no shell runs it.
+        limits: of its time for each response and of its memory.
+        words: see the attributes, also for the other arguments.
 
     Raises:
         ValueError: if there is no such program, or no system on which it could run.
@@ -95,18 +96,18 @@ class Program:
     command: str
     limits: Limits = field(default_factory=LIMITS.get)
     words: tuple[str, ...] | None = None
-    """Of the command; default: what a shell would make of it; none: of an estimator in Python."""
+    """Words of the command; default: the command split as by a shell; empty: an estimator in Python."""
     preface: bytes = field(default=b"", repr=False)
-    """What is written before the hello."""
+    """Bytes that are written before the hello."""
     environment: tuple[tuple[str, str], ...] | None = None
-    """Variables of the process; None: ours, with :func:`search_path`."""
+    """Environment variables of the process; None: those of this process, with :func:`search_path`."""
     kind: ClassVar[Kind] = "estimator"
     is_program: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not hasattr(os, "killpg"):
             raise ValueError(
-                "exec: and --isolated run a program of its own, which needs Linux or macOS: on Windows take WSL"
+                "exec: and --isolated run a separate program, which needs Linux or macOS: on Windows use WSL"
             )
         if self.words is not None:
             return
@@ -127,20 +128,20 @@ class Program:
 
 
 class ArrayField(NamedTuple):
-    """An array of what is written to a program."""
+    """Description of an array in the messages to a program."""
 
     name: str
-    """The names that lead to it, with dots."""
+    """Its name, with dots between the names of nested fields."""
     shape: tuple[int, ...] | None
-    """Of one track; None: it is there in other scenarios, or in recordings."""
+    """Shape for one track; None: it exists in other scenarios, or in recordings, only."""
     type: str
     """``float64``, ``int64`` or ``bool``; in a frame all are float64."""
     about: str
-    """What it is, and its unit."""
+    """Its meaning and unit."""
 
 
 def fields_of(part: Any, prefix: str = "") -> Iterator[ArrayField]:
-    """Say what the arrays of nested NamedTuples ``(..., N)`` are, in the order of ``leaves``."""
+    """Yield descriptions of the arrays of nested NamedTuples ``(..., N)``, in the order of ``leaves``."""
     about = field_words(type(part))
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
@@ -154,13 +155,13 @@ def fields_of(part: Any, prefix: str = "") -> Iterator[ArrayField]:
 
 
 def parameters_of(task: Task) -> dict[str, Any]:
-    """Return the constants of a task that JSON has words for, by name."""
+    """Return by name the constants of a task that JSON can represent."""
     own = task.parameters
     found = {}
     for name in getattr(own, "__dataclass_fields__", ()):
         value = getattr(own, name)
         if value is None and hasattr(own, "value"):
-            with suppress(KeyError):  # what nothing else decides either
+            with suppress(KeyError):  # the parameter has no value in this task
                 value = own.value(name)
         try:
             json.dumps(value, allow_nan=False)
@@ -171,7 +172,7 @@ def parameters_of(task: Task) -> dict[str, Any]:
 
 
 def rows_of(part: Any, count: int) -> numpy.ndarray:
-    """Return the numbers of nested tuples of arrays ``(..., N)``, those of a track in a row, ``(count, numbers)``."""
+    """Return the numbers of nested tuples of arrays ``(..., N)``, one row for each track, ``(count, numbers)``."""
     flat = [numpy.asarray(a, dtype="<f8").reshape(-1, numpy.shape(a)[-1])[:, :count] for a in leaves(part)]
     return numpy.ascontiguousarray(numpy.concatenate(flat).T)
 
@@ -184,9 +185,9 @@ def as_lists(values: numpy.ndarray) -> Any:
 
 
 class ProgramEstimator:
-    """A program in the loop, see :class:`.kinds.Estimator`.
+    """A program as an estimator, see :class:`.kinds.Estimator`.
 
-    What it does wrong ends no evaluation: all its tracks are lost from there on, and a warning says why.
+    Its faults do not end an evaluation: all its tracks are lost from then on, and a warning gives the reason.
 
     Args:
         task: the estimation problem.
@@ -194,9 +195,9 @@ class ProgramEstimator:
 
     Attributes:
         tracks: how many of the N lanes are tracks; the others repeat the last one.
-        last: number of the last measurement, whose answer nothing may follow; None where that is not known.
-        fault: number of the reason among ``FAULTS`` for which there is no answer; 0 while there is.
-        feedback: what it has reported to steer the world, ``(..., N)``; None where it does not.
+        last: number of the last measurement, after whose response the program must write nothing; None where unknown.
+        fault: number among ``FAULTS`` of the reason for a missing response; 0 while it responds.
+        feedback: its feedback to the world, ``(..., N)``; None where it gives none.
     """
 
     kind: ClassVar[Kind] = "estimator"
@@ -211,14 +212,14 @@ class ProgramEstimator:
         self.step_number: int = 0
         self.feedback: numpy.ndarray | None = None
         self._feedback_field: ArrayField | None = None
-        """Feedback of a track: offered in the hello, and reported from then on; None where it is not."""
+        """Description of the feedback of a track, which the hello offers; None where the program does not use it."""
         self._process: ProgramProcess | None = None
         self._format = ""
         self._initial: numpy.ndarray | None = None
         self._fields: list[ArrayField] = []
 
     def start(self, initial: Any, N: int) -> int:
-        """Start the program; what it is told waits for the first measurement, whose fields it is told too.
+        """Start the program; the hello waits for the first measurement, since it describes its fields.
 
         Raises:
             ValueError: if it cannot be started.
@@ -241,10 +242,10 @@ class ProgramEstimator:
         return 0
 
     def update(self, memory: int, measurement: Any) -> tuple[Array, Array, int]:
-        """Ask it; the memory is the number of measurements.
+        """Exchange a measurement for an estimate; the memory is the number of measurements.
 
         Raises:
-            ValueError: if it takes no part, or is to go back, which a process cannot.
+            ValueError: if the program takes no part, or for an earlier memory, since a process cannot go back.
         """
         if memory != self.step_number:
             raise ValueError("a program cannot go back to an earlier measurement")
@@ -256,7 +257,7 @@ class ProgramEstimator:
             try:
                 if memory == 0:
                     self._greet(measurement)
-                found = self._ask(rows_of(measurement, self.count), C)
+                found = self._exchange(rows_of(measurement, self.count), C)
                 if self.step_number == self.last:
                     self._process.finish()
                 answer = found
@@ -277,7 +278,7 @@ class ProgramEstimator:
         return answer[:C], answer[C : C + C * C].reshape(C, C, width), self.step_number
 
     def processor_seconds(self) -> float:
-        """Processor time that the program has taken, s; NaN where that is not known."""
+        """Return the processor time of the program, s; NaN where unknown."""
         return float("nan") if self._process is None else self._process.processor_seconds
 
     def end(self) -> None:
@@ -287,7 +288,7 @@ class ProgramEstimator:
             self._process = None
 
     def hello(self, measurement: Any) -> dict[str, Any]:
-        """Return what a program is told first; what programs in plain C look for comes first in it."""
+        """Return the hello, with the keys that programs in plain C search at its beginning."""
         C, measured = len(self.task.components), list(fields_of(measurement))
         numbers = {"initial": _count(self._fields), "measurement": _count(measured), "answer": C + C * C}
         offered = {}
@@ -312,12 +313,12 @@ class ProgramEstimator:
 
     @property
     def _answer_size(self) -> int:
-        """Numbers of a track that an answer has."""
+        """Return the number of numbers of a track in a response."""
         C = len(self.task.components)
         return C + C * C + (0 if self._feedback_field is None else _count([self._feedback_field]))
 
     def _greet(self, measurement: Any) -> None:
-        """Say hello, and hand over the initial estimate."""
+        """Exchange the hello, and write the initial estimate."""
         assert self._process is not None
         assert self._initial is not None
         hello = self.program.preface + json.dumps(self.hello(measurement)).encode() + b"\n"
@@ -336,7 +337,7 @@ class ProgramEstimator:
         self._format = answer["format"]
         if answer.get("feedback") is not True:
             self._feedback_field = None
-        self._process.tell(self._message("initial", self._fields, self._initial))
+        self._process.send(self._message("initial", self._fields, self._initial))
         self._fields = list(fields_of(measurement))
 
     def _message(self, name: str, fields: Sequence[ArrayField], rows: numpy.ndarray) -> bytes:
@@ -352,8 +353,8 @@ class ProgramEstimator:
             place += size
         return json.dumps({name: content}).encode() + b"\n"
 
-    def _ask(self, rows: numpy.ndarray, C: int) -> numpy.ndarray:
-        """Answer to a measurement, ``(tracks, C + C * C)``."""
+    def _exchange(self, rows: numpy.ndarray, C: int) -> numpy.ndarray:
+        """Return the response to a measurement, ``(tracks, C + C * C)``."""
         assert self._process is not None
         question = self._message("measurement", self._fields, rows)
         size = self.count * self._answer_size
@@ -380,15 +381,15 @@ class ProgramEstimator:
 
 
 def _count(fields: Sequence[ArrayField]) -> int:
-    """Numbers of a track."""
+    """Return the numbers of a track."""
     return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 
 
 def _read_object(line: bytes) -> dict[str, Any]:
-    """Read an answer.
+    """Parse a response.
 
     Raises:
-        Failure: if it is no object of JSON.
+        Failure: if it is no JSON object.
     """
     try:
         found = json.loads(line)
@@ -396,7 +397,7 @@ def _read_object(line: bytes) -> dict[str, Any]:
         found = None
     if not isinstance(found, dict):
         shown = "".join(c if c.isprintable() else " " for c in line[:80].decode(errors="replace"))
-        raise Failure(WRONG, f"it has answered with no object of JSON: {shown!r}")
+        raise Failure(WRONG, f"its answer is no JSON object: {shown!r}")
     return found
 
 

@@ -1,4 +1,4 @@
-"""A smoother in the loop: run forward like an estimator, then asked again with all that it has kept."""
+"""Smoothers in the loop: a forward run as an estimator, then the smoothed estimates."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -16,11 +16,11 @@ from ...envs.engine.lanes import Lanes, whole_episode
 from ...envs.engine.programs import Report
 from ...filters.array_namespace import map_nested
 from ...filters.scans import TOGETHER, Scans, over_time, stack_scans
-from .filters import Adapted, Checked, find_fault, is_lacking
+from .filters import AdaptedState, Checked, find_fault, is_lacking
 
 
 class SmoothedTrack(Filter[Task, Any, int]):
-    """An estimator that answers what a smoother has found before; its state counts the measurements.
+    """An estimator whose estimates a smoother has computed before; its state counts the measurements.
 
     Args:
         task: the estimation problem.
@@ -36,10 +36,10 @@ class SmoothedTrack(Filter[Task, Any, int]):
         self.covariances = covariances
         count = means.shape[-1]
         self.lanes: numpy.ndarray = numpy.minimum(numpy.arange(round_up_lanes(count)), count - 1)
-        """Episodes in lanes, the last one again in those beyond."""
+        """Index of the episode of each lane; lanes beyond repeat the last one."""
 
     def start(self, initial: Any) -> int:
-        """Nothing is measured yet."""
+        """Return the state before the first measurement."""
         return 0
 
     def update(self, state: int, given: FilterInput) -> int:
@@ -56,34 +56,34 @@ class SmoothedTrack(Filter[Task, Any, int]):
 
 
 def check_open_loop(model: Model, name: str) -> None:
-    """Raise ValueError if the estimate decides what is measured next: then there is nothing to be smoothed, or to be
-    answered from a file.
+    """Raise ValueError if the loop is closed: estimates of a smoother or from a file cannot steer the next
+    measurements.
 
     Args:
-        model: in which a smoother, or what answers from a file, is to run.
-        name: what it is, and its name.
+        model: model in which the smoother or the estimates from a file are to run.
+        name: kind and name of the competitor.
     """
     if model.task.closes_loop:
         raise ValueError(
-            f"{name} cannot run in {model.task.id}, a closed loop with these parameters, in which the "
-            "estimate steers what is measured later: leave it out"
+            f"{name} cannot run in {model.task.id}, a closed loop with these parameters, where the "
+            "estimate determines later measurements: leave it out"
         )
 
 
 def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Run a smoother forward over episodes, then let it smooth them.
+    """Run a smoother forward over episodes, then smooth them.
 
     Args:
-        looped: model whose filter it is.
-        lanes: its episodes, with their first measurement made.
-        length: measurements of each of them.
-        name: of the smoother, in errors.
+        looped: model with the smoother as its filter.
+        lanes: episodes of the model, with their first measurement.
+        length: number of measurements of each episode.
+        name: name of the smoother in errors.
 
     Returns:
         Means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of K measurements.
 
     Raises:
-        ValueError: if what it returns has other shapes.
+        ValueError: if its estimates have other shapes.
     """
     run = _run_compiled if can_step(looped, report_forward) else _step_forward
     measurements, memories = run(looped, lanes, length)
@@ -98,7 +98,7 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
 
 
 def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
-    """Measurements and memories of a smoother that is stepped."""
+    """Return the measurements and memories of a smoother that is stepped."""
 
     def memory_in(episode: Any) -> Any:
         return looped.filter.own.memory if looped.filter.in_python else episode.filter.own
@@ -114,17 +114,17 @@ def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], 
 
 
 def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
-    """Report what a smoother is given back."""
+    """Report the inputs of ``smooth``."""
     return episode.measurement, episode.filter.own
 
 
 def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
-    """Measurements and memories of a smoother that is compiled; its measurements are masked as it is shown them."""
+    """Return the measurements, masked as the smoother receives them, and the memories of a compiled smoother."""
     start = map_nested(lambda values: values[None, ..., : lanes.count], lanes.state.filter.own)
     measured: list[Any] = []
     memories = [start]
     for stretch in run_stretches(lanes, report_forward, length):
-        # Copies without the lanes beyond, by which those of one episode are eight times as long.
+        # Copies without the padding lanes, which make the arrays of one episode eight times as long.
         measurement, memory = map_nested(lambda values: values[..., : lanes.count].copy(), stretch)
         masked = over_time(looped.task.world.mask_missing, stack_scans(Scans(measurement)))
         measured.append(map_nested(lambda values: numpy.moveaxis(values, -2, 0), masked))
@@ -133,12 +133,12 @@ def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scan
 
 
 def run_stretches(lanes: Lanes, report: Report, length: int) -> Iterator[Any]:
-    """Run episodes that have just begun, and yield reports on some measurements after the others, ``(scans, ..., N)``.
+    """Run episodes from their start, and yield reports on successive stretches of measurements, ``(scans, ..., N)``.
 
     Args:
-        lanes: compiled ones, whose filter nothing steers.
+        lanes: compiled episodes, whose filter has no policy.
         report: as of :meth:`.Lanes.run`.
-        length: measurements of each of them.
+        length: number of measurements of each episode.
     """
     together = max(1, TOGETHER // lanes.width)
     for first in range(0, length, together):
@@ -149,28 +149,28 @@ def _join(stretches: Sequence[Any]) -> Any:
     return map_nested(lambda *arrays: numpy.concatenate(arrays), *stretches)
 
 
-# --- what is reported of the smoothed track
+# --- reports on the smoothed track
 
 
 def report_world(model: Model, episode: Episode) -> tuple[Any, Any]:
-    """Report what happens whatever is estimated."""
+    """Report the quantities of the world, which do not depend on the estimate."""
     return episode.truth, episode.measurement
 
 
 def report_smoothed(
     looped: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
 ) -> Iterator[dict[str, numpy.ndarray]]:
-    """Report on a smoothed track as if a filter had answered it step by step, for many measurements together.
+    """Report on a smoothed track as on a filter's estimates, for many measurements together.
 
     Args:
-        looped: model whose filter answers it.
-        lanes: compiled episodes of the same world that have just begun, whatever their filter is.
-        track: what was found.
-        report: of arrays ``(..., N)`` by name.
-        length: measurements of each of them.
+        looped: model with the smoothed track as its filter.
+        lanes: compiled episodes of the same world that have just begun, with any filter.
+        track: the smoothed estimates.
+        report: function that returns arrays ``(..., N)`` by name.
+        length: number of measurements of each episode.
 
     Yields:
-        What is reported of some measurements after the others, arrays ``(scans, ..., N)`` by name.
+        Reports on successive stretches of measurements, arrays ``(scans, ..., N)`` by name.
     """
     start, none, first = lanes.state.filter, numpy.zeros(lanes.width), 0
     state = Checked(None, start.mean, start.covariance, none, none)
@@ -187,14 +187,14 @@ def report_smoothed(
 def _check_answers(
     task: Task, before: Checked, measurement: Any, means: numpy.ndarray, covariances: numpy.ndarray
 ) -> Checked:
-    """States of a :class:`.CheckedFilter` at measurements ``(..., scans, N)``, from answers to them.
+    """Return the states of a :class:`.CheckedFilter` at measurements ``(..., scans, N)``, from estimates at them.
 
     Args:
         task: the estimation problem.
-        before: state before the first of them.
-        measurement: all of them.
-        means: ``(C, scans, N)``; what is held is written into it.
-        covariances: ``(C, C, scans, N)``, likewise.
+        before: state before the first measurement.
+        measurement: all measurements.
+        means: ``(C, scans, N)``; changed in place where an earlier estimate is repeated.
+        covariances: ``(C, C, scans, N)``; changed in place in the same way.
     """
     lacking = over_time(lambda some: is_lacking(task.world.mask_missing(some), numpy), measurement)
     missed = numpy.maximum.accumulate(numpy.where(lacking, 1.0, before.missed), axis=0)
@@ -203,14 +203,14 @@ def _check_answers(
         return find_fault(mean, covariance, 0.0 * missed, missed, numpy)
 
     fault = numpy.where(before.fault > 0.0, before.fault, over_time(fault_of, means, covariances, missed))
-    # From its first fault on an episode is lost for that reason, and its last valid answer stays.
+    # From its first fault on an episode is lost for that reason, and its last valid estimate is repeated.
     for lane in numpy.flatnonzero((fault > 0.0).any(axis=0)):
         first = numpy.argmax(fault[:, lane] > 0.0)
         fault[first:, lane] = fault[first, lane]
         for answers, start in ((means, before.mean), (covariances, before.covariance)):
             last = answers[..., first - 1, lane] if first else start[..., lane]
             answers[..., first:, lane] = last[..., None]
-    own = Adapted(means, covariances, None, Likelihood.unknown(fault))
+    own = AdaptedState(means, covariances, None, Likelihood.unknown(fault))
     return Checked(own, means, covariances, fault, missed)
 
 

@@ -1,6 +1,6 @@
-"""A bank closed by a policy: a filter like any other, which needs nobody who asks the policy.
+"""A bank closed by a policy, as one filter that calls the policy itself.
 
-Traced for one track, its arithmetic is a straight line: what steers is then compiled and exported with its bank.
+Traced for one track, its arithmetic has no branches, so the policy is compiled and exported with its bank.
 """
 
 import math
@@ -21,43 +21,43 @@ from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array, DecisionMeans
 from ...envs.engine.compiled import CompiledModel, warn_of
 from .filters import AroundBank
-from .kinds import Policy, says_traceable
+from .kinds import Policy, is_traceable
 
 
 class Decisions(NamedTuple):
-    """What a policy has decided so far, and remembers."""
+    """State of a policy: its memory, the action in force and the sums since the decision."""
 
     memory: Any
-    """Of the policy, every array as ``(entries, N)``; before its first decision zeros."""
+    """Memory of the policy, every array as ``(entries, N)``; zeros before its first decision."""
     count: Array
-    """Measurements taken in since the last decision, that of the decision among them; zero before the first one,
+    """Number of measurements since the last decision, including that of the decision; zero before the first one,
     ``(N,)``."""
     action: Array
-    """In force, ``(A, N)``."""
+    """Action in force, ``(A, N)``."""
     total: Array
-    """Sums over the measurements since the last decision of the fields that are shown as means, ``(fields, N)``."""
+    """Sums since the last decision of the fields that are observed as means, ``(fields, N)``."""
 
 
 Act = Callable[[Array, Any, Array], tuple[Array, Any]]
-"""From an observation ``(N, fields)``, memory, and whether the episode begins ``(N,)``, to an action ``(N, A)`` or
-``(N,)`` and the memory."""
+"""Function of an observation ``(N, fields)``, a memory, and whether the episode begins ``(N,)``; returns an action
+``(N, A)`` or ``(N,)`` and the memory."""
 
 
 class Decider:
-    """A policy asked at every measurement, of whose answers those stand that are due.
+    """A policy that is computed at every measurement; its actions apply where a decision is due.
 
     Args:
-        model: whose observations it is shown.
-        act: asks the policy.
-        memory: that the policy returns, arrays of one track; their values do not matter. The batch is the first axis
-            or else the last. Where one has neither, the filter is for one track: N is 1, or the arrays are traced.
+        model: defines the observations.
+        act: computes the actions.
+        memory: a memory of the policy, arrays of one track; their values do not matter. The batch is the first axis or
+            else the last. Where one has neither, the filter is for one track: N is 1, or the arrays are traced.
         interval: measurements for which an action holds; default: the task's decision interval.
     """
 
     def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
         self._template = memory
         self.xp: ModuleType = model.task.xp
-        self.ask = act
+        self.act = act
         self._shapes = [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
         self.space: gymnasium.Space[Any] = model.action_space
         self.size: int = math.prod(self.space.shape or (1,))
@@ -65,7 +65,7 @@ class Decider:
         self.means: DecisionMeans = DecisionMeans(model.fields, self.interval)
 
     def start(self, zero: Array) -> Decisions:
-        """Nothing is decided yet; all numbers are zero, ``(N,)``."""
+        """Return the state before the first decision; all numbers are zero, ``(N,)``."""
         memory = map_arrays(
             lambda array: self.xp.stack([zero] * max(int(numpy.size(array)), 1)), self._template
         )
@@ -73,7 +73,7 @@ class Decider:
         return Decisions(memory, zero, action, self.xp.stack([zero] * max(len(self.means.columns), 1)))
 
     def is_due(self, state: Decisions) -> Array:
-        """Whether the policy is asked at the next measurement, ``(N,)``."""
+        """Return whether a decision is due at the next measurement, ``(N,)``."""
         return (state.count == 0.0) | (state.count >= float(self.interval))
 
     def decide(self, observation: Array, state: Decisions) -> tuple[Array, Decisions]:
@@ -85,18 +85,19 @@ class Decider:
             total = xp.where(first, 0.0, self.means.add(total, observation))
             observation = xp.where(first, observation, self.means.show(observation, total, xp))
             total = xp.where(due, 0.0, total)
-        answer, memory = self._ask(observation, state.memory, first)
+        answer, memory = self._act(observation, state.memory, first)
         if K > 1:
             answer = xp.where(due, answer, state.action)
             kept = iter(leaves(state.memory))
             memory = map_arrays(lambda array: xp.where(due, array, next(kept)), memory)
         action = answer if self.space.shape else xp.astype(answer[0], xp.int64)
-        # Never more than the interval: float has no whole numbers beyond 2^24 for a filter that runs for days.
+        # Never more than the interval: float has no consecutive whole numbers beyond 2^24, for a filter that runs for
+        # days.
         count = xp.where(due, 1.0, state.count + 1.0) if K > 1 else xp.ones_like(state.count)
         return action, Decisions(memory, count, answer, total)
 
-    def _ask(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
-        """Action ``(A, N)`` and memory, every array ``(entries, N)``."""
+    def _act(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
+        """Return the action ``(A, N)`` and memory, every array ``(entries, N)``."""
         shapes, N = iter(self._shapes), observation.shape[-1]
 
         def restore(array: Array) -> Array:
@@ -115,7 +116,7 @@ class Decider:
                 rows = self.xp.reshape(array, (N if shape[:1] == (1,) else 1, -1)).T
             return self.xp.astype(rows, self.xp.float64)
 
-        answer, memory = self.ask(observation.T, map_arrays(restore, memory), first)
+        answer, memory = self.act(observation.T, map_arrays(restore, memory), first)
         answer = self.xp.asarray(answer)
         if answer.size != self.size * N or (answer.dtype.kind == "f" and not self.space.shape):
             raise ValueError(
@@ -129,9 +130,9 @@ class PolicyFilterState(NamedTuple):
     """State of a steered filter."""
 
     bank: Any
-    """Of the bank."""
+    """State of the bank."""
     policy: Decisions
-    """Of the policy."""
+    """State of the policy."""
 
 
 class SteeredFilter(AroundBank[PolicyFilterState]):
@@ -139,7 +140,7 @@ class SteeredFilter(AroundBank[PolicyFilterState]):
 
     Args:
         model: with the bank.
-        decider: asks the policy.
+        decider: computes the policy's actions.
     """
 
     def __init__(self, model: Model, decider: Decider) -> None:
@@ -154,18 +155,18 @@ class SteeredFilter(AroundBank[PolicyFilterState]):
         return PolicyFilterState(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
 
     def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
-        """Ask the policy where a decision is due, and apply its action."""
+        """Update the bank with the policy's action, chosen anew where a decision is due."""
         observation = self.model.observe(Episode(None, given.measurement, state.bank))
         action, decisions = self.decider.decide(observation, state.policy)
         return PolicyFilterState(self.bank.act(state.bank, given.measurement, action), decisions)
 
     def records(self, state: PolicyFilterState, measurement: Any) -> dict[str, Array]:
-        """Those of the bank."""
+        """Return the records of the bank."""
         return self.bank.records(state.bank, measurement)
 
 
 def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Decider:
-    """Return what asks a policy at every measurement of a model.
+    """Return the object that computes a policy at every measurement of a model.
 
     Args:
         model: on NumPy or traced arrays.
@@ -179,7 +180,7 @@ def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Dec
 
 
 def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
-    """Close the bank of a model by a policy; arguments as of :func:`decider_of`.
+    """Return the bank of a model closed by a policy; arguments as of :func:`decider_of`.
 
     Raises:
         NotTraceable: on traced arrays, where the policy's arithmetic cannot be traced.
@@ -188,13 +189,14 @@ def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredF
 
 
 def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = None) -> Specialised:
-    """Return what a policy decides: a function of what is shown, read lane by lane, and of :class:`Decisions`, zero
-    before the first one, to an action and :class:`Decisions`.
+    """Return a policy traced: a function of the observation, lane by lane, and of :class:`Decisions`.
+
+    It returns an action and the next :class:`Decisions`, which are zero before the first decision.
 
     Args:
-        model: compiled, in which it acts.
-        policy: made for it.
-        interval: as of :func:`decider_of`; 1 where the policy is asked only when a decision is due.
+        model: compiled model in which it acts.
+        policy: made for that model.
+        interval: as of :func:`decider_of`; 1 where the policy is called only when a decision is due.
 
     Raises:
         NotTraceable: if its arithmetic cannot be traced.
@@ -208,15 +210,14 @@ def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = No
 
 
 def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Policy], Any]) -> Any:
-    """Return a policy traced, or None where it is asked in Python; a warning says why what calls itself traceable is
-    not.
+    """Return a policy traced, or None where it runs in Python; warn if a policy declared traceable cannot be traced.
 
     Args:
-        model: in which it acts.
-        policy: made for it.
+        model: model in which it acts.
+        policy: made for that model.
         trace: :func:`trace_policy`.
     """
-    if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and says_traceable(policy)):
+    if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and is_traceable(policy)):
         return None
     try:
         return trace(model, policy)

@@ -1,7 +1,7 @@
-"""Filters and policies in loops of one's own, one measurement at a time, with the numbers of an evaluation.
+"""Filters and policies in a user's loop, one measurement at a time, with the same numbers as an evaluation.
 
-A filter of a compiled model takes in a measurement by one native call (:class:`CompiledUpdate`), any other by the
-functions of its model (:class:`ModelUpdate`). A policy is asked about any number of episodes (:class:`SteppingPolicy`).
+A filter of a compiled model processes a measurement by one native call (:class:`CompiledUpdate`), any other by the
+functions of its model (:class:`ModelUpdate`). :class:`SteppingPolicy` computes the actions of any number of episodes.
 """
 
 import functools
@@ -30,30 +30,30 @@ from .kinds import Policy
 from .steered_filter import compile_policy, trace_policy
 
 MODEL_ROWS = 128
-"""Observations that a model of Stable-Baselines3 is asked about at once, always as many."""
+"""Fixed number of observations in a call of a Stable-Baselines3 model."""
 
 
 class PolicyMemory(NamedTuple):
-    """What a policy remembers between two steps."""
+    """Memory of a policy between two steps."""
 
     calls: list[Any]
-    """Of each call of the policy."""
+    """State of each call of the policy."""
     fresh: bool
-    """Whether the episodes have yet to begin."""
+    """Whether the episodes have not begun yet."""
 
 
 class SteppingPolicy(Policy):
-    """A policy for loops of one's own, where it answers what it answers in an evaluation, to the last bit.
+    """A policy for a user's loop, with actions equal to those in an evaluation, to the last bit.
 
-    Matrix products round by their shape, and an episode must not depend on how many others there are. So the policy
-    is asked about a multiple of eight observations, a model of Stable-Baselines3 always about as many, and the last
-    one is repeated to fill up. A policy that is ``traceable`` is asked in compiled code where the model's steps are.
+    Rounding in matrix products depends on their shape, and an episode must not depend on the number of others. So the
+    policy is called with a multiple of eight observations, a Stable-Baselines3 model always with ``MODEL_ROWS``, and
+    the last one is repeated to fill up. A policy that is ``traceable`` is compiled where the model's steps are.
 
     Args:
-        model: task with the bank that the policy steers.
+        model: task with the bank that the policy controls.
         policy: anything with Stable-Baselines3's ``predict``.
         scenario: of the environment; None is its default.
-        task_keywords: parameters of the task that the environment must be made with.
+        task_keywords: parameters of the task with which the environment must be made.
     """
 
     def __init__(
@@ -61,24 +61,24 @@ class SteppingPolicy(Policy):
     ) -> None:
         super().__init__(model)
         self.policy = policy
-        self.control: str = model.control  # type: ignore[misc]  # made for it
+        self.control: str = model.control  # type: ignore[misc]  # the control of its model
         self.scenario = scenario
         self.task_keywords: dict[str, Any] = dict(task_keywords or {})
         self._traced: Specialised | None = None
         self._is_traced = False
         self._bound: dict[int, tuple[list[numpy.ndarray], list[numpy.ndarray], Call]] = {}
-        """What the traced policy reads and writes, and the call, by the number of observations."""
+        """Inputs and outputs of the traced policy, and the call, by the number of observations."""
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """What ``gymnasium.make`` takes for an environment that the policy acts in."""
+        """Keywords of ``gymnasium.make`` for an environment that the policy acts in."""
         scenario = {} if self.scenario is None else {"scenario": self.scenario}
         return {"control": self.control, **scenario, **self.task_keywords}
 
     def begin(self, seeds: Sequence[int]) -> PolicyMemory:
         """Return the state for the first :meth:`predict` of the episodes with these seeds.
 
-        Only policies that draw numbers need it, ``random`` for one; for the others None does.
+        Only policies that draw random numbers need it, such as ``random``; for the others None is enough.
         """
         own = self.policy
         return PolicyMemory(
@@ -100,7 +100,7 @@ class SteppingPolicy(Policy):
 
         Args:
             observation: ``(N, len(model.fields))``, or one observation without the batch axis.
-            state: what the last call returned; at the first None, or what :meth:`begin` has returned.
+            state: as returned by the last call; at the first None, or the state of :meth:`begin`.
             episode_start: ``(N,)`` booleans, or one; true where a new episode begins, as it does everywhere at the
                 first call.
             deterministic: as in Stable-Baselines3.
@@ -109,7 +109,7 @@ class SteppingPolicy(Policy):
             Actions, with the batch axis where the observation has it, and the state for the next call.
 
         Raises:
-            ValueError: for a state of another number of episodes, or if the policy answers with no actions.
+            ValueError: for a state of another number of episodes, or if the policy returns no actions.
         """
         single = numpy.ndim(observation) == 1
         batch = numpy.atleast_2d(observation)
@@ -121,19 +121,19 @@ class SteppingPolicy(Policy):
             start[:] = episode_start
         memories = [None] * len(calls) if state is None else state.calls
         if len(memories) != len(calls):
-            raise ValueError(f"the state is not one of {len(batch)} episodes: begin anew with state=None")
+            raise ValueError(f"the state is not one of {len(batch)} episodes: start again with state=None")
         answers, kept = [], []
         for call, memory in zip(calls, memories, strict=True):
-            answer, after = self._ask(batch[call], memory, start[call], deterministic)
+            answer, after = self._act(batch[call], memory, start[call], deterministic)
             answers.append(check_action(self.model.action_space, answer, len(call)))
             kept.append(after)
         action = numpy.concatenate(answers)[: len(batch)]
         return (action[0] if single else action), PolicyMemory(kept, False)
 
-    def _ask(
+    def _act(
         self, observation: numpy.ndarray, memory: Any, start: numpy.ndarray, deterministic: bool
     ) -> tuple[Any, Any]:
-        """Ask the policy, in code of the processor where it can be traced."""
+        """Compute the actions, in native code where the policy can be traced."""
         if not self._is_traced:
             trace = functools.partial(trace_policy, interval=1)
             self._traced, self._is_traced = compile_policy(self.model, self.policy, trace), True
@@ -157,11 +157,11 @@ class SteppingPolicy(Policy):
         return action.T, after
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the code: a copy makes its own."""
+        """Return the state without the compiled code: a copy compiles its own."""
         return {**self.__dict__, "_traced": None, "_is_traced": False, "_bound": {}}
 
     def _calls(self, count: int) -> list[numpy.ndarray]:
-        """Episodes that each call of the policy is shown."""
+        """Return the episodes of each call of the policy."""
         rows = MODEL_ROWS if hasattr(self.policy, "observation_space") else round_up_lanes(count)
         return [
             numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)
@@ -169,12 +169,12 @@ class SteppingPolicy(Policy):
 
 
 class MeasurementMemory:
-    """Fixed memory of a measurement.
+    """Fixed memory for a measurement.
 
     Args:
         like: a measurement, for its shapes and types.
-        tracks: how many come side by side; the last one is repeated up to a multiple of eight, as rounding in products
-            of matrices must not depend on their number.
+        tracks: number of tracks side by side; the last one is repeated up to a multiple of eight, since rounding in
+            matrix products must not depend on their number.
 
     Attributes:
         parts: its arrays, ``(..., width)``, of floats.
@@ -200,23 +200,24 @@ class MeasurementMemory:
 
 
 class CompiledUpdate:
-    """The filter of a compiled model, which takes in one measurement after another in memory of its own: by one native
-    call each, or by two where a policy answers in Python between them.
+    """The filter of a compiled model, with memory of its own, one native call for each measurement.
 
-    What the update hands on as it is stays where the prediction or the measurement was written, so there are two
-    memories of both, used by turns.
+    Where a policy acts in Python there are two calls, one before the action and one after it.
+
+    Values that the update passes on unchanged stay in the memory of the prediction or the measurement, so there are two
+    memories of both, used alternately.
 
     Args:
         model: compiled, of a world that is live.
-        report: dictionary of arrays, made after a measurement was taken in.
-        tracks: how many are followed side by side.
+        report: function that returns a dictionary of arrays after the update.
+        tracks: number of tracks side by side.
         policy: traced, see :func:`.steered_filter.trace_policy`; None without.
-        is_asked: whether a policy answers in Python.
-        observe: report ``(fields, N)`` made before a measurement is taken in; None: what is shown to a policy.
+        in_python: whether a policy acts in Python.
+        observe: function that returns ``(fields, N)`` before the update; None: the observation of a policy.
 
     Attributes:
-        shown: to a policy, ``(width, fields)``.
-        observed: what ``observe`` reports, likewise.
+        observation: observation of a policy, ``(width, fields)``.
+        observed: values of ``observe``, ``(width, fields)``.
         blank_policy: memory of the traced policy before its first decision.
     """
 
@@ -226,7 +227,7 @@ class CompiledUpdate:
         report: Report,
         tracks: int,
         policy: Specialised | None = None,
-        is_asked: bool = False,
+        in_python: bool = False,
         observe: Report | None = None,
     ) -> None:
         update, _, predict, episode = model.programs.later
@@ -249,61 +250,64 @@ class CompiledUpdate:
             memory_of(watch.outputs if watch else (), width),
         )
         self._action[...] = 0.0
-        self.shown: numpy.ndarray = numpy.zeros((width, predict.outputs[-1].shape[0]))
-        self.observed: numpy.ndarray = fields[0].T if fields else self.shown
+        self.observation: numpy.ndarray = numpy.zeros((width, predict.outputs[-1].shape[0]))
+        self.observed: numpy.ndarray = fields[0].T if fields else self.observation
         self._states: list[list[numpy.ndarray]] = []
-        """After the update in each memory, and one that was put."""
+        """States after the update in each memory, and one set from outside."""
         looks, answers = [], []
         for now, received in enumerate(self._received):
             given = [*predicted[now], *received.parts, self._action]
             after = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
             self._states.append(after[: len(self._kinds)])
-            memories = [self.shown, *self._policies[1 - now]], [self._action, *self._policies[now]]
+            memories = [self.observation, *self._policies[1 - now]], [self._action, *self._policies[now]]
             looks.append([watch.bound([*received.parts, *predicted[now]], fields)] if watch else [])
-            told = tell.bound([*received.parts, *self._states[now]], reported)
+            report_call = tell.bound([*received.parts, *self._states[now]], reported)
             steer = [policy.bound(*memories)] if policy else []
-            answers.append([*steer, update.bound(given, written), told])
+            answers.append([*steer, update.bound(given, written), report_call])
         self._states.append(written[: len(self._kinds)])
         arrivals = []
         for before, program, now in ((0, predict, 1), (1, predict, 0), (2, first, 0)):
-            read, ahead = [*self._states[before], *self._received[now].parts], [*predicted[now], self.shown]
-            answered = [] if is_asked else answers[now]
+            read, ahead = (
+                [*self._states[before], *self._received[now].parts],
+                [*predicted[now], self.observation],
+            )
+            answered = [] if in_python else answers[now]
             arrivals.append([program.bound(read, ahead), *looks[now], *answered])
         self._arrivals, self._answers = [CallSequence(calls) for calls in arrivals], []
-        if is_asked:
+        if in_python:
             self._answers = [CallSequence(calls) for calls in answers]
         self._now = 2
         cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
         self._report = [(name, reported[i][cut]) for name, i in tell.template.items()]
 
-    def arrive(self, measurement: Any) -> None:
-        """Predict to a measurement, and take it in where nothing is asked in Python."""
+    def receive(self, measurement: Any) -> None:
+        """Predict to a measurement, and update with it where no policy acts in Python."""
         before, now = self._now, int(self._now == 0)
         self._received[now].put(measurement)
         self._now = now
         self._arrivals[before].run(self._width, self._threads)
 
-    def answer(self, action: numpy.ndarray) -> None:
-        """Take the measurement in with an action that was chosen in Python, ``(width, ...)``."""
+    def act(self, action: numpy.ndarray) -> None:
+        """Update with the measurement and an action chosen in Python, ``(width, ...)``."""
         self._action[...] = action.T
         self._answers[self._now].run(self._width, self._threads)
 
     def report(self) -> dict[str, Any]:
-        """Return the report in arrays ``(..., N)`` of the caller's own, of one track without this axis."""
+        """Return the report in new arrays ``(..., N)``, for one track without this axis."""
         return {name: array.copy() if array.ndim else array[()] for name, array in self._report}
 
     @property
     def state(self) -> Any:
-        """State of the filter, in arrays of the caller's own."""
+        """State of the filter, in new arrays."""
         return copy_arrays(self._template, self._states[self._now], self._kinds)
 
     @property
     def policy_state(self) -> Any:
-        """Memory of the traced policy, in arrays of the caller's own."""
+        """Memory of the traced policy, in new arrays."""
         return map_arrays(lambda i: self._policies[self._now > 0][i].copy(), self._policy_template)
 
-    def go_on(self, state: Any, policy: Any) -> None:
-        """Go on from a state of the filter, and from a memory of the traced policy."""
+    def resume(self, state: Any, policy: Any) -> None:
+        """Continue from a state of the filter and a memory of the traced policy."""
         self._now = 2
         arrays = leaves(state) + (leaves(policy) if self._policy_template else [])
         for memory, values in zip([*self._states[2], *self._policies[1]], arrays, strict=True):
@@ -311,8 +315,9 @@ class CompiledUpdate:
 
 
 class ModelUpdate:
-    """The same by the functions of a model, with an answer in Python or the action zero; arguments as of
-    :class:`CompiledUpdate`, and a measurement for its shapes and types.
+    """The filter of a model, run by the functions of the model, with an action from Python or zero.
+
+    Arguments as of :class:`CompiledUpdate`, and a measurement for its shapes and types.
     """
 
     blank_policy = policy_state = None
@@ -323,35 +328,35 @@ class ModelUpdate:
         self._cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
         self._received = MeasurementMemory(like, tracks)
         self.state: Any = None
-        """Of the filter, in arrays that never change."""
+        """State of the filter, in arrays that never change."""
 
-    def arrive(self, measurement: Any) -> None:
+    def receive(self, measurement: Any) -> None:
         """Predict to a measurement."""
         self._received.put(measurement)
         measured = self._received.copy()
         self._episode = Episode((), measured, self._model.predict_filter(self.state, measured))
 
     @property
-    def shown(self) -> numpy.ndarray:
-        """Shown to a policy, ``(width, fields)``."""
+    def observation(self) -> numpy.ndarray:
+        """Observation of a policy, ``(width, fields)``."""
         return numpy.asarray(self._model.observe(self._episode)).T
 
     @property
     def observed(self) -> numpy.ndarray:
-        """What ``observe`` reports, ``(width, fields)``."""
+        """Values of ``observe``, ``(width, fields)``."""
         return numpy.asarray(self._model.run(self._observe, self._episode)).T
 
-    def answer(self, action: numpy.ndarray) -> None:
-        """Take the measurement in with an action, ``(width, ...)``."""
+    def act(self, action: numpy.ndarray) -> None:
+        """Update with the measurement and an action, ``(width, ...)``."""
         turned = numpy.asarray(action.T, dtype=float if self._model.action_space.shape else None)
         self._episode = self._model.act(self._episode, turned)
         self.state = self._episode.filter
 
     def report(self) -> dict[str, Any]:
-        """Return the report in arrays ``(..., N)`` of the caller's own, of one track without this axis."""
+        """Return the report in new arrays ``(..., N)``, for one track without this axis."""
         reported = self._model.run(self._make_report, self._episode)
         return {name: numpy.copy(array[self._cut])[()] for name, array in reported.items()}
 
-    def go_on(self, state: Any, policy: Any) -> None:
-        """Go on from a state of the filter."""
+    def resume(self, state: Any, policy: Any) -> None:
+        """Continue from a state of the filter."""
         self.state = state

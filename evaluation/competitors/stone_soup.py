@@ -12,11 +12,11 @@ from stonesoup.types.state import GaussianState
 from .adapters import Array, SingleTrackEstimator
 
 START = datetime(2000, 1, 1)
-"""Stone Soup wants a date; which one is of no consequence."""
+"""Start of the time stamps; Stone Soup requires a date, and any date will do."""
 
 
 class StoneSoupEstimator(SingleTrackEstimator):
-    """A predictor and an updater of Stone Soup, one state an episode.
+    """Estimator by a predictor and an updater of Stone Soup, with one state for each episode.
 
     Subclasses set ``self.predictor`` and ``self.updater``, after ``super().__init__(task)``. Where a
     measurement is more than positions with a covariance they define :meth:`detection`, for a control or hypotheses of
@@ -29,21 +29,20 @@ class StoneSoupEstimator(SingleTrackEstimator):
 
     @property
     def interval(self) -> float:
-        """Seconds from one measurement to the next, where these do not say; where the parameters leave it open a
-        subclass must.
-        """
+        """Seconds between measurements without an interval; a subclass must define it where the parameters do not."""
         return self.task.parameters.sampling_interval
 
     def begin(self, initial: Any) -> Any:
-        """Gaussian state at the start of the track."""
+        """Return the Gaussian state at the start of the track."""
         return GaussianState(initial.mean[:, None], initial.covariance, timestamp=START)
 
     def detection(self, measurement: Any, timestamp: datetime) -> Any:
-        """Detection of the position, with the covariance of this measurement in its model; None where there is none.
+        """Return the detection of the position, with the measurement's covariance in its model; None where it is
+        missing.
 
         Args:
-            measurement: of this track.
-            timestamp: of the measurement.
+            measurement: measurement of this track.
+            timestamp: time of the measurement.
         """
         z, R = self.reading(measurement)
         if z is None:
@@ -63,5 +62,5 @@ class StoneSoupEstimator(SingleTrackEstimator):
         return self.updater.update(SingleHypothesis(prediction, detection))
 
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """``mean`` and ``covar``."""
+        """Return ``mean`` and ``covar``."""
         return numpy.asarray(track.mean), numpy.asarray(track.covar)

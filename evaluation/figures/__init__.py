@@ -1,5 +1,5 @@
-"""Pictures of evaluations: error over time, the front of cost and time, animations, the worst episodes.
+"""Figures of evaluations: error over time, the front of cost and time, animations, the worst episodes.
 
-Knows all other rooms of ``evaluation``. Begin with :mod:`.looks`, how each competitor is drawn; then
+It imports all other rooms of ``evaluation``. Begin with :mod:`.looks`, the style of each competitor; then
 :mod:`.curve_figures`.
 """

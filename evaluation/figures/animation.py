@@ -1,4 +1,4 @@
-"""Animated pictures of an episode, under whatever estimates, for documentation and to look at a bad one."""
+"""Animations of an episode with any competitor's estimates, for documentation and for a look at bad episodes."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from ..running.rollout import run_competitor
 from ..storage.files import whole_file
 
 SHADES = 7
-"""Steps from a colour of the figure to white, for smooth edges."""
+"""Number of steps from a colour of the figure to white, for smooth edges."""
 
 
 def episode_frames(
@@ -32,23 +32,23 @@ def episode_frames(
     every: int = 2,
     **keywords: Any,
 ) -> list[Image.Image]:
-    """Play an episode and draw it.
+    """Run an episode and return its frames.
 
     Args:
-        task: class of the environment's.
-        name: of the competitor, for the title.
-        competitor: policy, estimator, smoother or reference, or what makes it.
+        task: task class of the environment.
+        name: name of the competitor, for the title.
+        competitor: policy, estimator, smoother or reference, or its maker.
         scenario: name of a scenario, or a trajectory.
-        seed: of the episode, as in ``reset``.
-        every: actions from one frame to the next; the last action is always shown.
+        seed: seed of the episode, as in ``reset``.
+        every: number of actions from one frame to the next; the last action always has a frame.
         **keywords: parameters of the task.
 
     Raises:
-        ValueError: for unknown names, and for bounds, which estimate nothing.
+        ValueError: for unknown names, and for bounds, which have no estimates.
     """
     every, kind = check_integer("every", every, 1), kind_of(competitor)
     if kind == "bound":
-        raise ValueError(f"{name!r} is a bound: it estimates nothing that could be drawn")
+        raise ValueError(f"{name!r} is a bound: it has no estimates to draw")
     keywords = {**getattr(competitor, "task_keywords", {}), **keywords}
     if kind == "policy":
         control = control_of(competitor, None, task, name)
@@ -62,7 +62,7 @@ def episode_frames(
 
 
 def _policy_frames(world: TaskEnv, name: str, policy: Any, seed: int, every: int) -> list[Image.Image]:
-    """Draw an episode as the environment does, which is closed after it."""
+    """Draw an episode by the environment's renderer, and close the environment."""
     assert world.picture is not None
     world.picture.caption = f"policy {name}"
     actor = SteppingPolicy(world.model, make_competitor(policy, world.model))
@@ -82,8 +82,8 @@ def _policy_frames(world: TaskEnv, name: str, policy: Any, seed: int, every: int
 def _estimate_frames(
     model: Model, scenario: str, name: str, estimator: Any, seed: int, every: int
 ) -> list[Image.Image]:
-    """Draw the estimates of a filter of its own, which is shown no observation and takes no action."""
-    # They bring matplotlib.
+    """Draw the estimates of a filter without observations and actions."""
+    # They import matplotlib.
     from ...envs.drawing.estimate_picture import EstimatePicture
     from ...envs.drawing.rendering import EpisodePicture
 
@@ -114,13 +114,13 @@ def _frame(world: TaskEnv) -> Any:
 
 
 def _palette() -> Image.Image:
-    """Colours of the figures and their shades: one palette for all frames, or colours would flicker.
+    """Return the colours of the figures and their shades: one palette for all frames, or colours would flicker.
 
-    A palette chosen from the pixels would drop what is small, such as the radar's mark.
+    A palette chosen from the pixels would drop small details, such as the radar's mark.
     """
     from matplotlib.colors import to_rgb
 
-    # Imported here for the same reason as in the environment.
+    # Imported here, as in the environment, since it is optional.
     from ...envs.drawing import rendering
 
     white = numpy.ones(3)
@@ -138,8 +138,8 @@ def write_animation(frames: list[Image.Image], path: Path, frames_per_second: fl
 
     Args:
         frames: at least one.
-        path: of the file, which is complete or not there.
-        frames_per_second: speed.
+        path: path of the file, which is complete or missing.
+        frames_per_second: number of frames per second.
     """
     palette = _palette()
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

@@ -1,8 +1,8 @@
-"""Pictures of an evaluation, all drawn from its curves (:mod:`.curves`), as wide as a paper's columns.
+"""Figures of an evaluation, all drawn from its curves (:mod:`.curves`), as wide as a paper's columns.
 
-At most six lines of a picture are told apart by colour: the user's own, the paper's algorithm, the reference, the
-bound, the best learned and the best classical competitor, then the others by their cost; the rest stays grey. Policies
-and estimators are solid, smoothers dash-dotted, references dashed, bounds dotted, in every picture.
+At most six lines of a figure have a colour: the user's own, the paper's algorithm, the reference, the bound, the best
+learned and the best classical competitor, then the others by their cost; the rest is grey. Policies and estimators are
+solid, smoothers dash-dotted, references dashed, bounds dotted, in every figure.
 """
 
 import textwrap
@@ -34,28 +34,28 @@ class CurvePanel(NamedTuple):
     """One pair of axes with lines over time."""
 
     label: str
-    """Of the ordinate."""
+    """Label of the ordinate."""
     values: xarray.DataArray
-    """(policy, time)."""
+    """Values over (policy, time)."""
     low: xarray.DataArray | None = None
-    """Of the band about each line, likewise."""
+    """Lower end of the band about each line, over (policy, time)."""
     high: xarray.DataArray | None = None
 
 
 def _abscissa(curves: xarray.Dataset) -> numpy.ndarray:
-    """Seconds where measurements come regularly, else their numbers."""
+    """Return the seconds where measurements come regularly, otherwise their numbers."""
     found: numpy.ndarray = curves["elapsed" if "elapsed" in curves.coords else "time"].values
     return found
 
 
 def _bound_abscissa(axis: Any, x: numpy.ndarray) -> None:
-    """From just before the first measurement to the last; about the only one, if there is no other."""
+    """Set limits from just before the first measurement to the last, or around a single one."""
     first, last = float(x[0]), float(x[-1])
     axis.set_xlim(*((first - 0.01 * (last - first), last) if last > first else (0.5 * first, 1.5 * first)))
 
 
 def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
-    """Seconds below and measurements above, where they come regularly; else measurements below."""
+    """Label the axis: seconds below and measurements above, where they come regularly; otherwise measurements below."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
     if "elapsed" not in curves.coords:
@@ -71,11 +71,11 @@ def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
 
 
 def _shade_windows(axis: Any, curves: xarray.Dataset) -> None:
-    """Shade the scenario's windows, and name them at the top, except those that span everything."""
+    """Shade the scenario's windows, and name them at the top, except those that span the whole episode."""
     length, x = curves.sizes["time"], _abscissa(curves)
     step = 0.5 * (x[1] - x[0]) if length > 1 else 0.5
     shown = {name: ends for name, ends in windows_of(curves).items() if ends[1] - ends[0] + 1 < 0.85 * length}
-    # Names that are wider than their windows would touch: every second one a line lower then.
+    # Names that are wider than their windows would touch: then every second one is a line lower.
     letters = 72.0 * 0.7 * axis.figure.get_figwidth() / 3.5
     narrow = any(len(name) / letters > (last - first + 1) / length for name, (first, last) in shown.items())
     for i, (name, (first, last)) in enumerate(shown.items()):
@@ -103,7 +103,7 @@ def _over_time(
     columns: int,
     finish: Callable[[Any, CurvePanel], None],
 ) -> Any:
-    """Draw lines over time, each panel below the other: those of a look in colour, the others grey."""
+    """Draw lines over time in panels one above the other: those of a look in colour, the others grey."""
     from matplotlib.lines import Line2D
 
     names = curves["policy"].values.tolist()
@@ -128,9 +128,7 @@ def _over_time(
             for name in distinct
             if not numpy.isnan(line := panel.values.sel(policy=name).values).all()
         }
-        here = group_equal_lines(
-            shown, shown
-        )  # some quantity may be the same for those whose other ones differ
+        here = group_equal_lines(shown, shown)  # lines may be equal in one quantity and differ in others
         for name, same in here.items():
             line = shown[name]
             label = distinct[name] if len(same) == 1 else join_names(same, most=1 if columns == 1 else 2)
@@ -151,7 +149,7 @@ def _over_time(
     if not beside:
         handles = [Line2D([], [], label=label, **look[name]) for name, label in distinct.items()] + handles
     elif others:
-        # One word needs no legend of its own.
+        # A single name needs no legend.
         title += "; grey: others"
         handles = []
     return add_title(figure, title, handles)
@@ -164,8 +162,9 @@ def _draw_bands(
     distinct: Iterable[str],
     look: Mapping[str, Mapping[str, Any]],
 ) -> bool:
-    """Draw the bands about lines, and return whether some were left out: those that on average fill a third of the
-    axis, where they hide all lines and say only that there are too few episodes.
+    """Draw the bands about lines, and return whether some were left out.
+
+    Bands that on average fill a third of the axis would hide all lines, and mean only that there are too few episodes.
     """
     left_out = False
     if panel.low is None or panel.high is None:
@@ -174,7 +173,7 @@ def _draw_bands(
     drawn: list[numpy.ndarray] = []
     for name in distinct:
         line = panel.values.sel(policy=name).values
-        # Bands of lines that can hardly be told apart would add up to a dark one.
+        # Bands of nearly equal lines would add up to a dark one.
         if any(numpy.allclose(line, other, rtol=0.01, atol=0.0, equal_nan=True) for other in drawn):
             continue
         drawn.append(line)
@@ -182,7 +181,7 @@ def _draw_bands(
         there = numpy.isfinite(low) & numpy.isfinite(high)
         if not there.any():
             continue
-        # A logarithmic axis knows no zero.
+        # A logarithmic axis has no zero.
         bottom, top = axis.get_ylim()
         low, high = (numpy.clip(ends, bottom, top) for ends in (low, high))
         ends = [
@@ -205,12 +204,12 @@ def _title(curves: xarray.Dataset) -> str:
 def draw_error_over_time(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """RMSE over time of every quantity, with 95 % bands over episodes.
+    """Draw the RMSE over time of every quantity, with 95 % bands over episodes.
 
     Args:
-        curves: of an evaluation with truth.
-        look: of the lines that are told apart, from :func:`looks`.
-        columns: of a paper, as wide as which it is.
+        curves: curves of an evaluation with truth.
+        look: style of the coloured lines, from :func:`looks`.
+        columns: width of the figure in columns of a paper, 1 or 2.
     """
     look = looks(curves) if look is None else look
     panels = [
@@ -223,7 +222,7 @@ def draw_error_over_time(
 
     def finish(axis: Any, panel: CurvePanel) -> None:
         if not len(positive(panel.values.values)):
-            return  # of who is told the truth; a logarithmic axis has no zero
+            return  # of a reference that knows the truth; a logarithmic axis has no zero
         axis.set_yscale("log")
         kinds = {name: str(curves["kind"].sel(policy=name).values) for name in look}
         bounds = [panel.values.sel(policy=name).values for name in look if kinds[name] == "bound"]
@@ -239,7 +238,7 @@ def draw_error_over_time(
 def draw_cost_difference(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Mean cost over time less that of the paper's algorithm, and of the best, with paired 95 % bands.
+    """Draw the mean cost over time less that of the paper's algorithm, and of the best, with paired 95 % bands.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -262,7 +261,7 @@ def draw_cost_difference(
     def finish(axis: Any, panel: CurvePanel) -> None:
         axis.axhline(0.0, color="0.3", lw=0.6, zorder=1.2)
         shown = [panel.values.sel(policy=name).values for name in look]
-        # One line, or a moment, must not squash all others.
+        # One line, or a transient, must not compress all others.
         sizes = numpy.concatenate([numpy.abs(line[numpy.isfinite(line)]) for line in shown])
         reach = 1.5 * float(numpy.quantile(sizes, 0.99)) if len(sizes) else 1.0
         there = numpy.concatenate([line[numpy.isfinite(line)] for line in shown])
@@ -278,7 +277,8 @@ def draw_cost_difference(
 def draw_consistency(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Mean NEES and NIS over their dimensions at every measurement, with the 95 % chi-square band of that mean.
+    """Draw the mean NEES and NIS over their dimensions at every measurement, with the 95 % chi-square band of that
+    mean.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -306,7 +306,7 @@ def draw_consistency(
 def draw_error_distribution(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Share of measurements with an error above a given size, of every quantity.
+    """Draw the share of measurements with an error above a given size, for every quantity.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -333,7 +333,8 @@ def draw_error_distribution(
         if not len(positive(distinct_values)):
             continue
         axis.set_xscale("log")
-        # From what nine of ten measurements exceed to the largest errors, of which one line's are not all there is.
+        # From the size that nine of ten measurements exceed to the largest errors, without letting one line set the
+        # limit.
         most = int(numpy.argmin(numpy.abs(shares - 0.9)))
         smallest = positive(distinct_values[:, most])
         largest = positive(numpy.nanmax(distinct_values, axis=1))
@@ -349,7 +350,7 @@ def draw_error_distribution(
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
-    """Policies whose mode probabilities move by more than 0.02 over time, with those that have the same."""
+    """Return the policies whose mode probabilities vary by more than 0.02 over time, with those that have the same."""
     probabilities = {name: curves["mode_probability"].sel(policy=name).values for name in names}
     found = {
         name: values
@@ -364,7 +365,7 @@ def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, lis
 def draw_mode_probabilities(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Mean over episodes of the mode probabilities, with 95 % bands, of what is told apart and where they vary.
+    """Draw the mean over episodes of the mode probabilities that vary, with 95 % bands, for the coloured lines.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -408,7 +409,7 @@ def draw_mode_probabilities(
 def draw_true_class_probability(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Mean over episodes of the probability of the true class, with 95 % bands.
+    """Draw the mean over episodes of the probability of the true class, with 95 % bands.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -430,15 +431,15 @@ def evaluation_figures(
     own: Sequence[str] = (),
     points: Sequence[Point] = (),
 ) -> Iterator[tuple[str, Any]]:
-    """Every figure of an evaluation, with the name of its file; without those in which there is nothing to see.
+    """Yield every figure of an evaluation, with the name of its file, except figures without data.
 
     Args:
-        curves: of an evaluation, from :func:`.curves.curves_of`.
-        columns: of a paper, 1 or 2, as wide as which they are.
-        highlight: names of the lines that are told apart, at most six; default: see :func:`choose_highlights`.
-        learned: names of what has been learned.
-        own: names of what the user brings.
-        points: of the front of cost and time, see :func:`.times.points_of_records`; none: it is not drawn.
+        curves: curves of an evaluation, from :func:`.curves.curves_of`.
+        columns: width of the figures in columns of a paper, 1 or 2.
+        highlight: names of the coloured lines, at most six; default: see :func:`choose_highlights`.
+        learned: names of learned competitors.
+        own: names of the user's competitors.
+        points: points of cost and time, see :func:`.times.points_of_records`; without points there is no such figure.
 
     Raises:
         ValueError: for another number of columns, unknown names, or too many.
@@ -455,7 +456,7 @@ def evaluation_figures(
     if {"anees", "anis"} & set(curves.data_vars):
         yield "consistency", draw_consistency(curves, look, columns=columns)
     if "true_class_probability" in curves:
-        # Where the truth differs from episode to episode, a mean over episodes of each mode says nothing.
+        # Where the true mode differs between episodes, a mean over episodes of each mode is meaningless.
         yield "true_class_probability", draw_true_class_probability(curves, look, columns=columns)
     elif "mode_probability" in curves and varying_modes(curves, look):
         yield "mode_probabilities", draw_mode_probabilities(curves, look, columns=columns)

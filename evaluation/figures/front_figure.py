@@ -1,4 +1,4 @@
-"""The front of cost and time as a picture: every competitor a point, steps along those whom nobody beats in both."""
+"""Figure of cost and time: a point for every competitor, and steps along the Pareto front."""
 
 import itertools
 import math
@@ -14,21 +14,21 @@ from .looks import COLOURS, OWN
 from .print_layout import FONT_SIZES, add_title, figure_with_axes, in_print
 
 MOST_ABOVE = 1.0
-"""How far above the paper's cost competitors are drawn, in octaves of the cost; of those that cost more only the user's
-own are drawn, and the others are counted."""
+"""Upper limit of the drawn costs, in octaves above the paper's cost; competitors above it are only counted, except the
+user's own."""
 TICKS = (
     *(-99.5, -99, -98, -95, -90, -85, -80, -75, -70, -65, -60, -55, -50, -45, -40, -35, -30, -25, -20, -15, -10, -5),
     *(0, 5, 10, 15, 20, 30, 40, 50, 70, 100),
 )  # fmt: skip
-"""Of the cost, %: of these as many are shown as there is room for."""
+"""Candidates for ticks of the cost, %; as many are drawn as there is room for."""
 LEARNED, PAPER, CLASSICAL = COLOURS[1], COLOURS[0], "0.45"
 TOUCHES = 3.0
-"""Badness of a place from which on a name touches a line, a point or another name: there only the paper's algorithm and
+"""Penalty of a place from which on a name touches a line, a point or another name: there only the paper's algorithm and
 the user's own are named."""
 DISTANCES = (5.0, 7.0, 9.0, 15.0, 23.0, 33.0, 45.0)
-"""Of a name from its point, points of print; the nearest that is free is taken."""
+"""Distances of a name from its point, points of print; the nearest free one is used."""
 NEAR = 3
-"""So many of them for names that may be left out: lines to names farther away would cross."""
+"""Number of these distances for optional names: lines to names farther away would cross."""
 DIRECTIONS = 16
 
 Box = tuple[float, float, float, float]
@@ -36,11 +36,11 @@ Box = tuple[float, float, float, float]
 
 
 class FrontPanel(NamedTuple):
-    """What is drawn of one environment in one scenario."""
+    """Contents of the panel of one environment in one scenario."""
 
     title: str
     points: Sequence[Point]
-    """Costs relative to the paper's algorithm, %."""
+    """Points, with costs relative to the paper's algorithm, %."""
     paper: str
     reference: str
     learned: Collection[str]
@@ -56,7 +56,7 @@ class FrontPanel(NamedTuple):
 
     @property
     def beyond(self) -> list[Point]:
-        """Those that cost more, and are not drawn."""
+        """Points with higher cost, which are not drawn."""
         return [point for point in self.points if point.kind in RANKED and point.cost > self.top]
 
 
@@ -69,14 +69,14 @@ def draw_front(
     *,
     columns: int = 2,
 ) -> Any:
-    """Cost against the paper's algorithm over the time of a measurement, and the front of both.
+    """Draw the cost relative to the paper's algorithm over the time of a measurement, and the front of both.
 
     Args:
-        curves: of an evaluation that was timed.
-        points: of its competitors, see :func:`.times.points_of_records`.
-        learned: names of what has been learned.
-        own: names of what the user brings.
-        columns: of a paper, as wide as which it is.
+        curves: curves of an evaluation with times.
+        points: points of its competitors, see :func:`.times.points_of_records`.
+        learned: names of learned competitors.
+        own: names of the user's competitors.
+        columns: width of the figure in columns of a paper, 1 or 2.
     """
     attrs = curves.attrs
     figure, (axis,) = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.4}[columns])
@@ -114,7 +114,7 @@ def draw_panel(axis: Any, panel: FrontPanel) -> None:
         x, y = ([getattr(value, name) for value in values] for values, name in (
             ([point.time for point in on_front], "nanoseconds"), (on_front, "cost"),
         ))  # fmt: skip
-        # From where the first begins to the right end: with more time nobody need do worse.
+        # From the first point to the right end: more time never requires a higher cost.
         axis.step([*x, axis.get_xlim()[1]], [*y, y[-1]], where="post", color="0.25", lw=1.0, zorder=2.0)
     names = {point.name for point in on_front}
     for point in shown:
@@ -122,7 +122,7 @@ def draw_panel(axis: Any, panel: FrontPanel) -> None:
 
 
 def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
-    """Handles of what the panels show."""
+    """Return the legend handles of the contents of the panels."""
     from matplotlib.lines import Line2D
 
     shown = [(point, panel) for panel in panels for point in panel.points if point.kind in RANKED]
@@ -133,7 +133,7 @@ def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
         handles.setdefault(_origin(point, panel), Line2D([], [], label=_origin(point, panel), **style))
     if any(not point.time.compiled for point, _ in shown):
         style = {"marker": "o", "markersize": 4.0, "color": CLASSICAL, "markerfacecolor": "white"}
-        handles["python"] = Line2D([], [], label="asked in Python", linestyle="", **style)
+        handles["python"] = Line2D([], [], label="runs in Python", linestyle="", **style)
     handles["front"] = Line2D([], [], color="0.25", lw=1.0, label="the front")
     handles["reference"] = Line2D([], [], color="black", lw=0.9, ls="--", label="reference")
     order = ("yours", "paper's algorithm", "policy", "estimator", "learned", "python", "front", "reference")
@@ -141,25 +141,24 @@ def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
 
 
 def name_points(figure: Any, panels: Mapping[Any, FrontPanel]) -> None:
-    """Write names where nothing else is: of the paper's algorithm, of the user's own, of those on the front, and of the
-    reference.
+    """Write names in free places: of the paper's algorithm, the user's own, the front, and the reference.
 
     Args:
-        figure: whose layout is complete.
-        panels: by their axes.
+        figure: figure with a complete layout.
+        panels: panels by their axes.
     """
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # names must not move the axes again
+    figure.set_layout_engine("none")  # names must not move the axes
     for axis, panel in panels.items():
         _Names(figure, axis).place(panel)
 
 
 class _Names:
-    """Places of names in one pair of axes, in pixels.
+    """Placement of names in one pair of axes, in pixels.
 
     Args:
-        figure: that the axes are in.
-        axis: whose limits are set.
+        figure: figure of the axes.
+        axis: axes with their limits set.
     """
 
     def __init__(self, figure: Any, axis: Any) -> None:
@@ -198,7 +197,7 @@ class _Names:
         names = {point.name for point in on_front}
         always = {panel.paper, *panel.own}
         others = [p for p in shown if p.name in always and p.name not in names]
-        # Who is named first has the best place, so several orders are tried.
+        # The first name gets the best place, so several orders are tried.
         orders = [
             [*others, *on_front[i:], *on_front[:i]][::step] for i in range(len(on_front)) for step in (1, -1)
         ]
@@ -240,13 +239,11 @@ class _Names:
         self._write(point.name, best, "black")
 
     def _find_place(self, point: Point, always: bool) -> tuple[Box, float] | None:
-        """Find and take the best free box for a name; return it and how bad it is. None: every place touches something,
-        and the name may be left out.
-        """
+        """Return and reserve the best free box for a name, with its penalty; None if every place touches something."""
         width, height = self._extent(point.name)
         x, y = self._at(point.time.nanoseconds, point.cost)
         k = numpy.arange(DIRECTIONS)
-        # Below the front nobody is: from there on round.
+        # There are no points below the front: the search starts there.
         angle = math.pi * (1.25 + (k + 1) // 2 * (-1) ** k * 2.0 / DIRECTIONS)
         distances = DISTANCES if always else DISTANCES[:NEAR]
         reach = numpy.repeat(distances, DIRECTIONS) * self.pixels
@@ -278,7 +275,7 @@ class _Names:
         self._write(point.name, box, colour)
 
     def _crosses(self, start: tuple[float, float], boxes: numpy.ndarray) -> numpy.ndarray:
-        """Whether a line from a point to its name, in each of the boxes, runs through another name or point."""
+        """Return whether a line from a point to its name, in each of the boxes, crosses another name or point."""
         ends = numpy.clip(numpy.array(start), boxes[:, :2], boxes[:, 2:])
         x, y = numpy.linspace(numpy.broadcast_to(start, ends.shape), ends, 12, axis=1).T[..., None]
         a, b, c, d = numpy.array(self.points + self.names).reshape(-1, 4).T
@@ -287,9 +284,7 @@ class _Names:
         return found
 
     def _is_nearer(self, point: tuple[float, float], boxes: numpy.ndarray) -> numpy.ndarray:
-        """Whether a name in each of the boxes might belong to another point, which is about as near; of those that lie
-        over each other any may be meant.
-        """
+        """Return whether a name in each of the boxes is ambiguous, since another point is about as near."""
         taken = numpy.array(self.points)
         centres = 0.5 * (taken[:, :2] + taken[:, 2:])
         apart = numpy.linalg.norm(centres - point, axis=1) > 5.0 * self.pixels
@@ -299,7 +294,7 @@ class _Names:
         return nearer
 
     def _crowding(self, boxes: numpy.ndarray) -> numpy.ndarray:
-        """How much else there is in each box: points weigh more than lines, names more, and the frame most."""
+        """Return the weighted overlap of each box: points weigh more than lines, names more, and the frame most."""
         left, bottom, right, top = boxes.T[..., None]
         margin = 0.8 * self.pixels
         found = numpy.zeros(len(boxes))
@@ -327,24 +322,24 @@ class _Names:
 
         middle = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
         x, y = self.axis.transAxes.inverted().transform(middle)
-        # A white rim keeps the lines behind it away.
+        # A white rim separates it from the lines behind it.
         rim = [withStroke(linewidth=2.0, foreground="white")]
         style = {"fontsize": self.size, "path_effects": rim, "color": colour, "zorder": 4.0}
         self.axis.text(x, y, text, transform=self.axis.transAxes, ha="center", va="center", **style)
 
 
 def _nearest(box: Box, point: tuple[float, float]) -> tuple[float, float]:
-    """Point of a box that is nearest to another."""
+    """Return the point of a box that is nearest to another point."""
     return min(max(point[0], box[0]), box[2]), min(max(point[1], box[1]), box[3])
 
 
 def _unit(cosine: numpy.ndarray) -> numpy.ndarray:
-    """Side on which a box lies: that of its middle for directions near the other axis."""
+    """Return the side on which a box lies: that of its middle for directions near the other axis."""
     return numpy.clip(1.8 * cosine, -1.0, 1.0)
 
 
 def _octaves(percent: Any) -> Any:
-    """Logarithm of a cost's ratio to the paper's."""
+    """Return the logarithm of a cost's ratio to the paper's."""
     return numpy.log2(numpy.maximum(1.0 + numpy.asarray(percent) / 100.0, 1e-6))
 
 
@@ -366,12 +361,12 @@ def _origin(point: Point, panel: FrontPanel) -> str:
 
 
 def _colour(point: Point, panel: FrontPanel) -> str:
-    """Colour of a name."""
+    """Return the colour of a name."""
     return {"paper's algorithm": PAPER, "learned": LEARNED, "yours": OWN}.get(_origin(point, panel), "black")
 
 
 MARKED = ("paper's algorithm", "learned", "yours")
-"""Origins that have a colour wherever they stand."""
+"""Origins that have a colour at every place."""
 
 
 def _marker(point: Point, panel: FrontPanel, on_front: bool) -> dict[str, Any]:
@@ -390,12 +385,12 @@ def _marker(point: Point, panel: FrontPanel, on_front: bool) -> dict[str, Any]:
 
 
 def _label_axes(axis: Any, panel: FrontPanel) -> None:
-    """Ticks and titles of the axes; how many lie beyond the top stands there."""
+    """Draw ticks and titles of the axes, and the number of points beyond the top."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
     low, high = (float(_octaves(end)) for end in axis.get_ylim())
     chosen: list[float] = []
-    # Zero first, then round numbers, wherever they have a tenth of the height to themselves.
+    # Zero first, then round numbers, at least a tenth of the height apart.
     for tick in sorted(TICKS, key=lambda t: (t != 0, t % 50 != 0, t % 20 != 0, t % 10 != 0, t)):
         at = float(_octaves(tick))
         if low <= at <= high and all(abs(at - float(_octaves(o))) > (high - low) / 10.0 for o in chosen):

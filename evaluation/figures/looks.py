@@ -1,4 +1,4 @@
-"""How competitors look in figures: who is told apart, by which colour and line, and who is drawn as one."""
+"""Styles of competitors in figures: coloured lines, their order, and lines that are drawn as one."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -13,15 +13,15 @@ LINES = ("-", "--", "-.", ":")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999933")
 LINES_OF_KINDS = {"policy": "-", "estimator": "-", "smoother": "-.", "reference": "--", "bound": ":"}
 OWN = "#9B5DE5"
-"""Of what a user brings."""
+"""Colour of the user's competitors."""
 GREY = "0.72"
-"""Of lines that are not told apart."""
+"""Colour of lines that are not highlighted."""
 MOST_HIGHLIGHTED = 6
-"""Lines that a reader can tell apart."""
+"""Maximal number of lines that a reader can distinguish."""
 
 
 def styles(names: list[str]) -> dict[str, dict[str, Any]]:
-    """Colour and line style of each policy; two policies never share both."""
+    """Return the colour and line style of each policy, a different pair for each."""
     n = len(COLOURS)
     return {
         name: {"color": COLOURS[i % n], "linestyle": LINES[(i // n) % len(LINES)], "linewidth": 1.6}
@@ -30,8 +30,9 @@ def styles(names: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def by_cost(curves: xarray.Dataset) -> list[str]:
-    """Names of what is ranked, the lowest mean cost first; without costs by the mean RMSE of the first quantity, and
-    without truth as they come.
+    """Return the names of the ranked competitors by mean cost, the lowest first.
+
+    Without costs the order is by the mean RMSE of the first quantity, and without truth that of the evaluation.
     """
     names = curves["policy"].values[numpy.isin(curves["kind"].values.astype(str), RANKED)].tolist()
     if "mean_cost" in curves:
@@ -50,14 +51,14 @@ def choose_highlights(
     learned: Sequence[str] = (),
     own: Sequence[str] = (),
 ) -> list[str]:
-    """Names of the lines that are told apart, the most important first; of those that are the same, the first.
+    """Return the names of the highlighted lines, the most important first; of equal lines the first.
 
     Args:
-        curves: of an evaluation.
-        highlight: names, in place of those that are found: the user's own, the paper's algorithm, the reference, the
-            bound, the best learned and the best classical competitor, and then by cost.
-        learned: names of what has been learned.
-        own: names of what the user brings.
+        curves: curves of an evaluation.
+        highlight: names; default: the user's own, the paper's algorithm, the reference, the bound, the best learned and
+            the best classical competitor, and then by cost.
+        learned: names of learned competitors.
+        own: names of the user's competitors.
 
     Raises:
         ValueError: for unknown names, or too many.
@@ -68,7 +69,9 @@ def choose_highlights(
             if name not in present:
                 raise ValueError(f"cannot highlight {name!r}: there are {', '.join(present)}")
         if len(set(highlight)) > MOST_HIGHLIGHTED:
-            raise ValueError(f"at most {MOST_HIGHLIGHTED} lines can be told apart, got {len(set(highlight))}")
+            raise ValueError(
+                f"at most {MOST_HIGHLIGHTED} lines can be highlighted, got {len(set(highlight))}"
+            )
         return list(dict.fromkeys(highlight))
     ranked = by_cost(curves)
     kinds = dict(zip(present, curves["kind"].values.astype(str).tolist(), strict=True))
@@ -93,7 +96,7 @@ def choose_highlights(
 
 
 def _same(one: numpy.ndarray, other: numpy.ndarray) -> bool:
-    """Whether two lines lie on each other; what is missing from both says nothing."""
+    """Return whether two lines coincide, apart from values that are missing in both."""
     missing = numpy.isnan(one).all() and numpy.isnan(other).all()
     return not missing and bool(numpy.allclose(one, other, rtol=1e-6, atol=0.0, equal_nan=True))
 
@@ -104,13 +107,13 @@ def looks(
     learned: Sequence[str] = (),
     own: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """Colour, line style and width of the lines that are told apart, in the order of the legend.
+    """Return the colour, line style and width of the highlighted lines, in the order of the legend.
 
     Args:
-        curves: of an evaluation.
+        curves: curves of an evaluation.
         highlight: as of :func:`choose_highlights`.
-        learned: names of what has been learned; their lines are thicker.
-        own: names of what the user brings; their lines are thicker, and the first has a colour of its own.
+        learned: names of learned competitors; their lines are thicker.
+        own: names of the user's competitors; their lines are thicker, and the first has a colour of its own.
     """
     chosen = choose_highlights(curves, highlight, learned, own)
     kinds = {name: str(curves["kind"].sel(policy=name).values) for name in chosen}
@@ -120,14 +123,14 @@ def looks(
     free = [colour for colour in COLOURS[1:6] if colour not in colours.values()]
     if mine := [name for name in own if name in chosen and name not in colours][:1]:
         colours[mine[0]] = OWN
-        free.remove(COLOURS[3])  # which is too like it
+        free.remove(COLOURS[3])  # which is too similar to it
     if curves.attrs["paper"] not in chosen:
         free.insert(0, COLOURS[0])
     rest = iter(free)
     for name in chosen:
         if name not in colours:
             colours[name] = next(rest)
-    # A second smoother, reference or bound is told from the first by its grey.
+    # A second smoother, reference or bound differs from the first by its grey.
     for kind in ("smoother", "reference", "bound"):
         for name, shade in zip(
             [n for n in chosen if kinds[n] == kind], ("#000000", "0.4", "0.6") * 2, strict=False
@@ -145,7 +148,7 @@ def looks(
 
 
 def group_equal_lines(names: Iterable[str], values: Mapping[str, numpy.ndarray]) -> dict[str, list[str]]:
-    """Names whose lines lie on each other, by the first of them, in the order of ``names``."""
+    """Return the names of coinciding lines, by the first of them, in the order of ``names``."""
     found: dict[str, list[str]] = {}
     for name in names:
         twin = next((first for first in found if _same(values[first], values[name])), name)
@@ -156,10 +159,10 @@ def group_equal_lines(names: Iterable[str], values: Mapping[str, numpy.ndarray])
 def distinguish_lines(
     look: Iterable[str], values: Mapping[str, numpy.ndarray]
 ) -> tuple[dict[str, str], list[str]]:
-    """Lines that are told apart, with their labels, and the others; whoever lies on one of them is named with it.
+    """Return the highlighted lines with their labels, and the others; a label names all coinciding lines.
 
     Args:
-        look: names of those that are told apart, in the order of the legend.
+        look: names of the highlighted lines, in the order of the legend.
         values: line of each name.
     """
     chosen = list(look)
@@ -171,6 +174,8 @@ def distinguish_lines(
 
 
 def join_names(names: Sequence[str], most: int = 2) -> str:
-    """Name of a line that several share: ``imm = zero``, or of more than ``most`` ``imm = zero = 3 more``."""
+    """Return the name of a line that several share: ``imm = zero``, or of more than ``most`` ``imm = zero = 3
+    more``.
+    """
     few = len(names) <= most
     return " = ".join(names if few else [*names[:most], f"{len(names) - most} more"])

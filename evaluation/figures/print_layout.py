@@ -11,11 +11,11 @@ import numpy
 from ..storage.files import whole_file
 
 MOST_BESIDE = 8
-"""Names that fit beside the lowest axes."""
+"""Number of names that fit beside the lowest axes."""
 WIDTHS = {1: 3.5, 2: 7.16}
-"""Inches, of one and two columns of a paper."""
+"""Widths of one and two columns of a paper, inches."""
 FONT_SIZES = {1: 7.0, 2: 8.0}
-"""Points, which are printed as they are: the figure has the width of its place."""
+"""Font sizes in print, points: the figure has the width of its place on the page."""
 FORMATS = ("png", "svg", "pdf")
 DOTS_PER_INCH = 200
 
@@ -38,7 +38,7 @@ def check_formats(formats: Iterable[str]) -> list[str]:
 
 
 def in_print(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Draw with the sizes of print, whatever matplotlib has been told elsewhere."""
+    """Draw with the sizes of print inside the context, independent of matplotlib's settings."""
 
     @wraps(draw)
     def draw_in_print(*arguments: Any, columns: int = 2, **keywords: Any) -> Any:
@@ -87,12 +87,10 @@ def figure_with_pairs(rows: int, columns: int = 2) -> Any:
 
 
 def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
-    """Return the figure with its title, and a legend, of the first axes or of handles: beside it where there is room,
-    else below.
-    """
+    """Add a title and a legend, of the first axes or of handles: beside the title where there is room, else below."""
     width = figure.get_figwidth()
     size = FONT_SIZES[1 if width < 5.0 else 2]
-    # Letters are half as wide as they are high, and a little.
+    # Letters are a little wider than half their height.
     letters = int(72.0 * width / (0.55 * size))
     wrapped = "\n".join(line for part in title.split("\n") for line in textwrap.wrap(part, letters))
     figure.suptitle(wrapped, x=0.01, ha="left")
@@ -114,8 +112,9 @@ def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> 
 
 
 def logarithmic(axis: Any) -> None:
-    """Label a logarithmic axis, whose limits are set, with plain numbers: decades; 2 and 5 too within three, 3 within
-    one; round ones, a few, within less than half of one.
+    """Label a logarithmic axis, whose limits are set, with plain numbers.
+
+    These are decades; also 2 and 5 within three decades, 3 within one, and a few round numbers within half of one.
     """
     from matplotlib.ticker import MaxNLocator, NullLocator
 
@@ -134,15 +133,15 @@ def sensible_limits(
     always: Sequence[numpy.ndarray] = (),
     bounds: Sequence[numpy.ndarray] = (),
 ) -> tuple[float, float]:
-    """Limits of a logarithmic axis on which one line, or a transient, cannot squash all others.
+    """Return the limits of a logarithmic axis on which one line, or a transient, cannot compress all others.
 
-    A line takes the room from its 5th percentile, so that it need not begin at zero, to its largest value, but not more
-    than a factor of six above what half of the lines take.
+    A line extends the limits from its 5th percentile, so that it need not begin at zero, to its largest value, but at
+    most a factor of six above half of the lines.
 
     Args:
-        lines: positive; NaN where there is none.
-        always: lines that are shown whatever they are.
-        bounds: lines that may be far below what anybody reaches: they take a factor of six below the others at most.
+        lines: positive values; NaN where there is none.
+        always: lines that are completely inside the limits.
+        bounds: lines that may be far below all others: they extend the limits by a factor of six at most.
     """
     ends = numpy.array([numpy.percentile(own, [5.0, 100.0]) for line in lines if len(own := positive(line))])
     if not len(ends):
@@ -165,7 +164,7 @@ def positive(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def _spread(wanted: Sequence[float], gap: float) -> list[float]:
-    """Places as near to the wanted ones as a gap between them allows, within 0 and 1."""
+    """Return places within 0 and 1, as near to the desired ones as a gap between them allows."""
     order = numpy.argsort(wanted, kind="stable")
     places = numpy.clip(numpy.asarray(wanted, dtype=float)[order], 0.0, 1.0)
     for _ in range(200):
@@ -187,10 +186,10 @@ def direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float,
     """Name lines at their right end.
 
     Args:
-        figure: that the axes are in.
-        axis: whose limits and scales are set.
-        ends: label -> where its line ends, and its colour.
-        rows: axes above each other in the figure.
+        figure: figure of the axes.
+        axis: axes with their limits and scales set.
+        ends: end of the line and colour, by label.
+        rows: number of axes above each other in the figure.
     """
     size = FONT_SIZES[1 if figure.get_figwidth() < 5.0 else 2] - 0.5
     height = 72.0 * (figure.get_figheight() - 0.7) / rows * 0.85  # of the axes, points; about
@@ -212,20 +211,21 @@ def direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float,
 
 
 def room_for_labels(labels: Iterable[str], columns: int) -> bool:
-    """Whether names beside the axes leave most of the width to them, and the lowest axes are high enough for them."""
+    """Return whether names fit beside the axes: most of the width remains, and the lowest axes are high enough."""
     labels = list(labels)
     width = 0.5 * (FONT_SIZES[columns] - 0.5) * max(map(len, labels), default=0) / 72.0
     return width <= 0.3 * WIDTHS[columns] and len(labels) <= MOST_BESIDE
 
 
 def wrap_label(label: str, columns: int) -> str:
-    """Break the name of an ordinate that is longer than a low panel is high."""
+    """Wrap a label of an ordinate that is longer than the height of a low panel."""
     return "\n".join(textwrap.wrap(label, 26 if columns == 1 else 32))
 
 
 def save(figure: Any, path: Path) -> None:
-    """Save a figure as its suffix says, whole or not at all: ``.png``; ``.svg``, whose text stays text; ``.pdf``, which
-    holds the fonts it takes. The same figure gives the same file.
+    """Save a figure in the format of its suffix, completely or not at all.
+
+    Formats are ``.png``; ``.svg``, with text as text; ``.pdf``, with embedded fonts. Equal figures give equal files.
 
     Raises:
         ValueError: for another suffix, or if it cannot be written.
@@ -236,7 +236,7 @@ def save(figure: Any, path: Path) -> None:
     check_formats([written])
     # Without the time of writing.
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(written)
-    # Type 42: TrueType as it is, which journals take; Type 3, the default, many refuse.
+    # Type 42: TrueType unchanged, which journals accept; many reject Type 3, the default.
     settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "filtergym", "pdf.fonttype": 42}
     with whole_file(path) as partial, rc_context(settings):
         figure.savefig(partial, format=written, dpi=DOTS_PER_INCH, metadata=metadata)

@@ -1,4 +1,4 @@
-"""The episodes that cost a competitor most, run once more to be looked at: an episode is fixed by its seed."""
+"""Episodes with the highest cost of a competitor, run again for figures: the seed determines an episode."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -16,33 +16,33 @@ from .looks import COLOURS
 from .print_layout import add_title, figure_with_pairs, in_print
 
 MOST_WORST = 3
-"""Episodes that are looked at."""
+"""Number of episodes in the figure."""
 MOST_CAUSES = 2
 LEAST_WEIGHT = 0.1
-"""Main causes of an episode, and what each of them weighs at least."""
+"""Maximal number of main causes of an episode, and the least weight of each."""
 
 
 class WorstEpisode(NamedTuple):
-    """An episode that costs a competitor much."""
+    """An episode with a high cost of a competitor."""
 
     number: int
-    """Among those of the evaluation."""
+    """Number of the episode in the evaluation."""
     seed: str
-    """With which ``env.reset`` and ``filtergym animate`` show it."""
+    """Seed of the episode for ``env.reset`` and ``filtergym animate``."""
     cost: float
-    """Mean over its measurements."""
+    """Mean cost over its measurements."""
     opponent_cost: float
-    """That of whom the competitor is compared with; NaN where there is nobody."""
+    """Mean cost of the opponent; NaN without one."""
     causes: list[str]
-    """The main ones, see :func:`main_causes`."""
+    """Main causes, see :func:`main_causes`."""
 
 
 def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
-    """Return the numbers of the dearest episodes, the worst first.
+    """Return the numbers of the episodes with the highest cost, the worst first.
 
     Args:
         costs: mean cost of every episode; one that is NaN is left out.
-        most: how many at most.
+        most: maximal number of episodes.
     """
     order = numpy.argsort(-costs, kind="stable")
     return [int(i) for i in order[:most] if not numpy.isnan(costs[i])]
@@ -51,12 +51,12 @@ def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
 def run_episodes(
     experiment: Experiment, competitors: Mapping[str, Any], numbers: list[int]
 ) -> xarray.Dataset:
-    """Run some episodes of an experiment once more, and keep what a picture of each shows.
+    """Run some episodes of an experiment again, with the data for figures.
 
     Args:
-        experiment: of which they are.
-        competitors: by name, as of :func:`.evaluate.run_experiment`.
-        numbers: of the episodes.
+        experiment: experiment of the episodes.
+        competitors: competitors by name, as for :func:`.evaluate.run_experiment`.
+        numbers: numbers of the episodes.
 
     Returns:
         An evaluation of these episodes, in their order, as of :func:`.evaluate.run_experiment`.
@@ -78,13 +78,13 @@ def _with_episodes(plan: Plan, numbers: list[int]) -> Plan:
 def describe_worst(
     dataset: xarray.Dataset, numbers: list[int], name: str, opponent: str = ""
 ) -> list[WorstEpisode]:
-    """Say of each of some episodes what it costs, whom, and by what cause.
+    """Describe some episodes by their costs and main causes.
 
     Args:
-        dataset: of :func:`run_episodes`.
-        numbers: of its episodes.
-        name: of the competitor.
-        opponent: with whom it is compared; empty: nobody.
+        dataset: evaluation from :func:`run_episodes`.
+        numbers: numbers of its episodes.
+        name: name of the competitor.
+        opponent: competitor with which it is compared; empty: none.
     """
     own = mean_cost(dataset, name)
     other = mean_cost(dataset, opponent) if opponent else numpy.full(len(numbers), numpy.nan)
@@ -103,7 +103,7 @@ def main_causes(run: xarray.Dataset) -> list[list[str]]:
         run: one competitor's part of an evaluation.
 
     Returns:
-        At most ``MOST_CAUSES`` for each; none where no cause weighs ``LEAST_WEIGHT``.
+        At most ``MOST_CAUSES`` for each; none where no cause has ``LEAST_WEIGHT``.
     """
     if VARIABLE not in run:
         return [[] for _ in range(run.sizes["episode"])]
@@ -118,7 +118,7 @@ def main_causes(run: xarray.Dataset) -> list[list[str]]:
 
 
 def _share_of_all(sums: numpy.ndarray) -> numpy.ndarray:
-    """Share that each cause has of the whole, ``(episodes, causes)``; zero where the whole is zero."""
+    """Return the share that each cause has of the whole, ``(episodes, causes)``; zero where the whole is zero."""
     whole = numpy.broadcast_to(sums[:, :1], sums.shape)
     return numpy.nan_to_num(ratio(numpy.stack([sums, whole], axis=1)))
 
@@ -130,14 +130,14 @@ def _share_of_all(sums: numpy.ndarray) -> numpy.ndarray:
 def draw_worst(
     tracks: Sequence[xarray.Dataset], titles: Sequence[tuple[str, str]], name: str, *, columns: int = 2
 ) -> Any:
-    """Draw episodes below each other: where the target was and was believed to be, and how large the error was.
+    """Draw episodes below each other: true and estimated positions of the target, and the error.
 
     Args:
-        tracks: of each, with ``truth``, ``seen`` where anything is, ``estimate`` and ``sigma`` over policy, component
-            and time; the attribute ``plane`` says whether the first two components are the axes of a plane.
-        titles: of each, above its first axes and above its second.
-        name: of the competitor whose they are; it is drawn first.
-        columns: of a paper, as wide as which the figure is.
+        tracks: track of each episode, with ``truth``, optionally ``seen``, ``estimate`` and ``sigma`` over policy,
+            component and time; the attribute ``plane`` is true if the first two components are the axes of a plane.
+        titles: titles of each episode, above its first and second axes.
+        name: name of their competitor, which is drawn first.
+        columns: width of the figure in columns of a paper, 1 or 2.
     """
     from matplotlib.lines import Line2D
 
@@ -162,7 +162,7 @@ def draw_worst(
 
 
 def _draw_positions(axis: Any, track: xarray.Dataset, colours: Mapping[str, str], name: str) -> None:
-    """Truth, readings and estimates in the plane, or of the first component over time."""
+    """Draw truth, readings and estimates in the plane, or of the first component over time."""
     plane = bool(track.attrs["plane"])
     clock = track["elapsed" if "elapsed" in track.coords else "time"].values
 
@@ -193,7 +193,7 @@ def _draw_positions(axis: Any, track: xarray.Dataset, colours: Mapping[str, str]
 
 
 def _draw_errors(axis: Any, track: xarray.Dataset, colours: Mapping[str, str]) -> None:
-    """Size of the error in the plane, or of the first component, with two of its own sigmas."""
+    """Draw the size of the error in the plane, or of the first component, with the reported two sigmas."""
     clock = track["elapsed" if "elapsed" in track.coords else "time"].values
     drawn = track.isel(component=slice(2 if track.attrs["plane"] else 1))
     for one in reversed([str(n) for n in track["policy"].values]):

@@ -1,8 +1,8 @@
-"""What figures need of an evaluation: one reduction over its episodes, from which every picture is drawn.
+"""Curves of an evaluation: one reduction over its episodes, from which all figures are drawn.
 
 Bands of ``rmse``, mode and true-class probabilities are 95 % percentile bootstraps over episodes (Efron and Tibshirani:
-An Introduction to the Bootstrap, 1993, 13.3), or over flights where episodes fly several. Beyond the end of shorter
-flights what is missing is left out.
+An Introduction to the Bootstrap, 1993, 13.3), or over flights where episodes fly several. After the end of shorter
+flights their missing values are left out.
 """
 
 import functools
@@ -30,40 +30,42 @@ from .threads import one_thread
 from .times import COORDINATES
 
 SHARES = numpy.geomspace(1e-4, 1.0, 121)
-"""At which the distribution of errors is told: thirty to a decade."""
+"""Shares at which the distribution of errors is computed: thirty to a decade."""
 BAND_RESAMPLES = 200
-"""Of the bootstrap of curves: their bands need fewer than intervals of numbers."""
+"""Resamples of the bootstrap of curves: bands need fewer than intervals of single numbers."""
 DISTRIBUTION_LIMIT = 2**21
-"""Measurements whose distribution is told: all of them would have to be kept, and more change no picture."""
+"""Maximal number of measurements in a distribution: all must be stored, and more do not change a figure."""
 PERCENTILES = (10.0, 90.0)
-"""Of actions and gains over episodes."""
+"""Percentiles of actions and gains over episodes."""
 
 MOST_STRETCHES = 100
-"""Stretches of an episode of which the mean cost is compared over time."""
+"""Maximal number of stretches of an episode for comparing the mean cost over time."""
 
 ENDINGS = ("", "_low", "_high")
-"""Of the names of a curve and of the ends of its band."""
+"""Endings of the names of a curve and of the ends of its band."""
 
 Curve = dict[str, numpy.ndarray]
-"""What belongs to a curve, by the ending of its name."""
+"""Values of a curve and the ends of its band, by the ending of the name."""
 Series = tuple[tuple[str, ...], numpy.ndarray]
 """Dimensions and values of a variable."""
 
 
 @one_thread()
 def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarray.Dataset:
-    """Reduce an evaluation to what its figures show.
+    """Reduce an evaluation to the curves of its figures.
 
     Args:
-        dataset: from an evaluation, as it was or read from a file; also some of its policies.
-        resamples: of the bootstrap.
+        dataset: evaluation, in memory or read from a file; also with some of its policies only.
+        resamples: number of bootstrap resamples.
 
     Returns:
-        Variables over policy and time, of 64-bit floats; NaN where a competitor has none, and absent where nobody has:
+        Variables over policy and time, of 64-bit floats; NaN where a competitor has none, and absent where no
+        competitor has:
 
         * ``rmse`` (policy, quantity, time), in the unit of the quantity, with ``rmse_low`` and ``rmse_high``: root of
           the mean square error over episodes;
-        * ``error_exceeded`` (policy, quantity, share), likewise: size of error that this share of measurements reaches
+        * ``error_exceeded`` (policy, quantity, share), in the unit of the quantity: size of error that this share of
+            measurements reaches
           or exceeds; none of bounds, nor where there are too few measurements for a share;
         * ``anees`` and ``anis`` (policy, time): mean NEES and NIS over their dimension, with the 95 % chi-square band
           of that mean, ``anees_low`` and so on, (time);
@@ -71,12 +73,12 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
           with ``_low`` and ``_high``;
         * ``action`` (policy, action_name, time): mean over episodes of the actions applied, with their 10 and 90 %
           percentiles, ``_low`` and ``_high``, of policies whose action is a box; ``gain`` (policy, gain_name, time), of
-          gains that a bank records, likewise;
-        * ``mean_cost`` (policy): over episodes;
+          gains that a bank records, with the same percentiles;
+        * ``mean_cost`` (policy): mean over episodes;
         * ``cost_minus_paper`` and ``cost_minus_best`` (policy, stretch): mean cost over stretches of the episode less
-          that of the paper's algorithm and of the best that is ranked, paired, with ``_low`` and ``_high``.
+            that of the paper's algorithm and of the best ranked competitor, paired, with ``_low`` and ``_high``.
 
-        Errors exceeded, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
+        Exceeded errors, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
         256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``nanoseconds`` and
         ``compiled`` if the evaluation was timed, ``unit`` of every quantity (the groups of components where there are
         any, else the first three components), ``elapsed`` (s) of every measurement, where they come regularly, and
@@ -103,17 +105,17 @@ class CompetitorCurves(NamedTuple):
     gains: list[str]
     costs: numpy.ndarray | None = None
     """Mean over episodes of the cost in each stretch, in the data and every resample, ``(1 + resamples, stretches)``;
-    None of bounds, and without truth."""
+    None for bounds, and without truth."""
 
     def at_measurements(self, chosen: numpy.ndarray, times: int) -> "CompetitorCurves":
-        """Return them at the measurements of these indices, of so many."""
+        """Return the curves at the measurements of these indices, out of ``times``."""
         over_time = {key for key, own in self.curves.items() if own.shape[-1:] == (times,)}
         fewer = {key: own[..., chosen] if key in over_time else own for key, own in self.curves.items()}
         return self._replace(curves=fewer)
 
 
 def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
-    """Take the curves out of the results of :func:`curve_statistics` over all episodes of a competitor."""
+    """Return the curves from the results of :func:`curve_statistics` over all episodes of a competitor."""
     curves = {"mean_cost": numpy.array(results["cost",].mean())} if ("cost",) in results else {}
     labels: dict[str, list[str]] = {}
     for (kind, *words), endings in results.items():
@@ -126,7 +128,7 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
 
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
-    """Return the groups of components, where there are any, else the first three; those whose truth is known."""
+    """Return the groups of components, or without groups the first three components, with known truth."""
     reported = list(components_and_groups(dataset))
     return [name for name in groups_of(dataset) if name in reported] or reported[:3]
 
@@ -134,15 +136,15 @@ def select_quantities(dataset: xarray.Dataset) -> list[str]:
 def curve_statistics(
     run: xarray.Dataset, episodes: int, resamples: int = BAND_RESAMPLES
 ) -> Iterator[Statistic]:
-    """Declare what curves are made of: by variable, and the names of actions and gains.
+    """Declare the statistics of curves by variable, and the names of actions and gains.
 
     Args:
         run: some episodes of one competitor.
-        episodes: of the whole evaluation.
-        resamples: of the bands.
+        episodes: number of episodes of the whole evaluation.
+        resamples: number of resamples for the bands.
     """
     times = run.sizes["time"]
-    resamples = resamples if episodes > 1 else 0  # one episode has no other to differ from
+    resamples = resamples if episodes > 1 else 0  # one episode has no variation over episodes
     distributed = max(block_of(times), DISTRIBUTION_LIMIT // times)
     if run.attrs["truth"]:
         groups = groups_of(run)
@@ -186,16 +188,16 @@ DIMENSIONS: dict[str, tuple[str, ...]] = {
     "action": ("action_name", "time"),
     "gain": ("gain_name", "time"),
 }
-"""Of a curve, after the competitor."""
+"""Dimensions of a curve, after the competitor."""
 
 
 def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, episodes: int) -> xarray.Dataset:
-    """Put the curves of several competitors together.
+    """Combine the curves of several competitors in a dataset.
 
     Args:
-        found: in the order of the policies of the evaluation.
-        dataset: the evaluation, of whose variables none is needed.
-        episodes: of which the curves are.
+        found: curves in the order of the policies of the evaluation.
+        dataset: the evaluation, of which only coordinates and attributes are needed.
+        episodes: number of episodes of the curves.
     """
     units, shown = components_and_groups(dataset), select_quantities(dataset)
     names = {
@@ -264,14 +266,14 @@ def stretches_of(times: int) -> list[slice]:
     """Cut an episode into at most ``MOST_STRETCHES`` stretches of one length; the last may be shorter.
 
     Args:
-        times: its measurements.
+        times: number of its measurements.
     """
     length = -(-times // MOST_STRETCHES)
     return [slice(first, min(first + length, times)) for first in range(0, times, length)]
 
 
 def cost_in_stretches(cost: numpy.ndarray) -> numpy.ndarray:
-    """Mean cost of every episode in each stretch, NaN where it has none.
+    """Return the mean cost of every episode in each stretch, NaN where it has none.
 
     Args:
         cost: ``(episodes, time)``; NaN where there is none.
@@ -284,7 +286,9 @@ def cost_in_stretches(cost: numpy.ndarray) -> numpy.ndarray:
 
 
 def _stretch_coords(dataset: xarray.Dataset) -> dict[str, Any]:
-    """Middle of every stretch, as the number of a measurement and, where they come regularly, in seconds."""
+    """Return the middle of every stretch, as the number of a measurement and, where they come regularly, in
+    seconds.
+    """
     middles = {
         name: [float(dataset[name].values[stretch].mean()) for stretch in stretches_of(dataset.sizes["time"])]
         for name in ("time", "elapsed")
@@ -297,7 +301,7 @@ def _stretch_coords(dataset: xarray.Dataset) -> dict[str, Any]:
 
 
 def _cheapest(found: Sequence[CompetitorCurves], dataset: xarray.Dataset) -> str:
-    """Return the best that is ranked; empty where nobody is."""
+    """Return the name of the best ranked competitor; empty where none is ranked."""
     named = zip(dataset["policy"].values.tolist(), dataset["kind"].values.tolist(), found, strict=True)
     means = {
         str(name): float(each.curves["mean_cost"])
@@ -310,12 +314,12 @@ def _cheapest(found: Sequence[CompetitorCurves], dataset: xarray.Dataset) -> str
 def _cost_differences(
     found: Sequence[CompetitorCurves], names: Sequence[str], bases: Mapping[str, str]
 ) -> dict[str, Series]:
-    """Mean cost over time less that of others, paired.
+    """Return the mean cost over time less that of other competitors, paired.
 
     Args:
-        found: in the order of the names.
-        names: of the competitors.
-        bases: name of each other competitor, by the end of the variable's name.
+        found: curves in the order of the names.
+        names: names of the competitors.
+        bases: name of each other competitor, by the ending of the variable's name.
     """
     variables: dict[str, Series] = {}
     for key, base in bases.items():
@@ -332,7 +336,7 @@ def _cost_differences(
 
 
 def gains_of(dataset: xarray.Dataset) -> list[str]:
-    """Names of the gains that some bank records: a number for every measurement."""
+    """Return the names of the gains that a bank records, one number for every measurement."""
     names = map(str, dataset.data_vars)
     return [
         name
@@ -345,15 +349,15 @@ def gains_of(dataset: xarray.Dataset) -> list[str]:
 
 
 def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
-    """Size that a share of errors reaches or exceeds, for each of :data:`SHARES`.
+    """Return the size that a share of errors reaches or exceeds, for each of :data:`SHARES`.
 
     Args:
-        errors: of any shape, not below zero; NaN: none.
+        errors: non-negative errors of any shape; NaN is left out.
 
     Returns:
         ``(shares,)``; NaN where the share is less than one error.
     """
-    descending = -numpy.sort(-errors, axis=None)  # what is missing comes last
+    descending = -numpy.sort(-errors, axis=None)  # NaN comes last
     count = int(numpy.isfinite(descending).sum())
     which = numpy.rint(SHARES * count).astype(int)
     found = numpy.full(len(SHARES), numpy.nan)
@@ -363,17 +367,17 @@ def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
 
 
 def _consistency_bands(found: Sequence[CompetitorCurves]) -> dict[str, Series]:
-    """Where mean NEES and NIS over their dimension lie with 95 % if the filter is consistent.
+    """Declare the 95 % intervals of mean NEES and NIS over their dimension for a consistent filter.
 
-    A sum of independent chi-square numbers is one, of the sum of their degrees (Bar-Shalom, Li, Kirubarajan: Estimation
-    with Applications to Tracking and Navigation, 2001, 5.4).
+    A sum of independent chi-square numbers is chi-square with the sum of their degrees (Bar-Shalom, Li, Kirubarajan:
+    Estimation with Applications to Tracking and Navigation, 2001, 5.4).
     """
     variables: dict[str, Series] = {}
     for key in ("anees", "anis"):
         name = f"{key}_dimension"
         dimensions = [each.curves[name] for each in found if name in each.curves]
         if dimensions:
-            # Where some measurements are missing the bands differ little; the widest is told.
+            # Where some measurements are missing the bands differ little; the widest is stored.
             fewest = min(dimensions, key=lambda dimension: dimension.sum())
             there = fewest > 0.0
             ends = numpy.full((2, len(fewest)), numpy.nan)
@@ -384,7 +388,7 @@ def _consistency_bands(found: Sequence[CompetitorCurves]) -> dict[str, Series]:
 
 
 def _spread(values: numpy.ndarray) -> Curve:
-    """Mean and percentiles over the episodes of ``(episodes, name, time)``."""
+    """Return the mean and percentiles over the episodes of ``(episodes, name, time)``."""
     flat = values.reshape(len(values), -1)
     found = numpy.full((3, flat.shape[1]), numpy.nan)
     absent = numpy.isnan(flat)
@@ -411,5 +415,5 @@ def _exceedance(squares: numpy.ndarray) -> Curve:
 
 
 def _over_dimension(episodes: int, means: numpy.ndarray) -> Curve:
-    """Mean NEES or NIS over its dimension, and the sum of the dimensions, from the means of both, ``(1, 2, time)``."""
+    """Return the mean NEES or NIS over its dimension, and the sum of dimensions, from both means, ``(1, 2, time)``."""
     return {"": ratio(means)[0], "_dimension": episodes * means[0, 1]}

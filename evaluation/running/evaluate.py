@@ -22,18 +22,18 @@ from ...envs.engine.catalogue import importable_name, nearest, task_class
 from ...envs.engine.episode_noise import uniforms_of_seeds
 from ...envs.engine.programs import Report
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
-from ..competitors.kinds import TOLD_MORE, Kind, kind_of
+from ..competitors.kinds import INFORMED_KINDS, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
-from .kept import Kept, limits
 from .metrics import bootstrap_of, units_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
+from .stored_values import StoredValues, limits
 from .supervision import running
 from .threads import one_thread
 from .times import with_times
@@ -46,15 +46,15 @@ def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> s
     """Return the control that a run uses: the policy's own, or the one that fits a model's spaces.
 
     Args:
-        maker: of the competitor, or the competitor itself.
-        control: that is demanded; None demands none.
-        cls: the environment.
-        name: of the competitor, in errors.
+        maker: maker of the competitor, or the competitor itself.
+        control: required control; None: any.
+        cls: task class of the environment.
+        name: name of the competitor in errors.
 
     Raises:
-        ValueError: if the competitor cannot act in the control that is demanded, or in none.
+        ValueError: if the competitor cannot act in the required control, or in any.
     """
-    if control is not None and not isinstance(control, str):  # an array equals no word, and no truth
+    if control is not None and not isinstance(control, str):  # an array has no truth value
         raise nearest("control", control, cls.controls)
     if kind_of(maker) != "policy":
         return cls.controls[0]
@@ -64,8 +64,10 @@ def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> s
         models = [make_model(cls, c) for c in cls.controls]
         acting = [model for model in models if model.action_space == space]
         if not acting:
-            raise ValueError(f"policy {name!r} acts in {space}, which is no control of {cls.id}")
-        # Controls may share an action space; what they show then tells them apart.
+            raise ValueError(
+                f"policy {name!r} acts in {space}, which is the action space of no control of {cls.id}"
+            )
+        # Controls may share an action space; their observation spaces then distinguish them.
         shown = getattr(getattr(maker, "observation_space", None), "shape", None)
         fitting = [t.control for t in acting if (len(t.fields),) == shown] or [t.control for t in acting]
         own = control if control in fitting else fitting[0]
@@ -77,19 +79,19 @@ def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> s
 
 
 def check_observation(model: Model, policy: Any, name: str) -> None:
-    """Raise ValueError if a model takes observations of another shape than the task shows, or privileged ones."""
+    """Raise ValueError if a model expects observations of another shape than the task's, or privileged ones."""
     space = getattr(policy, "observation_space", None)
     if isinstance(space, gymnasium.spaces.Dict):
         raise ValueError(
-            f"policy {name!r} takes privileged observations ({', '.join(space)}), which no evaluation shows: let its "
-            "actor answer observations alone, in an object with a method predict"
+            f"policy {name!r} takes privileged observations ({', '.join(space)}), which no evaluation provides: wrap "
+            "its actor, which needs the observations alone, in an object with a method predict"
         )
     shown = getattr(space, "shape", None)
     if shown is not None and shown != (len(model.fields),):
         raise ValueError(
-            f"policy {name!r} expects observations of shape {shown}, but control {model.control!r} shows "
-            f"{len(model.fields)} fields, and a model knows none by its name: train it again, or give the .safetensors "
-            "of its run, which does"
+            f"policy {name!r} expects observations of shape {shown}, but control {model.control!r} has "
+            f"{len(model.fields)} fields, and a model does not contain their names: train it again, or give the "
+            ".safetensors of its run, which does"
         )
 
 
@@ -97,14 +99,14 @@ OPTIONS = (
     "scenario", "episodes", "seed", "split", "control", "tracks", "drawn_episodes", "backend", "threads", "strict",
     "timed",
 )  # fmt: skip
-"""Fields of an experiment that a user names side by side with parameters of the task."""
+"""Fields of an experiment that a user gives together with parameters of the task."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Over which episodes of which environment competitors are run, and how.
+    """Environment, episodes and options of an evaluation.
 
-    Plain data for any process; the environment goes to another process by its name.
+    Plain data for any process; another process finds the environment by its name.
     """
 
     task: type[Task]
@@ -113,31 +115,31 @@ class Experiment:
     """Name of a scenario, a trajectory, a set of flights, or a recording; None: the training distribution."""
     episodes: int = 500
     """Monte Carlo runs M. Every flight of a set gets as many, so they may be rounded up. Of a recording every episode
-    is replayed once, whatever is asked for."""
+    is replayed once, independent of this number."""
     seed: int = 0
-    """Number of the experiment."""
+    """Seed of the experiment."""
     split: str = "test"
-    """One of "test", "validation" and "train", which share no episode."""
+    """One of "test", "validation" and "train", which have no episode in common."""
     control: str | None = None
-    """Demand this control; None: every policy runs in its own."""
+    """Required control; None: every policy runs in its own."""
     tracks: bool = False
-    """Keep what a track is drawn from, see :meth:`.Task.track`; it takes memory."""
+    """Store the data of plots of tracks, see :meth:`.Task.track`; they take memory."""
     drawn_episodes: int = 0
-    """Of how many of the first episodes to keep what :meth:`.Task.drawn` tells, as ``drawn_estimate`` and so on over
-    policy, drawn_episode and time."""
+    """Number of first episodes for which the values of :meth:`.Task.drawn` are stored, as ``drawn_estimate`` and so on
+    over policy, drawn_episode and time."""
     paper: str = ""
-    """Name of the paper's algorithm, whose score is 0; kept in the attributes of the evaluation."""
+    """Name of the paper's algorithm, whose score is 0; stored in the attributes of the evaluation."""
     reference: str = ""
-    """Name of the competitor whose score is 1; kept likewise."""
+    """Name of the competitor whose score is 1; stored in the attributes of the evaluation."""
     backend: str = "auto"
-    """What computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`."""
+    """Backend of the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`."""
     threads: int = 1
-    """How many share the episodes, of the compiled backend."""
+    """Number of threads that share the episodes, with the compiled backend."""
     strict: bool = False
     """Raise where an estimator would lose an episode, see :class:`.filters.CheckedFilter`."""
     timed: bool = False
-    """Measure the processor time of every competitor, the coordinates ``nanoseconds`` and ``compiled``: of all that is
-    kept the one thing that differs from run to run."""
+    """Measure the processor time of every competitor, the coordinates ``nanoseconds`` and ``compiled``: the only
+    results that differ from run to run."""
     keywords: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the task."""
 
@@ -150,7 +152,7 @@ class Experiment:
         return make_task(self.task, self.scenario, **self.keywords)
 
     def make_model(self, maker: Any, control: str) -> Model:
-        """Make the model that a competitor acts in; the experiment's keywords win over those tuned with it."""
+        """Make the model that a competitor acts in; the experiment's keywords override those tuned with it."""
         keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
         return make_model(
             self.task, control, self.scenario, backend=self.backend, threads=self.threads, **keywords
@@ -172,28 +174,27 @@ def run_experiment(
     """Run policies, estimators, references and bounds over the same episodes.
 
     Args:
-        experiment: which episodes, and how.
-        competitors: by the name that stands in the tables: each a class or function that makes it,
-            or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``; of a smoother
-            with ``smooth``, too.
+        experiment: the episodes and options.
+        competitors: by the name in the tables: each a class or function that makes it, or an object, with a method
+            ``predict`` or, of an estimator, with ``start`` and ``update``; of a smoother with ``smooth``, too.
         progress: called with the number of measurements done, now and then.
-        workers: who runs competitors and chunks of episodes; default: this process, one after the other.
+        workers: processes for competitors and chunks of episodes; default: this process, one after the other.
 
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
-        truth), ``cost``, ``compressed_cost`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
-        ``mode_probability``), ``mean_square`` of bounds, ``action`` (also over action_name) of policies whose
+        truth), ``cost``, ``compressed_cost`` (minus the ``cost`` reward), ``nees``, everything that the task records
+        (``nis``, ``mode_probability``), ``mean_square`` of bounds, ``action`` (also over action_name) of policies whose
         action is a box, and ``lost`` of estimators, zero, or once an episode is lost the number of the reason, see
-        :data:`.dataset.FAULTS`. Coordinates: ``unit`` and ``group`` of every component,
-        ``kind`` and ``control`` of every policy, ``episode_seed`` (in words: a file may have no room for so large a
-        number), ``nanoseconds`` and ``compiled`` of every policy where the experiment is timed, ``window_first`` and
-        ``window_last`` of every window, and ``elapsed``, seconds since the start of the track, where measurements come
-        regularly. Of a set of flights ``flight`` and ``length`` say which each episode
-        flies and its measurements; what lies beyond is NaN. The attribute ``notes`` tells what was left out. Of a
-        recording likewise, where ``flight`` names the episode of the recording; without truth there are neither
-        ``error``, ``cost``, ``compressed_cost`` nor ``nees``, and where some of it is not known, errors of that are
-        NaN, ``nees`` is of the other components, ``nees_degrees`` of them, and ``truth_known`` says which they are.
-        ``to_netcdf`` saves it; :mod:`.evaluation.storage.dataset` reads windows, groups and keywords out of it.
+        :data:`.dataset.FAULTS`. Coordinates: ``unit`` and ``group`` of every component, ``kind`` and ``control`` of
+        every policy, ``episode_seed`` (as text: some file formats have no such large numbers), ``nanoseconds`` and
+        ``compiled`` of every policy where the experiment is timed, ``window_first`` and ``window_last`` of every
+        window, and ``elapsed``, seconds since the start of the track, where measurements come regularly. For a set of
+        flights ``flight`` and ``length`` give the flight of each episode and its number of measurements; later values
+        are NaN. The attribute ``notes`` lists omissions. For a recording ``flight`` names the episode of the recording.
+        Without truth there are neither ``error``, ``cost``, ``compressed_cost`` nor ``nees``. Where the truth of some
+        components is unknown, their errors are NaN, ``nees`` and ``nees_degrees`` are those of the other components,
+        and ``truth_known`` marks these. ``to_netcdf`` saves it; :mod:`.evaluation.storage.dataset` reads its windows,
+        groups and keywords.
 
     Raises:
         ValueError: for an unknown scenario, control or keyword, or a policy that does not fit
@@ -213,7 +214,9 @@ def run_competitors(
 ) -> "xarray.Dataset":
     """Return the evaluation of :func:`run_experiment`, without its note on intervals."""
     if progress is not None and not callable(progress):
-        raise ValueError(f"progress is a function of the measurements done, got {quote_shortened(progress)}")
+        raise ValueError(
+            f"progress must be a function of the number of measurements done, got {quote_shortened(progress)}"
+        )
     plan = plan_of(experiment, competitors)
     workers = check_workers(workers)
     block = block_of(next(iter(plan.models.values())).task.horizon)
@@ -247,33 +250,38 @@ class Piece(NamedTuple):
     """Number of the first episode."""
     horizon: int
     model: Model | None
-    """That was made already, in this process."""
+    """Model that already exists in this process."""
 
     @property
     def part(self) -> slice:
-        """Which episodes of the evaluation they are."""
+        """Slice of the evaluation's episodes."""
         return slice(self.first, self.first + len(self.seeds))
 
 
 LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
-"""What few estimators and references say: how likely a measurement was."""
+"""Names of the likelihood statistics, which only some estimators and references report."""
 
 
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
-    """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``.
+    """Run some episodes of one competitor; return the stored values of every measurement, ``(episodes, time, ...)``.
 
-    Of a policy whose action is a box that is ``action``, too, within the limits of the box, as every bank takes it.
+    For a policy whose action is a box they include ``action``, clipped to the limits of the box, as every bank does.
     """
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
-    kept, drawn = Kept(experiment.tracks), None
+    kept, drawn = StoredValues(experiment.tracks), None
     report: Report = limits if kind == "bound" else kept
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
         drawn = replace(kept, drawings=True), most
-    # What is timed afterwards is optimised then: nothing need be compiled in two ways.
-    with optimised_code() if experiment.timed else nullcontext(), running(piece.name, tick) as told:
-        flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, told, drawn)
+    # Code that is timed afterwards is optimised here: so nothing is compiled in two ways.
+    with (
+        optimised_code() if experiment.timed else nullcontext(),
+        running(piece.name, tick) as report_progress,
+    ):
+        flown = run_episodes(
+            model, piece.maker, kind, piece.seeds, report, piece.name, report_progress, drawn
+        )
     arrays = dict(flown.found)
     if kind == "policy":
         _check_reserved(model, arrays)
@@ -299,30 +307,30 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
     """Raise ValueError if a task records something under a name that the evaluation of a policy needs."""
     for taken in {"action", "lost"} & found.keys():
         raise ValueError(
-            f"{model.task.id} records something under the name {taken!r}, under which an evaluation keeps "
-            "which actions were applied or episodes lost: call it something else"
+            f"{model.task.id} records a value named {taken!r}, a name that an evaluation uses for "
+            "applied actions or lost episodes: choose another name"
         )
 
 
 class Plan(NamedTuple):
-    """An evaluation before its episodes are run; everything that can be wrong with it is refused by then."""
+    """An evaluation before its episodes are run, with all its arguments checked."""
 
     experiment: Experiment
-    """Its scenario opened."""
+    """The experiment with its scenario opened."""
     competitors: Mapping[str, Any]
     kinds: dict[str, Kind]
     models: dict[str, Model]
     scenario: Scenario
     seeds: list[int]
-    """Of the episodes that are planned."""
+    """Seeds of the planned episodes."""
     first: int
-    """Number of the first of them."""
+    """Number of the first planned episode."""
     flown: numpy.ndarray | None
     """Number of the flight of each episode."""
     lengths: numpy.ndarray | None
 
     def piece(self, name: str, first: int, count: int, here: bool) -> Piece:
-        """Return some episodes of a competitor as a piece of work, with its task if it is done here."""
+        """Return some episodes of a competitor as a piece of work, with its task if it runs in this process."""
         model = self.models[name]
         return Piece(
             self.experiment,
@@ -342,7 +350,9 @@ class Plan(NamedTuple):
             return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
     def arrays(self, episodes: int, drawn: int) -> StackedArrays:
-        """Return room for what is kept of so many episodes of every competitor; arguments as it has them."""
+        """Return arrays for the stored values of the episodes of every competitor; arguments as of
+        :class:`.StackedArrays`.
+        """
         acting = [
             name
             for name, model in self.models.items()
@@ -351,7 +361,7 @@ class Plan(NamedTuple):
         return StackedArrays(self.models, acting, episodes, drawn)
 
     def dataset(self, kept: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
-        """Return what was kept of some competitors or episodes as an evaluation."""
+        """Return the stored values of some competitors or episodes as an evaluation."""
         experiment = self.experiment
         dataset = with_named_axes(kept, self.kinds, self.models, self.scenario.windows, seeds)
         if self.flown is not None and self.lengths is not None:
@@ -387,13 +397,13 @@ class Plan(NamedTuple):
 def plan_of(
     experiment: Experiment, competitors: Mapping[str, Any], first: int = 0, end: int | None = None
 ) -> Plan:
-    """Return the plan of an evaluation; refusals as of :func:`run_experiment`.
+    """Return the plan of an evaluation; errors as of :func:`run_experiment`.
 
     Args:
-        experiment: which episodes, and how.
-        competitors: by name.
-        first: number of the first episode that is planned; flights and recordings have the plan of all.
-        end: number after that of the last one; None, with a first of 0: all.
+        experiment: the episodes and options.
+        competitors: competitors by name.
+        first: number of the first planned episode; for flights and recordings all episodes are planned.
+        end: number after the last planned episode; None, with a first of 0: all.
     """
     cls = experiment.task
     experiment = replace(
@@ -422,12 +432,12 @@ def plan_of(
     model = next(iter(models.values()))
     if chosen.recording is not None:
         for name, kind in kinds.items():
-            if kind in TOLD_MORE:
+            if kind in INFORMED_KINDS:
                 raise ValueError(
-                    f"{kind} {name!r} is told what recording {chosen.name!r} does not hold, more of the truth than the "
+                    f"{kind} {name!r} needs truth that recording {chosen.name!r} does not contain, beyond the "
                     "components: leave it out"
                 )
-        episodes = len(model.task.flights)  # nothing is random: each once
+        episodes = len(model.task.flights)  # nothing is random, so each flight is run once
     flown, lengths = None, None
     if model.task.flights:
         seeds, flown, lengths = _flights_in_turn(model, split, seed, episodes)
@@ -448,21 +458,21 @@ def plan_of(
 
 
 def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
-    """Raise ValueError for what another process cannot be given, or would not find.
+    """Raise ValueError for a task or a competitor that cannot be sent to another process, or found there.
 
     Args:
-        task: class of the environment's.
-        competitors: by their names.
+        task: task class of the environment.
+        competitors: competitors by name.
     """
     if importable_name(task).startswith("__main__:"):
         raise ValueError(
-            f"{task.id} is registered by the program that runs, which other processes do "
+            f"{task.id} is registered by the running program, which other processes do "
             "not run: register it in a module of its own, or leave out jobs and cluster"
         )
     for name, maker in competitors.items():
         try:
             cloudpickle.dumps(maker)
-        except Exception as error:  # whatever an object raises when it is asked
+        except Exception as error:  # pickling can raise any error
             raise ValueError(
                 f"{name!r} cannot be sent to another process ({error}): give its class, or leave out jobs and cluster"
             ) from error
@@ -471,9 +481,9 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
 def _flights_in_turn(
     model: Model, split: str, seed: int, episodes: int
 ) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
-    """Seeds, in their order, of which every flight gets as many as any other; the flight and length of each.
+    """Return seeds, in their order, with the same number for every flight, and the flight and length of each.
 
-    An episode stays what its seed makes it. Who wants fewer episodes than there are flights gets one of each.
+    The seed alone determines an episode. With fewer episodes than flights there is one of each flight.
     """
     count = len(model.task.flights)
     share = -(-episodes // count)

@@ -1,4 +1,4 @@
-"""From an evaluation to numbers: tidy records, every one derived from the dataset and nothing else.
+"""Tidy records of an evaluation, computed from its dataset alone.
 
 A record is one number with its 95 % bootstrap interval over episodes, or over flights where episodes fly several.
 Differences and ratios are paired: numerator and denominator are resampled together.
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
 NOTHING = IntervalEstimate(math.nan, math.nan, math.nan)
 NEGLIGIBLE = 5e-5
-"""Relative difference of costs that is rounding, or as good as none."""
+"""Relative difference of costs that counts as rounding."""
 
 
 class Record(NamedTuple):
-    """One number of one policy in one window."""
+    """One number of one competitor in one window."""
 
     environment: str
     control: str
@@ -65,7 +65,7 @@ class Record(NamedTuple):
 def squared_errors(
     run: "xarray.Dataset", component: str, groups: dict[str, tuple[str, ...]]
 ) -> numpy.ndarray:
-    """Squared error of a component or group in one run, ``(episodes, time)``; of a bound its mean."""
+    """Return the squared error of a component or group in one run, ``(episodes, time)``; for a bound its mean."""
     parts = list(groups.get(component, (component,)))
     if "mean_square" in run and not numpy.isnan(run["mean_square"].values[0, 0, 0]):
         return run["mean_square"].sel(component=parts).sum("component", skipna=False).values
@@ -73,7 +73,7 @@ def squared_errors(
 
 
 def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Components and groups of components whose truth is known, with their units."""
+    """Return the components and groups of components whose truth is known, with their units."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
     if "truth_known" in dataset.coords:
         known = dataset["truth_known"].values > 0
@@ -83,7 +83,7 @@ def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
 
 
 def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
-    """Sum of every episode over the times, and how many there are, of which :func:`.bootstrap.ratio` is the mean.
+    """Return the sum of every episode over the times and the number of terms; :func:`.bootstrap.ratio` gives the mean.
 
     Args:
         values: ``(episodes, time)``; NaN stands for no measurement, or no event.
@@ -96,7 +96,7 @@ def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
-    """Resampling of the episodes of an evaluation; of whole flights where they fly several."""
+    """Return the bootstrap over the episodes of an evaluation, or over whole flights where they fly several."""
     clusters = tuple(dataset["flight"].values.tolist()) if "flight" in dataset.coords else None
     return resampling(dataset.sizes["episode"], resamples, clusters)
 
@@ -105,20 +105,21 @@ def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES)
 def resampling(
     episodes: int, resamples: int = RESAMPLES, clusters: tuple[str, ...] | None = None
 ) -> Bootstrap:
-    """Return the resampling of so many episodes, which takes a while where they are many."""
+    """Return the bootstrap over a number of episodes, cached since many episodes take a while."""
     return Bootstrap(episodes, resamples, clusters=clusters)
 
 
 def units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
-    """Units of time that are resampled of one long episode; None of several, or of a short one."""
+    """Return the units of time for resampling one long episode; None for several episodes or a short one."""
     if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST:
         return TimeUnits(dataset.sizes["time"])
     return None
 
 
 def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | None:
-    """Sums in units of time of what the length of blocks follows from, ``(units, 2)``: of the cost, without truth of
-    the log-likelihood; None where neither is known.
+    """Return sums in units of time, ``(units, 2)``, which determine the length of blocks.
+
+    They are sums of the cost, without truth of the log-likelihood; None where neither is known.
     """
     known = [name for name in ("cost", "log_likelihood") if name in run]
     return units.sums_of_present(run[known[0]].values) if known else None
@@ -127,13 +128,13 @@ def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | N
 def bootstrap_over_time(
     units: TimeUnits, series: Sequence[numpy.ndarray | None], resamples: int = RESAMPLES
 ) -> Bootstrap:
-    """Resampling of one episode, whose blocks are as long as the ``series`` of all competitors need."""
+    """Return the bootstrap over one episode, with blocks as long as the ``series`` of all competitors require."""
     known = [one for one in series if one is not None]
     return BlockBootstrap(units, known, resamples) if known else Bootstrap(1, resamples)
 
 
 def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
-    """Resampling of the episodes of an evaluation; of one episode of blocks of time."""
+    """Return the bootstrap over the episodes of an evaluation; for one episode over blocks of time."""
     if (units := units_of(dataset)) is None:
         return bootstrap_of_episodes(dataset, resamples)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
@@ -141,26 +142,26 @@ def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Boots
 
 
 class Reduced(NamedTuple):
-    """What records need of one competitor; of one episode no more than units of time."""
+    """Statistics of one competitor for its records; for one episode sums in units of time."""
 
     reduction: Reduction
     units: TimeUnits | None
-    """Of one long episode."""
+    """Units of time of one long episode."""
     series: numpy.ndarray | None
     """As of :func:`sums_over_time`."""
     predictions: list[Measure]
     run: "xarray.Dataset"
-    """Its part of an evaluation, of whose variables none is needed."""
+    """Its part of an evaluation, of which only coordinates and attributes are needed."""
 
     def without_variables(self) -> "Reduced":
-        """Return it without the variables of the evaluation, and at its first measurement."""
+        """Return the statistics with only coordinates and attributes of the evaluation at its first measurement."""
         run = self.run.drop_vars(list(self.run.data_vars))
         return self._replace(run=run.isel(time=slice(0, 1)).copy(deep=True))
 
 
 def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
-    """Reduce one competitor's part of an evaluation to what its records need; ``metrics`` not of recordings."""
-    # Of a recording, an environment's own metrics would ask for more of the truth than it holds.
+    """Reduce a competitor's part of an evaluation to the statistics for its records; no ``metrics`` for recordings."""
+    # An environment's own metrics need more of the truth than a recording contains.
     own = None if run.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)
     units = units_of(run)
@@ -170,7 +171,7 @@ def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) 
 
 
 def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset") -> Bootstrap:
-    """Resampling of an evaluation that was reduced, as of :func:`bootstrap_of`."""
+    """Return the bootstrap over a reduced evaluation, equal to that of :func:`bootstrap_of`."""
     if (units := reduced[0].units) is None:
         return bootstrap_of_episodes(evaluation)
     return bootstrap_over_time(units, [one.series for one in reduced])
@@ -183,7 +184,7 @@ def records_of_reduced(
 
     Args:
         reduced: all competitors, from :func:`reduce_competitor`.
-        evaluation: whose coordinates and attributes say of what.
+        evaluation: gives the coordinates and attributes.
         metrics: as of :func:`reduce_competitor`.
     """
     own = None if evaluation.attrs.get("recorded") else metrics
@@ -197,10 +198,10 @@ def records_of_reduced(
 
 
 def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
-    """Mean of each episode, ``(episodes,)``; where flights differ in length, over its own.
+    """Return the mean of each episode, ``(episodes,)``; where flights differ in length, over its own.
 
     Args:
-        run: that the values are of.
+        run: part of the evaluation with the values.
         values: ``(episodes, time)``; NaN beyond the end of a flight, or of a window that it does not reach.
     """
     if "flight" not in run.coords:
@@ -209,7 +210,7 @@ def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarra
 
 
 def _peak(means: numpy.ndarray) -> numpy.ndarray:
-    """Largest root over time."""
+    """Return the largest root over time."""
     found: numpy.ndarray = numpy.fmax.reduce(numpy.sqrt(means), axis=1)
     return found
 
@@ -217,19 +218,19 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
 def record_statistics(
     run: "xarray.Dataset", episodes: int, metrics: OwnMetrics | None = None
 ) -> Iterator[Statistic]:
-    """Declare what records are made of: by metric, component, window and unit; and the cost of every episode.
+    """Declare the statistics for records, by metric, component, window and unit, and the cost of every episode.
 
     Args:
         run: some episodes of one competitor.
-        episodes: of the whole evaluation.
-        metrics: the environment's own.
+        episodes: number of episodes of the whole evaluation.
+        metrics: metrics of the environment.
     """
     groups, slices = groups_of(run), slices_of(run)
     is_bound = str(run["kind"].values) == "bound"
     judged = run.attrs.get("truth", True)
 
     def means(metric: str, component: str, unit: str, values: Any, function: Function = identity) -> Any:
-        """Mean over every window."""
+        """Return the mean over every window."""
         for window, times in slices.items():
             key, mean = ("record", metric, component, window, unit), mean_over_time(run, values[:, times])
             yield Statistic(key, mean, function, of_units=_units(values, times))
@@ -250,10 +251,10 @@ def record_statistics(
             yield from means(
                 "mean_mode_probability", mode, "1", run["mode_probability"].sel(mode=mode).values
             )
-    says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
-    if says or not judged:  # there is nothing else of an estimator of one's own then
+    has_likelihood = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
+    if has_likelihood or not judged:  # a user's estimator has no other statistics then
         shape = (run.sizes["episode"], run.sizes["time"])
-        log_likelihood = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
+        log_likelihood = run["log_likelihood"].values if has_likelihood else numpy.full(shape, math.nan)
         for window, times in slices.items():
             yield _mean_of_present("log_likelihood", "measurement", window, "nat", log_likelihood, times)
     if not is_bound and judged:
@@ -280,18 +281,19 @@ def record_statistics(
 def _mean_of_present(
     metric: str, component: str, window: str, unit: str, values: numpy.ndarray, times: slice
 ) -> Statistic:
-    """Mean over episodes and times of what is there; a block of episodes may have nothing."""
+    """Return the mean over episodes and times of the numbers that are not NaN; a block of episodes may have none."""
     key, sums = ("record", metric, component, window, unit), sums_of_present(values[:, times])
     return Statistic(key, sums, ratio, optional=True, of_units=_units(values, times))
 
 
 def _units(values: numpy.ndarray, times: slice) -> Callable[[TimeUnits], numpy.ndarray]:
-    """Return what sums up values of one episode, ``(1, time)``, in units of time."""
+    """Return a function that sums values of one episode, ``(1, time)``, in units of time."""
     return functools.partial(TimeUnits.sums_of_present, values=values, times=times)
 
 
 def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[Statistic]:
-    """Whether errors and innovations are as large as the covariances say: one, and 95 %, where they are.
+    """Declare the consistency statistics of errors and innovations with their covariances: one, and 95 %, if
+    consistent.
 
     The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
     interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4).
@@ -313,20 +315,23 @@ def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[
 
 
 def _over_dimension(run: "xarray.Dataset", metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """NEES or NIS over its dimension, NaN where there is none, and that dimension, as their arrays are."""
+    """Return the NEES or NIS over its dimension, NaN where there is none, and that dimension, in the shape of the
+    variable.
+    """
     degrees = consistency_degrees(run, metric)
     some = numpy.where(degrees > 0.0, degrees, 1.0)
     return numpy.where(degrees > 0.0, run[metric].values / some, numpy.nan), degrees
 
 
 def _band(means: numpy.ndarray, episodes: int) -> IntervalEstimate:
-    """Where the mean of that many chi-square numbers, each over its degrees of freedom, lies with 95 %.
+    """Return the 95 % interval of the mean of chi-square numbers, each over its degrees of freedom.
 
-    The chi-square distribution of the same variance; the very one where all degrees are equal.
+    It follows from the chi-square distribution of the same variance, which is exact where all degrees are equal.
 
     Args:
-        means: over episodes, of the count of numbers and of the sum of their inverse degrees, ``(1 + resamples, 2)``.
-        episodes: of which they are means.
+        means: means over episodes of the count of numbers and of the sum of their inverse degrees, ``(1 + resamples,
+            2)``.
+        episodes: number of episodes.
     """
     count, inverse = episodes * means[0]
     if count == 0.0:
@@ -337,40 +342,42 @@ def _band(means: numpy.ndarray, episodes: int) -> IntervalEstimate:
 
 
 def consistency_metrics(run: "xarray.Dataset") -> list[str]:
-    """Which of ``nees`` and ``nis`` there are; the latter needs its dimension beside it, ``nis_degrees``."""
+    """Return which of ``nees`` and ``nis`` exist; the latter requires its dimension, ``nis_degrees``."""
     present = ["nees"] * ("nees" in run) + ["nis"] * ("nis" in run and "nis_degrees" in run)
     return [metric for metric in present if not numpy.isnan(run[metric].values).all()]
 
 
 def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
-    """Dimension of what ``nees`` or ``nis`` is of, as their arrays are."""
+    """Return the dimension of ``nees`` or ``nis``, in the shape of the variable."""
     if metric == "nis":
         return numpy.nan_to_num(run["nis_degrees"].values)
-    # Of whoever states everything there are no degrees, though there may be of others in the same evaluation.
+    # A filter that reports all components has no degrees, though others in the same evaluation may have them.
     degrees = run["nees_degrees"].values if "nees_degrees" in run else math.nan + run["nees"].values
     return numpy.nan_to_num(degrees, nan=float(run.sizes["component"]))
 
 
 def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
-    """Quantile of the chi-square distribution.
+    """Return the quantile of the chi-square distribution.
 
     Args:
-        probability: of smaller numbers.
-        degrees: of freedom, a number or an array of any shape, larger than zero.
+        probability: probability of smaller numbers.
+        degrees: degrees of freedom, a number or an array of any shape, larger than zero.
 
     Returns:
         The quantile for each number of degrees, in the same shape.
     """
-    from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
+    from scipy.special import gammaincinv  # scipy.stats has the quantile too, but takes a second to import
 
-    # Few different ones, and the quantile is dear.
+    # There are few different degrees, and the quantile is slow.
     different, which = numpy.unique(degrees, return_inverse=True)
     quantiles: numpy.ndarray = 2.0 * gammaincinv(0.5 * different, probability)
     return quantiles[which].reshape(numpy.shape(degrees))
 
 
 def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of freedom."""
+    """Return the two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of
+    freedom.
+    """
     low, high = (chi_square_quantile(p, runs * degrees) / runs for p in (0.025, 0.975))
     return low, high
 
@@ -378,41 +385,42 @@ def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarra
 def score(
     cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
 ) -> IntervalEstimate:
-    """(C_paper - C) / (C_paper - C_reference), from means, and resampled ones, of three costs or their logarithms."""
+    """Return ``(C_paper - C) / (C_paper - C_reference)`` of means and resampled means of costs or their logarithms."""
     room = paper - reference
-    # Where the reference is not significantly better than the paper, a ratio to the room says nothing, and where it is
-    # worse it would praise what is worse still.
+    # Where the reference is not significantly better than the paper, a ratio to their difference means nothing, and
+    # where it is worse, a higher cost would give a higher score.
     return bootstrap.interval((paper - cost) / room) if bootstrap.interval(room).low > 0.0 else NOTHING
 
 
 class Contender(NamedTuple):
-    """A competitor and all that its records are made of."""
+    """A competitor with the statistics for its records."""
 
     name: str
     kind: str
     control: str
     measures: list[Measure]
-    """Of itself alone."""
+    """Measures of this competitor alone."""
     further: list[Measure]
-    """The environment's own."""
+    """Measures of the environment."""
     costs: numpy.ndarray | None
-    """Mean cost of every episode; None of bounds, and without truth."""
+    """Mean cost of every episode; None for bounds, and without truth."""
     losses: Losses | None
     causes: CauseCosts | None = None
-    """None of bounds, without truth, and of an evaluation that holds no causes."""
+    """Costs by cause; None for bounds, without truth, and for an evaluation without causes."""
     cost_over_time: numpy.ndarray | None = None
-    """Of one episode its mean cost in every resample of its measurements, ``(1 + resamples,)``; None of several."""
+    """For one episode its mean cost in every resample of its measurements, ``(1 + resamples,)``; None for several."""
 
 
 def mean_cost(dataset: "xarray.Dataset", name: str) -> numpy.ndarray:
-    """Mean cost of every episode of one competitor, ``(episodes,)``."""
+    """Return the mean cost of every episode of one competitor, ``(episodes,)``."""
     return mean_over_time(dataset, dataset["cost"].sel(policy=name).values)
 
 
 class _Against:
     """Costs of every episode, and their comparisons with the paper's algorithm, the reference and the best.
 
-    Ratios are geometric means over episodes, of which no single one owns much: exp of mean differences of logarithms.
+    Ratios are geometric means over episodes, exp of mean differences of logarithms, in which no single episode
+    dominates.
     """
 
     def __init__(
@@ -431,7 +439,7 @@ class _Against:
                 self.means[c.name], self.logs[c.name] = c.cost_over_time, numpy.log(c.cost_over_time)
         self.ranked = [c.name for c in contenders if c.kind in RANKED and c.costs is not None]
         self.smoothers = {c.name for c in contenders if c.kind == "smoother"}
-        # Of equals the first, and so where none is a number, as of flights in which nobody was measured.
+        # The first of equals, and also where all are NaN, as in flights without measurements.
         own_logs = numpy.array([self.logs[name] for name in self.ranked])
         places = numpy.argmax(own_logs <= own_logs.min(axis=0) + NEGLIGIBLE, axis=0) if self.ranked else []
         self.best = self.ranked[places[0]] if self.ranked else ""
@@ -441,8 +449,10 @@ class _Against:
         }
 
     def _columns(self, part: slice) -> numpy.ndarray:
-        """Numbers of some episodes of which means are needed, ``(some, columns)``: of every competitor its cost, its
-        logarithm, whether it is lost, and whether it is less than the paper's algorithm's.
+        """Return the columns to average over some episodes, ``(some, columns)``.
+
+        For every competitor: the cost, its logarithm, whether the track is lost, and whether the cost is less than that
+        of the paper's algorithm.
         """
         costs = [own[part] for own in self.costs.values()]
         with numpy.errstate(divide="ignore", invalid="ignore"):
@@ -452,7 +462,9 @@ class _Against:
         return numpy.stack(columns, axis=1)
 
     def behind_best(self, name: str) -> Iterator[Measure]:
-        """Paired ratio of the cost to the best one's, less one, and how often other episodes would name this one."""
+        """Return the paired ratio of the cost to the best one's, less one, and the share of resamples in which it is
+        best.
+        """
         if name in self.ranked:
             difference = self._difference(name, self.best)
             yield Measure("behind_best", self.best, "all", difference, "1")
@@ -460,25 +472,27 @@ class _Against:
             yield Measure("best_share", "", "all", IntervalEstimate(share, math.nan, math.nan), "1")
 
     def _difference(self, name: str, other: str) -> IntervalEstimate:
-        """Geometric mean of the ratios of two costs, less one."""
+        """Return the geometric mean of the ratios of two costs, less one."""
         with numpy.errstate(invalid="ignore", over="ignore"):
             return self.bootstrap.interval(numpy.expm1(self.logs[name] - self.logs[other]))
 
     def own(self, name: str) -> Iterator[Measure]:
-        """Geometric mean of the cost, and the share of episodes whose track is lost where a bound says so."""
+        """Return the geometric mean of the cost, and the share of lost tracks where the environment has a bound for
+        them.
+        """
         if name in self.logs:
             with numpy.errstate(over="ignore"):
                 mean = self.bootstrap.interval(numpy.exp(self.logs[name]))
             yield Measure("geometric_cost", "", "all", mean, "1")
             if self.bound > 0.0:
                 lost, bootstrap = self.lost[name], self.bootstrap
-                # Of flights whole ones are resampled: their episodes are not independent.
+                # Whole flights are resampled: their episodes are not independent.
                 of_episodes = share_interval(float(lost[0]), bootstrap.episodes)
                 share = bootstrap.interval(lost) if bootstrap.ragged else of_episodes
                 yield Measure("lost_tracks", "", "all", share, "1")
 
     def others(self, name: str) -> Iterator[Measure]:
-        """Score and paired difference to the paper's algorithm, where there is what they need."""
+        """Return the score and the paired differences to the paper's algorithm, where their inputs exist."""
         if name not in self.wins:
             return
         bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
@@ -491,7 +505,7 @@ class _Against:
             "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(ratios)),
             "win_rate": bootstrap.interval(self.wins[name]),
         }
-        # A share of the room that a causal competitor has says nothing of one that uses later measurements.
+        # The score compares with a causal reference, which is meaningless for a smoother.
         if self.reference in self.costs and name not in self.smoothers:
             own, none, best = (self.logs[other] for other in (name, self.paper, self.reference))
             found["score"] = score(own, none, best, bootstrap)
@@ -500,10 +514,10 @@ class _Against:
 
 
 def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
-    """What the innovations of one competitor come to: their size and whether they are white.
+    """Return the statistics of one competitor's innovations: their size and their correlation.
 
     ``prediction_error`` is the root of their mean square in the sensor's unit, ``innovation_correlation`` the
-    correlation of successive ones, zero where they are white; of every group of what is measured.
+    correlation of successive ones, zero where they are white; for every group of measured components.
 
     Args:
         run: one competitor's part of an evaluation.
@@ -525,7 +539,7 @@ def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
 
 
 def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
-    """One where an episode costs less than by the paper's algorithm, ``(episodes,)``."""
+    """Return one where an episode costs less than with the paper's algorithm, ``(episodes,)``."""
     # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
     draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
     return numpy.where(draw, 0.5, ratio < 1.0)
@@ -533,12 +547,12 @@ def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
 
 @one_thread()
 def flight_records(dataset: "xarray.Dataset") -> list[Record]:
-    """Cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
+    """Return the cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
 
     Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
 
     Args:
-        dataset: from an evaluation of a set of flights.
+        dataset: evaluation of a set of flights.
     """
     parts = parts_by_flight(dataset)
     return [r for part in parts for r in tidy_records(part) if r.metric in PER_FLIGHT]
@@ -548,44 +562,43 @@ def parts_by_flight(dataset: "xarray.Dataset") -> "Iterator[xarray.Dataset]":
     """Yield the evaluation of each flight, whose scenario has its name, in the order of the names."""
     for flight in sorted(set(dataset["flight"].values.tolist())):
         own = dataset["flight"].values == flight
-        part = dataset if own.all() else dataset.isel(episode=numpy.flatnonzero(own))  # which copies them
+        part = dataset if own.all() else dataset.isel(episode=numpy.flatnonzero(own))  # a copy
         part = part.isel(time=slice(int(part["length"].max())))
         windows = {name: (first, part.sizes["time"]) for name, (first, _) in windows_of(part).items()}
         yield with_windows(part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}"), windows)
 
 
 PER_FLIGHT = ("rmse", "cost", "geometric_cost", "geometric_cost_difference", "relative_cost_difference")
-"""Metrics that are told of every flight."""
+"""Metrics that are reported for every flight."""
 
 
 @one_thread()
 def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -> list[Record]:
-    """Every metric of every policy with its interval.
+    """Return every metric of every competitor with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent),
-    ``median_anees`` (of the middle one of the episodes, which a few lost tracks do not rule), ``nees_inside``
-    and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
-    is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
-    ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
-    ``lost_episodes`` of estimators (share), and of estimates from a file ``missing``, the share of the measurements of
-    which it has no row. Where the evaluation was timed ``nanoseconds``, processor time of a
-    measurement, whose component says whether it is ``compiled`` code's or ``python``'s. Without truth what needs it is
-    left out. Of a recording with tracks ``prediction_error`` and ``innovation_correlation``, whose intervals are over
-    stretches of measurements.
+    ``median_anees`` (median over the episodes, which a few lost tracks do not determine), ``nees_inside`` and
+    ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (95 % interval of the mean of a consistent
+    filter); ``log_likelihood`` (mean log-density of a measurement under its prediction); ``mean_mode_probability``;
+    ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards); ``lost_episodes`` of estimators (share), and of
+    estimates from a file ``missing``, the share of measurements without a row. Where the evaluation was timed
+    ``nanoseconds``, processor time of a measurement, whose component is ``compiled`` or ``python``. Without truth the
+    metrics that need it are left out. For a recording with tracks ``prediction_error`` and ``innovation_correlation``,
+    whose intervals are over stretches of measurements.
 
     ``geometric_cost`` is the geometric mean over episodes, by which competitors are ranked, ``lost_tracks`` the share
-    of episodes whose mean cost is beyond the environment's bound. Against the paper's algorithm, paired,
+    of episodes whose mean cost is above the environment's bound. Against the paper's algorithm, paired,
     ``geometric_cost_difference`` (geometric mean of the ratios of the episodes' costs, less one), ``cost_difference``
     and ``relative_cost_difference`` of the means, ``median_cost_ratio`` and ``win_rate`` over episodes, ``score`` =
-    (L_paper - L) / (L_paper - L_reference), L mean logarithms of the cost. Against the best of what is ranked
+    (L_paper - L) / (L_paper - L_reference), L mean logarithms of the cost. Against the best ranked competitor
     ``behind_best`` (as the geometric difference; the component names the best) and ``best_share``, the share of
-    resamples of the episodes in which this one is the best; of those whose costs are as good as equal the first is.
-    And the environment's own metrics.
+    resamples of the episodes in which this one is the best (the first of those with equal costs). And the environment's
+    own metrics.
 
     Args:
         dataset: from an evaluation.
-        metrics: the environment's own, from one policy's part of the dataset; left out for recordings.
+        metrics: metrics of the environment; left out for recordings.
     """
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
     return records_of_reduced([reduce_competitor(run, metrics) for run in runs], dataset, metrics)
@@ -594,13 +607,13 @@ def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -
 def contender_of(
     results: Mapping[Key, Any], run: "xarray.Dataset", bootstrap: Bootstrap, metrics: OwnMetrics | None
 ) -> Contender:
-    """Return what the records of a competitor are made of.
+    """Return a competitor with the statistics for its records.
 
     Args:
-        results: of :func:`record_statistics`.
-        run: its part of an evaluation, of whose variables none is needed.
-        bootstrap: over the episodes.
-        metrics: the environment's own.
+        results: results of :func:`record_statistics`.
+        run: its part of an evaluation, of which only coordinates and attributes are needed.
+        bootstrap: bootstrap over the episodes.
+        metrics: metrics of the environment.
     """
     measures = []
     for (kind, *words), value in results.items():
@@ -631,7 +644,7 @@ def contender_of(
 def _compare_causes(
     contender: Contender, contenders: Sequence[Contender], bootstrap: Bootstrap
 ) -> Iterator[Measure]:
-    """Cost under each cause over that of the opponent; a cause stands in the place of a window."""
+    """Return the cost under each cause relative to that of the opponent; the cause takes the place of a window."""
     split = {c.name: c.causes for c in contenders if c.causes is not None}
     if contender.name not in split:
         return
@@ -645,12 +658,12 @@ def _compare_causes(
 def records_of(
     contenders: Sequence[Contender], evaluation: "xarray.Dataset", bootstrap: Bootstrap
 ) -> list[Record]:
-    """Return every record, with the comparisons that take several competitors.
+    """Return every record, with the comparisons between competitors.
 
     Args:
-        contenders: all of them.
-        evaluation: whose attributes say of what.
-        bootstrap: over the episodes.
+        contenders: all competitors.
+        evaluation: gives the attributes.
+        bootstrap: bootstrap over the episodes.
     """
     attrs = evaluation.attrs
     against = _Against(contenders, attrs, bootstrap)

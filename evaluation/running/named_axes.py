@@ -1,4 +1,4 @@
-"""What was kept of episodes as a dataset, whose axes have names and units."""
+"""The stored values of episodes as a dataset, whose axes have names and units."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,14 +12,14 @@ from ...envs.data.recording import Recording
 from ..competitors.kinds import Kind
 from ..statistics.cause_split import VARIABLE
 from ..storage.dataset import window_coords
-from .kept import DRAWN_PREFIX
+from .stored_values import DRAWN_PREFIX
 
 if TYPE_CHECKING:
     import xarray
 
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
-"""Names of blocks of an observation that show the action before."""
+"""Names of the observation blocks with the last action."""
 
 
 OF_COMPONENTS = "that of the component (coordinate unit)"
@@ -32,22 +32,22 @@ MEANINGS = {
     "nees": ("1", "estimation error squared, normalised by the reported covariance, not by the dimension"),
     "nis": ("1", "innovation squared, normalised by its predicted covariance, not by the dimension"),
     "nis_degrees": ("1", "dimension of the innovation"),
-    "log_likelihood": ("nat", "log-density of the measurement as it was predicted, in its units"),
+    "log_likelihood": ("nat", "log-density of the measurement under its prediction, in its units"),
     "mode_probability": ("1", "probability of each hypothesis"),
     "action": ("1", "action as the filter got it, normalised to its space"),
     "compressed_cost": ("1", "minus the reward `cost`: normalised to the unit of the reward, and compressed"),
     "lost": ("1", "number of the reason why the episode is lost, 0 where it is not"),
     "causes": ("1", "bit field of the causes that hold, in the order of the coordinate cause"),
 }
-"""Unit and meaning of variables; what an environment reports beside them is in the unit that its page says."""
+"""Unit and meaning of variables; the environment's page gives the units of its own variables."""
 MEASURED = ("that of the environment's table of measurements", "as the sensors report it, not normalised")
 
 
 def _attributes(key: str, cost: str) -> dict[str, str]:
-    """Unit of a variable, and whether it is normalised; nothing where only the environment knows."""
+    """Return the unit of a variable, and whether it is normalised; empty for variables of the environment."""
     name = key.removeprefix(DRAWN_PREFIX)
     if name == "cost":
-        return {"units": "1", "long_name": f"{cost}, normalised as it says"}
+        return {"units": "1", "long_name": f"{cost}, normalised as stated"}
     found = MEASURED if name.startswith("measurement_") else MEANINGS.get(name, ())
     return dict(zip(("units", "long_name"), found, strict=False))
 
@@ -55,17 +55,17 @@ def _attributes(key: str, cost: str) -> dict[str, str]:
 def recording_coords(
     recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
 ) -> dict[str, Any]:
-    """What the evaluation of a recording says of its log.
+    """Return the coordinates of a recording's evaluation that refer to its log.
 
     Args:
-        recording: that is replayed.
+        recording: the replayed recording.
         episodes: number of its episode that each episode of the evaluation replays, ``(M,)``.
         dataset: the evaluation.
 
     Returns:
         Coordinates: ``started``, seconds from the first measurement of the log to the start of the track; ``log_time``
-        of every measurement, where the log has times of its own; ``truth_known`` of every component, where the truth
-        of some is not known.
+        of every measurement, where the log has times of its own; ``truth_known`` of every component, where the truth of
+        some is unknown.
     """
     length = dataset.sizes["time"]
     coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}
@@ -77,7 +77,7 @@ def recording_coords(
 
 
 def _further_dimensions(key: str, count: int) -> list[str]:
-    """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
+    """Return the names of a variable's dimensions after policy, episode and time: the first and ``count`` more."""
     if count < 0:
         return []
     key = key.removeprefix(DRAWN_PREFIX)
@@ -91,32 +91,32 @@ def _further_dimensions(key: str, count: int) -> list[str]:
 
 
 def action_names(model: Model) -> tuple[str, ...]:
-    """Names of the components of a box of actions.
+    """Return the names of the components of a box of actions.
 
-    As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
-    for each; else the control, with numbers from 1 on where there are several.
+    They are the names in the observation block of the last action, if there is one; else the hypotheses, if there is a
+    number for each; else the control, numbered from 1 on where there are several.
     """
     count = math.prod(model.action_space.shape or ())
     shown = [block.parts for block in model.filter.blocks if block.name in LAST_ACTIONS]
     for names in (*shown, model.task.modes):
-        # A number alone says less than the hypothesis's name.
+        # The hypothesis's name is clearer than a number.
         if len(names) == count and not any(str(name).isdigit() for name in names):
             return tuple(str(name).replace("-", "_") for name in names)
     return tuple(f"{model.control}_{i + 1}" for i in range(count)) if count > 1 else (model.control,)
 
 
 class StackedArrays:
-    """What is kept of episodes, each piece of them written where it stays.
+    """Arrays of all competitors and episodes, filled in place piece by piece.
 
     Args:
-        models: of every competitor, in which it acts.
-        acting: names of those whose action is a box.
-        episodes: of each.
-        drawn: number of the first episodes of which a picture is kept.
+        models: model of every competitor.
+        acting: names of the competitors whose action is a box.
+        episodes: number of episodes of each.
+        drawn: number of first episodes with data for pictures.
 
     Attributes:
-        actions: names of the actions of each that is acting; of their control too, where they steer by several.
-        action_names: of all of them.
+        actions: names of the actions of each acting competitor, with its control where they use several.
+        action_names: all names of actions.
     """
 
     def __init__(self, models: Mapping[str, Model], acting: Sequence[str], episodes: int, drawn: int) -> None:
@@ -134,7 +134,7 @@ class StackedArrays:
         self._written: list[tuple[int, slice, set[str]]] = []
 
     def write(self, name: str, part: slice, kept: dict[str, numpy.ndarray]) -> None:
-        """Write what was kept of some episodes of a competitor, ``(episodes, time, ...)`` by name, and empty it."""
+        """Write the values of some episodes, ``(episodes, time, ...)`` by name, and empty the mapping."""
         place = self._places[name]
         self._written.append((place, part, set(kept)))
         while kept:
@@ -153,7 +153,7 @@ class StackedArrays:
                 rows[..., [self.action_names.index(each) for each in self.actions[name]]] = values
 
     def finished(self) -> dict[str, numpy.ndarray]:
-        """Return the arrays ``(policy, episode, time, ...)`` by name, in its order; NaN where nothing was kept."""
+        """Return the arrays ``(policy, episode, time, ...)`` by name; NaN where nothing was written."""
         for key, array in self._arrays.items():
             for place, part, kept in self._written:
                 if key not in kept:
@@ -168,14 +168,14 @@ def with_named_axes(
     windows: Mapping[str, tuple[int, int]],
     seeds: Sequence[int],
 ) -> "xarray.Dataset":
-    """Return what was kept of competitors as a dataset.
+    """Return the values of competitors as a dataset.
 
     Args:
-        kept: all of it.
-        kinds: of every competitor.
-        models: likewise, in which each acts.
-        windows: of the scenario.
-        seeds: of the episodes.
+        kept: the values.
+        kinds: kind of every competitor.
+        models: model of every competitor.
+        windows: windows of the scenario.
+        seeds: seeds of the episodes.
     """
     import xarray
 

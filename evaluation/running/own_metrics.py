@@ -1,7 +1,8 @@
-"""Metrics of an environment, beside those of every one, from as many episodes as there are.
+"""Metrics of a single environment, in addition to those of all environments, from any number of episodes.
 
-They come in two steps, so that no more than a block of episodes need be in memory: what they need of each episode, a
-few numbers of it or what is only averaged over the episodes; and what follows from that of all of them.
+They are computed in two steps, so that only a block of episodes is in memory. The first step gathers a few numbers of
+each episode, or arrays that are only averaged over the episodes. The second step computes the metrics from those of all
+episodes.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +22,7 @@ Arrays = Mapping[str, numpy.ndarray]
 
 
 class Measure(NamedTuple):
-    """A record before it is told whose it is; what an environment's own metrics return."""
+    """A record without its competitor, as an environment's own metrics return it."""
 
     metric: str
     component: str
@@ -31,14 +32,14 @@ class Measure(NamedTuple):
 
 
 class MetricInputs(NamedTuple):
-    """What the metrics of an environment need of episodes of one competitor; empty where there is nothing to tell."""
+    """Inputs of an environment's metrics from episodes of one competitor; empty where there are none."""
 
-    each: Arrays = {}  # noqa: RUF012  (nobody writes to it)
-    """Numbers of every episode, ``(episodes, ...)``: all of them are kept, so let them be few."""
+    each: Arrays = {}  # noqa: RUF012  (never written to)
+    """Numbers of every episode, ``(episodes, ...)``: all are stored, so they should be few."""
     averaged: Arrays = {}  # noqa: RUF012
-    """Of one episode each, ``(episodes, ...)``; of all of them means, ``(1 + resamples, ...)``."""
+    """Arrays of each episode, ``(episodes, ...)``; for all episodes their means, ``(1 + resamples, ...)``."""
     common: Arrays = {}  # noqa: RUF012
-    """The same in every episode."""
+    """Arrays that are the same in every episode."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,12 @@ class OwnMetrics:
     """The metrics of an environment."""
 
     gather: "Callable[[xarray.Dataset], MetricInputs]"
-    """From one policy's part of some episodes of an evaluation to what is needed of each."""
+    """Function from one competitor's part of some episodes of an evaluation to the inputs."""
     measures: "Callable[[MetricInputs, Bootstrap, xarray.Dataset], list[Measure]]"
-    """From what was gathered of all episodes, and the evaluation, of whose variables none is needed."""
+    """Function from the inputs of all episodes, and the evaluation's coordinates and attributes, to the measures."""
 
     def statistics(self, run: "xarray.Dataset") -> Iterator[Statistic]:
-        """Declare what was gathered.
+        """Declare the statistics of the inputs.
 
         Args:
             run: some episodes of one competitor.
@@ -70,9 +71,9 @@ class OwnMetrics:
         """Return the measures of one competitor.
 
         Args:
-            results: of :meth:`statistics` of all episodes.
-            bootstrap: over them.
-            evaluation: its part of the evaluation, of whose variables none is needed.
+            results: results of :meth:`statistics` of all episodes.
+            bootstrap: bootstrap over the episodes.
+            evaluation: its part of the evaluation, of which only coordinates and attributes are needed.
         """
         gathered = MetricInputs(
             *({key[1]: results[key] for key in results if key[0] == f} for f in MetricInputs._fields)

@@ -1,12 +1,11 @@
-"""Work spread over processes of this machine, or over a cluster; what comes out is what one process makes.
+"""Parallel work in processes of this machine or on a cluster, with the same results as in one process.
 
-A piece of work is a function of a module and what it is called with: plain data, such as names and seeds, or objects
-that can be pickled. Pieces are run in any order, each with one thread of BLAS and torch, and nothing is drawn that the
-piece itself does not seed; so who puts the results into the order of the pieces has the same bits wherever they came
-from.
+A piece of work is a function of a module and its arguments: plain data, such as names and seeds, or objects that can be
+pickled. Pieces are run in any order, each with one thread of BLAS and torch, and each seeds its own random numbers. So
+the results in the order of the pieces have the same bits wherever they were computed.
 
-On this machine joblib's processes (loky) run them, on a cluster the tasks of Ray or Dask, which are run again where a
-process or a machine is lost. joblib's backend for Ray is a pool of actors, and ends with the first that is lost.
+On this machine joblib's processes (loky) run them, on a cluster the tasks of Ray or Dask, which are repeated where a
+process or a machine is lost. joblib's backend for Ray is a pool of actors, and ends with the first lost actor.
 """
 
 import os
@@ -30,28 +29,28 @@ from .rollout import Progress
 from .threads import one_thread
 
 RETRIES = 10
-"""How often Ray begins a piece again whose process it has lost; Dask has a setting of its own, three times."""
+"""Number of times that Ray repeats a piece whose process is lost; Dask has its own setting, three times."""
 CLUSTER_PROCESSES = 16
-"""Processes that a cluster elsewhere is thought to have, where work is cut for it."""
+"""Assumed number of processes of a remote cluster, to split work for it."""
 NO_HTTP_ROUTES: dict[str, Any] = {
     f"distributed.{role}.http.routes": [] for role in ("scheduler", "worker", "nanny")
 }
-"""Dask's web servers tell whoever asks of the work, and have no authentication: nothing is served."""
+"""Dask's web servers show the work without authentication: these settings switch them off."""
 CLUSTERS = "ray, ray://HOST:PORT, ray://auto, dask, tcp://HOST:PORT or tls://HOST:PORT"
 
 Function = Callable[[Any, Progress], Any]
-"""Of a module: from a piece of work, and what is told of measurements done, to its result."""
+"""Function of a module that takes a piece of work and a progress callback, and returns its result."""
 
 
 class ImportPaths(NamedTuple):
-    """Where the modules and files are that pieces of work name."""
+    """Paths to the modules and files that pieces of work name."""
 
     folder: str
     paths: list[str]
     named_in: list[str]
-    """Folders of modules that the user has named, where nothing else is looked for."""
+    """Folders of modules that the user has named, searched for these only."""
     safe_path: str | None
-    """What the user's environment says of PYTHONSAFEPATH, which we set for the processes that begin."""
+    """PYTHONSAFEPATH in the user's environment; this process sets it for the processes that it starts."""
 
 
 Outcome = tuple[int, Any, tuple[Exception, str] | None, list[tuple[str, type[Warning]]]]
@@ -62,12 +61,12 @@ class LostProcessError(ValueError):
     """A process that did part of the work has ended."""
 
 
-class Elsewhere(Exception):  # noqa: N818  (no error of its own: what stands behind one)
+class Elsewhere(Exception):  # noqa: N818  (the cause of an error, not an error)
     """Traceback of an error in another process."""
 
 
 def end_with(parent: int) -> None:
-    """Let this process end with the one that began it, which may be killed and could not tell it."""
+    """End this process when its parent ends, which may be killed without notice."""
 
     def watch() -> None:
         if sys.platform == "win32":
@@ -84,12 +83,12 @@ def end_with(parent: int) -> None:
 
 
 def _run_piece(index: int, packed: bytes, packed_item: bytes, paths: ImportPaths) -> Outcome:
-    """Do a piece of work, in a process that may know nothing yet."""
+    """Do a piece of work, in a process that may be new."""
     with suppress(OSError):  # another machine may not have it
         os.chdir(paths.folder)
-    if paths.safe_path is None:  # programs that compete are the user's
+    if paths.safe_path is None:  # competing programs run in the user's environment
         os.environ.pop("PYTHONSAFEPATH", None)
-    # Engines search the working directory, too, where a file is no library, unless this command does.
+    # Engines search the working directory, too, unless this command does not.
     unwanted = {"", paths.folder} - set(paths.paths)
     sys.path[:] = [path for path in sys.path if path not in unwanted]
     sys.path.extend(path for path in paths.paths if path not in sys.path and Path(path).is_dir())
@@ -105,7 +104,7 @@ def _run_piece(index: int, packed: bytes, packed_item: bytes, paths: ImportPaths
 
 
 def _sendable(error: Exception) -> Exception:
-    """Return an error that can be told to another process; in words if it cannot be pickled."""
+    """Return an error that can be sent to another process; as text if it cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
@@ -114,10 +113,10 @@ def _sendable(error: Exception) -> Exception:
 
 
 def check_workers(workers: Any) -> "Workers":
-    """Return who does the work; where nobody is named, this process.
+    """Return the workers; default: this process.
 
     Raises:
-        ValueError: for anything else, such as a number.
+        ValueError: for any other type, such as a number.
     """
     if workers is not None and not isinstance(workers, Workers):
         raise ValueError(
@@ -127,18 +126,18 @@ def check_workers(workers: Any) -> "Workers":
 
 
 class Workers:
-    """Who does the work; ``with Workers(4) as workers`` ends what was begun for it.
+    """Processes that do the work; ``with Workers(4) as workers`` ends them afterwards.
 
     Args:
         jobs: processes; 1: this one; -1: as many as there are cores.
-        cluster: ``"ray"`` or ``"dask"``: a new one on this machine, which lets nobody else in, with ``jobs`` processes,
-            where that is more than one, or as many as there are cores. One that runs already: ``ray://HOST:PORT``;
-            ``ray://auto``, that of this machine, whoever has begun it; of Dask ``tls://HOST:PORT``, with the
-            certificates of Dask's configuration, or ``tcp://HOST:PORT``, which is open to whoever reaches the port.
-            None: no cluster.
+        cluster: ``"ray"`` or ``"dask"``: a new one on this machine, closed to other users, with ``jobs`` processes,
+            where that is more than one, or as many as there are cores. A running cluster: ``ray://HOST:PORT``;
+            ``ray://auto``, that of this machine, started by any user; of Dask ``tls://HOST:PORT``, with the
+            certificates of Dask's configuration, or ``tcp://HOST:PORT``, which is open to everybody who reaches the
+            port. None: no cluster.
 
     Raises:
-        ValueError: for another number or word, or where the packages of a cluster are missing.
+        ValueError: for invalid ``jobs`` or ``cluster``, or where the packages of a cluster are missing.
     """
 
     def __init__(self, jobs: int = 1, cluster: str | None = None) -> None:
@@ -158,13 +157,13 @@ class Workers:
         self.jobs = jobs
         self.cluster = cluster
         self.alone: bool = jobs == 1 and cluster is None
-        """Whether this process does everything itself."""
+        """Whether this process does all of the work."""
         self._ended = ExitStack()
         self._dask: Any = None
 
     @property
     def width(self) -> int:
-        """Into how many pieces work is best cut; of a cluster that runs elsewhere a guess."""
+        """Best number of pieces of work; for a remote cluster a guess."""
         if self.alone:
             return 1
         if self.cluster is not None and "://" in self.cluster:
@@ -173,12 +172,12 @@ class Workers:
 
     @property
     def _cores(self) -> int:
-        """How many processes a new cluster has."""
+        """Return the number of processes of a new cluster."""
         if self.jobs not in (1, -1):
             return self.jobs
         import joblib
 
-        return int(joblib.cpu_count())  # of those that this process may use
+        return int(joblib.cpu_count())  # that this process may use
 
     def __enter__(self) -> Self:
         return self
@@ -198,16 +197,16 @@ class Workers:
         """Do pieces of work.
 
         Args:
-            function: of a module, which workers import.
-            items: what it is called with.
-            sizes: measurements of each, for the progress.
-            progress: told of measurements done; of work elsewhere when a piece has come back.
+            function: function of a module, which workers import.
+            items: its arguments.
+            sizes: measurements of each piece, for the progress.
+            progress: called with the number of measurements done; for work in other processes when a piece is done.
 
         Yields:
-            Number of a piece and its result, as they come.
+            Number of a piece and its result, in the order of completion.
 
         Raises:
-            ValueError: if a process is lost for good, or the cluster is not there; and whatever the function raises.
+            ValueError: if a process is lost for good, or the cluster does not exist; and any error of the function.
         """
         tick = progress or (lambda measurements: None)
         if self.alone:
@@ -221,7 +220,7 @@ class Workers:
         calls = ((index, packed, cloudpickle.dumps(item), paths) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
         shown_warnings: set[tuple[str, type[Warning]]] = set()
-        # Processes that begin search no libraries in the working directory; :func:`_run_piece` tells them the paths.
+        # New processes search no libraries in the working directory; :func:`_run_piece` sets their paths.
         with _environment(PYTHONSAFEPATH="1"):
             for number, result, failed, noted in spread(calls):
                 for text, category in noted:
@@ -241,7 +240,7 @@ class Workers:
         sizes: Sequence[int] | None = None,
         progress: Progress | None = None,
     ) -> list[Any]:
-        """Do pieces of work, see :meth:`run`, and return what comes out in their order."""
+        """Do pieces of work, see :meth:`run`, and return the results in their order."""
         found: list[Any] = [None] * len(items)
         for index, result in self.run(function, items, sizes, progress):
             found[index] = result
@@ -257,7 +256,7 @@ class Workers:
                 own = {"initializer": end_with, "initargs": (os.getpid(),)}
                 return super().configure(*given, **own, **options)
 
-        # Whoever ends the work early, by an error or Ctrl-C, knows that the rest is not done.
+        # Where an error or Ctrl-C ends the work early, the rest is cancelled.
         warnings.filterwarnings("ignore", message=".*tasks which were still being processed by the workers")
         try:
             with joblib.parallel_config(backend=Processes(), inner_max_num_threads=1):
@@ -269,7 +268,7 @@ class Workers:
         except TerminatedWorkerError as error:
             raise LostProcessError(
                 "a process that did part of the work was ended from outside, perhaps because memory ran out: take "
-                "fewer jobs, or go on from here by the same command where it keeps what is done"
+                "fewer jobs, or continue by the same command where it stores finished work"
             ) from error
 
     def _over_dask(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
@@ -284,7 +283,7 @@ class Workers:
                 as_completed,
             )
 
-            # Certificates that this process tells its workers alone: whoever else connects is refused.
+            # Certificates that this process gives to its workers alone: other connections are rejected.
             begin = self._dask is None and self.cluster == "dask"
             security = Security.temporary() if begin else None
         except ImportError as error:
@@ -311,14 +310,14 @@ class Workers:
         try:
             for future in as_completed(futures):
                 yield future.result()
-                future.release()  # a result is large, and has been taken
+                future.release()  # a result is large, and is not needed any more
         except KilledWorker as error:
             raise ValueError(f"the cluster has lost a piece of work for good: {error}") from error
         finally:
             self._dask.cancel(futures)
 
     def _over_ray(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked to tell others
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no telemetry
         try:
             import ray  # pyright: ignore[reportMissingImports]
         except ImportError as error:
@@ -334,14 +333,14 @@ class Workers:
         try:
             yield from self._from_ray(ray, remote, calls, pending)
         finally:
-            for reference in pending:  # of who ends the work early
+            for reference in pending:  # where the work ends early
                 ray.cancel(reference, force=True)
 
     @staticmethod
     def _from_ray(
         ray: Any, remote: Any, calls: Iterator[tuple[Any, ...]], pending: list[Any]
     ) -> Iterator[Outcome]:
-        """Keep the cluster busy; ``pending`` is what it has to do."""
+        """Submit pieces to the cluster and yield their results; ``pending`` is filled with the running ones."""
         more = True
         while pending or more:
             # The cluster may grow meanwhile; two pieces for each core keep it busy.
@@ -364,8 +363,8 @@ class Workers:
         if self.cluster != "ray":
             ray.init("auto" if self.cluster == "ray://auto" else self.cluster, **quiet)
             return
-        # A new one, whatever runs here. Since 2.59 Ray lets in only who knows its token; without one of ours it would
-        # leave one in a file that other users may be able to read.
+        # A new one, even if another runs. Since 2.59 Ray requires a token; without this one it would write one to a
+        # file that other users may be able to read.
         if "RAY_AUTH_TOKEN_PATH" not in os.environ:
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         ray.init("local", num_cpus=self._cores, include_dashboard=False, **quiet)
@@ -373,7 +372,7 @@ class Workers:
 
 @contextmanager
 def _environment(**variables: str) -> Iterator[None]:
-    """Set variables of the environment for a while, and for the processes that begin in it."""
+    """Set environment variables inside the context, also for the processes that start in it."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:

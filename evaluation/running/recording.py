@@ -1,4 +1,4 @@
-"""Recordings made from the simulation: what the sensors say in episodes of a scenario, with the truth."""
+"""Recordings made from the simulation: measurements in episodes of a scenario, with the truth."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -20,18 +20,18 @@ from .rollout import AT_ONCE, Progress, start_lanes
 from .seeds import episode_seeds
 
 CHUNK = 256
-"""Episodes recorded side by side."""
+"""Number of episodes recorded side by side."""
 
 
 class NoFilter(Filter[Task, Any, Initial]):
-    """In place of a filter where nobody estimates: the initial estimate stands."""
+    """Filter that always returns the initial estimate, for runs without an estimator."""
 
     def start(self, initial: Any) -> Initial:
-        """Report the initial estimate."""
+        """Return the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
     def update(self, state: Initial, given: FilterInput) -> Initial:
-        """Learn nothing."""
+        """Return the state unchanged."""
         return state
 
 
@@ -40,18 +40,17 @@ def _no_filter(model: Model) -> NoFilter:
 
 
 def record_experiment(experiment: Experiment, progress: Progress | None = None) -> Recording:
-    """Record what the sensors say in the episodes of an experiment, and the truth.
+    """Record the measurements in the episodes of an experiment, and the truth.
 
-    They are the episodes that an evaluation of the experiment flies. Replayed on the same backend, observations,
-    estimates and costs are the same, bit for bit.
+    They are the episodes of an evaluation of the experiment. Replayed on the same backend, observations, estimates and
+    costs are the same, bit for bit.
 
     Args:
-        experiment: whose episodes these are; no policy runs, and of its fields only those are used that say which
-            episodes, with which parameters and on what backend.
+        experiment: only its fields for the episodes, the parameters and the backend are used, since no policy runs.
         progress: called with the number of measurements done, now and then.
 
     Raises:
-        ValueError: for unknown names, a closed loop, or more measurements than a recording may hold.
+        ValueError: for unknown names, a closed loop, or more measurements than a recording may contain.
     """
     cls, split, seed, episodes = experiment.task, experiment.split, experiment.seed, experiment.episodes
     seeds = episode_seeds(split, seed, episodes)
@@ -74,7 +73,7 @@ def record_experiment(experiment: Experiment, progress: Progress | None = None) 
         times = numpy.cumsum(measurements["interval"], axis=1)
     else:
         times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
-    # Those acted on, and the one that the last observation shows.
+    # The measurements with an action, and that of the last observation.
     there = numpy.arange(truth.shape[1]) <= lengths[:, None]
     parameters = differing(plain.parameters)
     for name in cls.World.own_parameters:
@@ -97,20 +96,20 @@ def record_experiment(experiment: Experiment, progress: Progress | None = None) 
 
 
 def _check_size(task: Task, episodes: int) -> None:
-    """Raise ValueError if episodes are more than a recording may hold, or the loop is closed."""
+    """Raise ValueError for more episodes than a recording may contain, or a closed loop."""
     arrays = dict(named_arrays(measure_once(task)[1]))
     row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(task.components) + 1
     if row * episodes * (task.horizon + 1) > MOST_NUMBERS:
         raise ValueError(
             f"{episodes:,} episodes of {task.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
-            "that a recording may hold: record fewer"
+            "that a recording may contain: record fewer"
         )
 
 
 def _record(
     model: Model, seeds: Sequence[int], tick: Progress
 ) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
-    """Measurements and truth, ``(E, T, ...)``, and what was told of the start, ``(E, ...)``."""
+    """Return the measurements and truth, ``(E, T, ...)``, and the values given at the start, ``(E, ...)``."""
     initial: dict[str, numpy.ndarray] = {}
     series: dict[str, list[numpy.ndarray]] = {}
     count, interval = len(seeds), model.task.decision_interval
@@ -145,7 +144,7 @@ def _record(
 
 
 def _measured(model: Model, episode: Episode) -> dict[str, Any]:
-    """Report what was measured, and the truth."""
+    """Return the measurement and the truth."""
     return {**dict(named_arrays(episode.measurement)), "truth": model.task.world.state(episode.truth)}
 
 

@@ -1,4 +1,4 @@
-"""Episodes from their seeds to their end, with whatever competes in the loop."""
+"""Runs of whole episodes from their seeds, with any competitor in the loop."""
 
 import itertools
 import math
@@ -19,12 +19,12 @@ from ...envs.engine.episode_noise import identities_of_seeds, uniforms_of_seeds
 from ...envs.engine.lanes import Lanes, whole_episode
 from ...envs.engine.programs import Report
 from ...envs.interface.requests import check_action
-from ..competitors.filters import put_in_loop
+from ..competitors.filters import close_loop
 from ..competitors.kinds import (
     Kind,
-    answers_by_track,
     check_competitor,
     compilation_key,
+    is_made_for_episodes,
     is_program,
     kind_of,
     make_competitor,
@@ -32,13 +32,13 @@ from ..competitors.kinds import (
 from ..competitors.smoothers import SmoothedTrack, check_open_loop, report_smoothed, report_world, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
-from .kept import DRAWN_PREFIX
+from .stored_values import DRAWN_PREFIX
 
 AT_ONCE = 2**18
-"""Measurements of all episodes side by side that are run at once in native code."""
+"""Measurements, over all episodes side by side, in one call of native code."""
 
 Progress = Callable[[int], None]
-"""Called with the number of measurements just done."""
+"""Function that is called with the number of measurements just done."""
 
 
 def start_lanes(
@@ -47,13 +47,13 @@ def start_lanes(
     on_start: Callable[[Episode], None] | None = None,
     report: Report | None = None,
 ) -> Lanes:
-    """Return one episode for each seed, side by side, with its first measurement made.
+    """Return one episode for each seed, side by side, with its first measurement.
 
     Args:
         model: task with a bank.
-        seeds: of the episodes.
+        seeds: seeds of the episodes.
         on_start: called with the episodes at the start of the track.
-        report: that will be made of them; default: not known.
+        report: report function that will be applied to them; default: unknown.
     """
     lanes = Lanes(model, len(seeds), on_start=on_start, report=report)
     lanes.begin(identities_of_seeds(seeds))
@@ -69,35 +69,35 @@ def rollout(
     kind: Kind | None = None,
     name: str = "competitor",
 ) -> Iterator[tuple[Any, Array]]:
-    """Run whatever competes over one episode for each seed, measurement by measurement.
+    """Run a competitor over one episode for each seed, measurement by measurement.
 
     Args:
-        model: task with a bank; of a policy, that of its control.
+        model: task with a bank; for a policy, that of its control.
         competitor: policy, estimator, smoother, reference or bound, or a class or function that makes it. A smoother
-            runs over the episodes twice, the second time with what it says when all is measured.
+            runs over the episodes twice, the second time with its smoothed estimates.
         seeds: of the episodes, all run side by side.
-        report: function of the model and the state after the measurement was taken in; default: the state itself.
-        kind: what the competitor is; default: what it says.
-        name: of it, in errors.
+        report: function of the model and the state after the update; default: the state itself.
+        kind: kind of the competitor; default: its own.
+        name: its name in errors.
 
     Yields:
         For every measurement the report, arrays ``(..., N)`` whose lanes beyond ``len(seeds)`` are padding, and the
         action applied to it, batch first.
     """
     kind = kind or kind_of(competitor)
-    looped = model if kind == "policy" else _put_in_loop(model, competitor, kind, seeds, name)
+    looped = model if kind == "policy" else _close_loop(model, competitor, kind, seeds, name)
     yield from _step(looped, competitor if kind == "policy" else None, seeds, report, name)
 
 
 def _step(
-    looped: Model, asked: Any, seeds: Sequence[int], report: Report, name: str
+    looped: Model, maker: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
-    """Step a bank, whose policy is asked before every decision, or a filter that needs none, ``asked`` is None."""
+    """Step a bank with a policy, or a filter without one if ``maker`` is None."""
     lanes, action, policy, memory = start_lanes(looped, seeds, report=report), None, None, None
-    if asked is None:
+    if maker is None:
         action = numpy.zeros(len(seeds), dtype=numpy.int64)
     else:
-        policy = SteppingPolicy(looped, check_competitor(name, make_competitor(asked, looped), "policy"))
+        policy = SteppingPolicy(looped, check_competitor(name, make_competitor(maker, looped), "policy"))
         memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
         if policy is not None:
@@ -106,17 +106,17 @@ def _step(
             yield found, action
 
 
-def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str) -> Model:
-    """Return a model whose filter is a competitor, of a smoother what it has found in these episodes."""
+def _close_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str) -> Model:
+    """Return a model whose filter is a competitor, or the smoothed estimates of a smoother in these episodes."""
     if kind == "smoother":
         check_open_loop(model, f"smoother {name!r}")
         competitor, kind = (
             SmoothedTrack(model.task, *_smoothed_estimates(model, competitor, seeds, name)),
             "estimator",
         )
-    if answers_by_track(competitor):
+    if is_made_for_episodes(competitor):
         competitor = competitor.of_episodes(model.task, seeds)
-    return put_in_loop(model, competitor, kind, name, len(seeds), model.task.horizon)
+    return close_loop(model, competitor, kind, name, len(seeds), model.task.horizon)
 
 
 def _smoothed_estimates(
@@ -124,7 +124,7 @@ def _smoothed_estimates(
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Return means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of a smoother.
 
-    Episodes of one length are smoothed together, from their last measurement on; beyond it that estimate is held.
+    Episodes of one length are smoothed together, from their last measurement on; after it that estimate is repeated.
     """
     task = model.task
     lengths = task.lengths(uniforms_of_seeds(seeds, task.noise))
@@ -133,7 +133,7 @@ def _smoothed_estimates(
     for length in numpy.unique(lengths).tolist():
         lanes = numpy.flatnonzero(lengths == length)
         own = [seeds[lane] for lane in lanes.tolist()]
-        looped = put_in_loop(model, competitor, "smoother", name, len(own))
+        looped = close_loop(model, competitor, "smoother", name, len(own))
         found = run_forward(looped, start_lanes(looped, own), length, name)
         for kept, answered in zip((means, covariances), found, strict=True):
             kept[..., :length, lanes] = answered[..., : len(own)]
@@ -141,13 +141,13 @@ def _smoothed_estimates(
     return means, covariances
 
 
-class Flown(NamedTuple):
-    """What is reported of episodes that were run to their end."""
+class EpisodeReports(NamedTuple):
+    """Reports on complete episodes."""
 
     found: dict[str, numpy.ndarray]
     """Arrays ``(episodes, time, ...)`` by name; not always one row after the other in memory."""
     action: numpy.ndarray | None
-    """That a policy applied to each measurement, ``(episodes, time, ...)``; None of what has none."""
+    """Action of a policy at each measurement, ``(episodes, time, ...)``; None for other competitors."""
 
 
 def run_episodes(
@@ -159,30 +159,30 @@ def run_episodes(
     name: str = "competitor",
     tick: Progress | None = None,
     more: tuple[Report, int] | None = None,
-) -> Flown:
-    """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
+) -> EpisodeReports:
+    """Run a competitor over one episode for each seed, and return the reports on every measurement.
 
-    Where everything is compiled, world, filter, policy and report, all episodes are one call of native code; else they
+    Where world, filter, policy and report are all compiled, all episodes are one call of native code; otherwise they
     are stepped. The numbers are the same.
 
     Args:
-        model: as in :func:`rollout`, likewise what follows.
-        competitor: likewise.
-        kind: likewise.
-        seeds: likewise.
-        report: of arrays ``(..., N)`` by name.
-        name: of the competitor, in errors.
-        tick: told of measurements done.
-        more: report on the first episodes, and how many they are: of all it would take much memory. Names that begin
-            with :data:`.kept.DRAWN_PREFIX` are of them only.
+        model: task with a bank; for a policy, that of its control.
+        competitor: policy, estimator, smoother, reference or bound, or a class or function that makes it.
+        kind: kind of the competitor.
+        seeds: seeds of the episodes, all run side by side.
+        report: function of the model and the state that returns arrays ``(..., N)`` by name.
+        name: name of the competitor in errors.
+        tick: called with the number of measurements done.
+        more: a larger report and the number of first episodes that it is for: for all it would take much memory. Names
+            that begin with :data:`.stored_values.DRAWN_PREFIX` exist for these episodes only.
     """
     count, compiled_policy, tick = len(seeds), None, tick or (lambda measurements: None)
     is_policy = kind == "policy"
-    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
     if is_policy:
         compiled_policy = _compiled_policy_of(model, competitor, name)
     if kind == "smoother" and isinstance(track := looped.filter.own.own, SmoothedTrack):
-        forward = put_in_loop(model, competitor, kind, name, count)
+        forward = close_loop(model, competitor, kind, name, count)
         if can_step(forward, report_world):
             lanes = start_lanes(forward, seeds)
             length = lanes.decisions_per_episode * model.task.decision_interval
@@ -206,22 +206,22 @@ def run_episodes(
 def run_stretches(
     model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report, rows: int, name: str
 ) -> Iterator[dict[str, numpy.ndarray]]:
-    """Run whatever competes as :func:`run_episodes` does, in a memory that does not grow with the episodes' length.
+    """Run a competitor as :func:`run_episodes` does, in memory that does not grow with the episodes' length.
 
     Args:
-        model: as in :func:`run_episodes`, with the five arguments of the same names.
-        competitor: see there.
-        kind: see there.
-        seeds: see there.
-        report: see there.
-        rows: measurements that are reported at once, in whole decisions.
-        name: see there.
+        model: task with a bank; for a policy, that of its control.
+        competitor: policy, estimator, smoother, reference or bound, or a class or function that makes it.
+        kind: kind of the competitor.
+        seeds: seeds of the episodes, all run side by side.
+        report: function of the model and the state that returns arrays ``(..., N)`` by name.
+        rows: number of measurements in one report, in whole decisions.
+        name: name of the competitor in errors.
 
     Yields:
-        What is reported of some measurements after the others, arrays ``(rows, ..., episodes)`` by name.
+        Reports on successive stretches of measurements, arrays ``(rows, ..., episodes)`` by name.
     """
     interval, is_policy, policy = model.task.decision_interval, kind == "policy", None
-    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
     if is_policy:
         policy = _compiled_policy_of(model, competitor, name)
     length = model.task.horizon // interval * interval
@@ -238,34 +238,36 @@ def run_stretches(
 
 
 def _without_padding(report: Mapping[str, numpy.ndarray], count: int) -> dict[str, numpy.ndarray]:
-    """Return the first lanes of a report in memory of their own: a view would keep the padding."""
+    """Return the first lanes of a report as copies: views would hold the memory of the padding."""
     return {name: values[..., :count].copy() for name, values in report.items()}
 
 
 def _run_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
-) -> Flown:
-    """Run compiled episodes in native code, ``AT_ONCE`` measurements at a time, each from where the last was left."""
+) -> EpisodeReports:
+    """Run compiled episodes in native code, ``AT_ONCE`` measurements in each call."""
     lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
     interval = looped.task.decision_interval
     decisions, most = lanes.decisions_per_episode, max(1, AT_ONCE // (lanes.width * interval))
 
-    def run(decisions: int, whole: bool) -> Flown:
-        """Run so many decisions; of whole episodes a view is returned."""
+    def run(decisions: int, whole: bool) -> EpisodeReports:
+        """Run a number of decisions; for whole episodes return a view."""
         reports, actions = lanes.run(report, compiled_policy, decisions * interval)
         tick(count * decisions * interval)
         found = {name: _episodes_first(values, count) for name, values in reports.items()}
         steered = None if actions is None else _checked_actions(looped, actions, count)
-        return Flown(found, steered) if whole else map_arrays(numpy.ascontiguousarray, Flown(found, steered))
+        return (
+            EpisodeReports(found, steered)
+            if whole
+            else map_arrays(numpy.ascontiguousarray, EpisodeReports(found, steered))
+        )
 
     parts = [run(min(most, decisions - i), decisions <= most) for i in range(0, decisions, most)]
     return _one_after_another(parts, axis=1)
 
 
-def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
-    """Join episodes, or measurements of the same ones, and empty the parts on the way; what is reported of some
-    episodes only is theirs alone.
-    """
+def _one_after_another(parts: Sequence[EpisodeReports], axis: int = 0) -> EpisodeReports:
+    """Concatenate parts along an axis, and empty them on the way; reports on some episodes only are not padded."""
     if len(parts) == 1:
         return parts[0]
     found = {
@@ -273,28 +275,28 @@ def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
         for name in list(parts[0].found)
     }
     actions = [part.action for part in parts if part.action is not None]
-    return Flown(found, numpy.concatenate(actions, axis) if actions else None)
+    return EpisodeReports(found, numpy.concatenate(actions, axis) if actions else None)
 
 
 def _join_stretches(
     stretches: Iterator[dict[str, numpy.ndarray]], count: int, tick: Progress, drawn: int
-) -> Flown:
-    """Keep what is reported of many measurements together, arrays ``(scans, ..., N)`` by name."""
+) -> EpisodeReports:
+    """Concatenate reports on stretches of measurements, arrays ``(scans, ..., N)`` by name."""
     series: dict[str, list[numpy.ndarray]] = {}
     for found in stretches:
         for name, values in found.items():
             kept = drawn if name.startswith(DRAWN_PREFIX) else count
             series.setdefault(name, []).append(values[..., :kept].copy())
         tick(count * len(next(iter(found.values()))))
-    return Flown(
+    return EpisodeReports(
         {name: _episodes_first(numpy.concatenate(values), count) for name, values in series.items()}, None
     )
 
 
 def _step_episodes(
     steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, drawn: int
-) -> Flown:
-    """Keep what is reported of episodes that are stepped."""
+) -> EpisodeReports:
+    """Run episodes step by step and collect the reports."""
     series: dict[str, list[numpy.ndarray]] = {}
     actions = []
     for found, action in steps:
@@ -306,11 +308,11 @@ def _step_episodes(
         actions.append(numpy.asarray(action))
         tick(count)
     together = {name: _episodes_first(numpy.stack(values), count) for name, values in series.items()}
-    return Flown(together, numpy.stack(actions, axis=1) if is_policy else None)
+    return EpisodeReports(together, numpy.stack(actions, axis=1) if is_policy else None)
 
 
 def _compiled_policy_of(model: Model, competitor: Any, name: str) -> Specialised | None:
-    """Return what steers the model in native code; None of a policy that is asked in Python."""
+    """Return the policy in native code; None for a policy that runs in Python."""
 
     def trace() -> Specialised | None:
         policy = check_competitor(name, make_competitor(competitor, model), "policy")
@@ -321,7 +323,7 @@ def _compiled_policy_of(model: Model, competitor: Any, name: str) -> Specialised
         return None
     try:
         return model.programs.keep((run_episodes, compilation_key(competitor)), trace)
-    except TypeError:  # it has no hash
+    except TypeError:  # the maker has no hash
         return trace()
 
 
@@ -334,7 +336,7 @@ def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.
     """Return actions ``(time, ..., N)``, episodes first.
 
     Raises:
-        ValueError: for the first that is not in the action space, but for the limits of a box.
+        ValueError: for the first action outside the action space, apart from the limits of a box.
     """
     space, kept = model.action_space, _episodes_first(actions, count)
     if isinstance(space, gymnasium.spaces.Discrete):
@@ -348,42 +350,41 @@ def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.
 
 
 TIMED_EPISODES, TIMED_MEASUREMENTS = 512, 256
-"""Episodes side by side, and measurements of each, of which a time is taken: enough for two digits."""
+"""Episodes side by side, and measurements of each, in a measurement of time: enough for two digits."""
 RUN_SECONDS = 0.02
-"""How long a run takes, about, where the episodes are long enough."""
+"""Approximate duration of a run, s, where the episodes are long enough."""
 TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.05, 3, 20
-"""For how long, and how often, runs are repeated of which the quickest counts."""
+"""Duration, s, and numbers of repeated runs, of which the quickest counts."""
 
 
 class ProcessorTime(NamedTuple):
-    """What a measurement takes on one core: world and competitor together, or of a program the process alone."""
+    """Processor time of a measurement on one core: world and competitor together, or a program's process alone."""
 
     nanoseconds: float
-    """Of a measurement of one of many episodes side by side."""
+    """Time of a measurement of one of many episodes side by side, ns."""
     compiled: bool
-    """Whether all of it is native code; else the time is mostly that of the steps between, in Python."""
+    """Whether all code is native; otherwise the time is mostly that of the steps in Python."""
     own: bool = False
-    """Whether it is that of a program's own process, without the world: not to be compared with the others."""
+    """Whether it is the time of a program's own process, without the world, which is not comparable with the others."""
 
 
 def measure_time(
     model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str = "competitor"
 ) -> ProcessorTime | None:
-    """Measure the processor time of a measurement: the world moves, is measured, and the competitor estimates.
+    """Measure the processor time of a measurement: motion of the world, sensors, and the competitor's estimate.
 
-    Of :data:`TIMED_EPISODES` episodes side by side, after everything is traced and compiled: of native code the
-    quickest of several runs, since what disturbs one only adds to it; of what is asked in Python the median decision.
-    Of a program it is the time of its own process.
+    :data:`TIMED_EPISODES` episodes run side by side, after tracing and compilation. For native code the quickest of
+    several runs counts, since disturbances only add time; for Python code the median decision. For a program it is the
+    time of its own process.
 
     Args:
-        model: as in :func:`rollout`, likewise what follows.
-        competitor: likewise.
-        kind: likewise. A smoother answers when all is measured, a bound estimates nothing, and the time of what has
-            answered before is not known: None.
-        seeds: of some episodes, which are repeated where they are fewer.
-        name: of the competitor, in errors.
+        model: task with a bank; for a policy, that of its control.
+        competitor: as in :func:`rollout`.
+        kind: kind of the competitor. Smoothers, bounds and competitors made for given episodes have no time: None.
+        seeds: seeds of episodes, which are repeated up to that number.
+        name: name of the competitor in errors.
     """
-    if kind in ("smoother", "bound") or answers_by_track(competitor):
+    if kind in ("smoother", "bound") or is_made_for_episodes(competitor):
         return None
     seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
     task, is_policy = model.task, kind == "policy"
@@ -392,7 +393,7 @@ def measure_time(
         competitor = competitor(task)
         clock = competitor.processor_seconds
     decisions = max(1, min(TIMED_MEASUREMENTS, task.horizon) // task.decision_interval)
-    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
     compiled_policy = _compiled_policy_of(model, competitor, name) if is_policy else None
     if can_step(looped, _report_estimate) and (compiled_policy is not None or not is_policy):
         spent = _time_compiled(looped, compiled_policy, seeds, decisions)
@@ -400,7 +401,7 @@ def measure_time(
     steps = _step(looped, competitor if is_policy else None, seeds, _report_estimate, name)
     with warnings.catch_warnings():
         if own:
-            warnings.simplefilter("ignore")  # the evaluation has said what is wrong with a program
+            warnings.simplefilter("ignore")  # the evaluation has already warned of a program's faults
         spent = _time_steps(steps, decisions, task.decision_interval, clock)
     if math.isnan(spent):
         return None
@@ -414,7 +415,7 @@ def _report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
 def _time_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], decisions: int
 ) -> float:
-    """Seconds of a decision of all episodes, in the quickest run of optimised code."""
+    """Return the seconds of a decision of all episodes, in the quickest run of optimised code."""
     identities = identities_of_seeds(seeds)
     lanes = start_lanes(looped, seeds, report=_report_estimate)
     interval = looped.task.decision_interval
@@ -427,9 +428,9 @@ def _time_compiled(
 
     with optimised_code():
         run(1)  # compiles
-    # And a first decision. Where a clock that counts ticks has not moved meanwhile, it took one at most.
+    # And a first decision. Where a clock with coarse ticks has not advanced, it took one tick at most.
     setting_up = max(min(run(1) for _ in range(FEWEST_RUNS)), time.get_clock_info("process_time").resolution)
-    # No step branches, so that every decision takes as long: a dear one need not be repeated to the end.
+    # No step branches, so every decision takes the same time: a slow one need not be repeated to the end.
     count = min(decisions, 1 + math.ceil(RUN_SECONDS / setting_up))
     if count == 1:
         return setting_up
@@ -442,7 +443,7 @@ def _time_compiled(
 def _time_steps(
     steps: Iterator[Any], decisions: int, interval: int, clock: Callable[[], float] = time.process_time
 ) -> float:
-    """Seconds of the median decision, by a clock."""
+    """Return the seconds of the median decision, by a clock."""
     spent: list[float] = []
     for _ in range(decisions):
         began = clock()
@@ -457,5 +458,5 @@ def _time_steps(
 def run_competitor(
     model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report
 ) -> dict[str, numpy.ndarray]:
-    """Run whatever competes, see :func:`run_episodes`, and return what is reported, ``(episodes, time, ...)``."""
+    """Run a competitor by :func:`run_episodes`, and return the reports, ``(episodes, time, ...)``."""
     return run_episodes(model, competitor, kind, seeds, report).found

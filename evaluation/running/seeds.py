@@ -1,4 +1,4 @@
-"""Seeds of episodes: three splits that share nothing, whatever the number beside them."""
+"""Seeds of episodes, in three splits without common seeds."""
 
 import numpy
 
@@ -9,15 +9,15 @@ SPLITS = {"train": 0, "validation": 1, "test": 2}
 
 
 def episode_seeds(split: str, seed: int, episodes: int, first: int = 0) -> list[int]:
-    """Seeds of a run of episodes.
+    """Return the seeds of a run of episodes.
 
     Each is an ordinary Gymnasium seed: ``env.reset(seed=...)`` replays the episode.
 
     Args:
         split: "train", "validation" or "test".
-        seed: number of the experiment; different numbers share no episode.
-        episodes: how many.
-        first: how many to skip.
+        seed: seed of the experiment; different seeds have no episode in common.
+        episodes: number of episodes.
+        first: number of episodes to skip.
 
     Raises:
         ValueError: for an unknown split, a seed below zero, or fewer episodes than one.

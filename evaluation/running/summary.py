@@ -1,7 +1,7 @@
-"""What records, curves and a track need of an evaluation: little enough to send, to keep in a file, and to hold.
+"""Summaries of evaluations: statistics for records, curves and tracks, small enough to send and to store.
 
-A summary is of one competitor. Its episodes are run where it is made, in chunks each of which is reduced before the
-next begins, and what they come to is added in their order; so its bits depend on nothing but what was asked for.
+A summary contains one competitor. Its episodes are run in chunks, each reduced before the next begins, and the results
+are added in their order; so its bits depend only on the request.
 """
 
 import functools
@@ -20,7 +20,6 @@ from ..storage.dataset import Losses, count_losses, losses_in
 from ..storage.store import Store, Work
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, spread, stack_curves
 from .evaluate import Experiment, check_sendable, plan_of, run_competitors, run_piece
-from .kept import DRAWN_PREFIX
 from .metrics import (
     PER_FLIGHT,
     Contender,
@@ -40,18 +39,19 @@ from .metrics import (
 from .own_metrics import OwnMetrics
 from .parallel import Workers
 from .rollout import Progress
+from .stored_values import DRAWN_PREFIX
 from .threads import one_thread
 from .times import COORDINATES, with_times
 
 TOGETHER = 4 * BLOCK
-"""Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
+"""Episodes of a piece of work: enough that its result is small compared with its computation."""
 DRAWN_TIMES = 20_000
-"""Measurements of an episode that pictures show, at most."""
+"""Maximal number of measurements of an episode in pictures."""
 MOST_RECORDINGS = 40
-"""Episodes of a recording that are reported one by one."""
+"""Maximal number of episodes of a recording that are reported separately."""
 BATCH = 600_000
-"""Measurements that another process is given at once, where several pieces of work share a model: about a second. A
-longer batch would leave the others idle at the end, and lose more where the work is interrupted."""
+"""Measurements that are sent to another process in one batch, where several pieces of work share a model: about a
+second. A longer batch would leave other processes idle at the end, and lose more in an interruption."""
 
 
 class EvaluationRequest(NamedTuple):
@@ -61,7 +61,7 @@ class EvaluationRequest(NamedTuple):
     name: str
     maker: Any
     metrics: OwnMetrics | None = None
-    """The environment's own."""
+    """Metrics of the environment."""
     horizon: int = 1
     """Measurements of an episode, for the progress."""
     first: int = 0
@@ -69,13 +69,13 @@ class EvaluationRequest(NamedTuple):
     last: int | None = None
     """Episode before which it ends; None: the end."""
     curves: bool = True
-    """Whether it is reduced to curves, too: who draws no figure needs none, and they take as long as the records."""
+    """Whether to compute curves, too, for figures; they take as long as the records."""
     identity: str | None = None
-    """Of the competitor, see :class:`..competitors.kinds.Competitor`; with None its summary is not kept in a store."""
+    """Identity of the competitor, see :class:`..competitors.kinds.Competitor`; with None its summary is not stored."""
 
     @property
     def episodes(self) -> int:
-        """How many the experiment has."""
+        """Number of episodes of the experiment."""
         return self.experiment.episodes
 
     @property
@@ -85,17 +85,17 @@ class EvaluationRequest(NamedTuple):
 
     @property
     def measurements(self) -> int:
-        """How many there are."""
+        """Number of measurements."""
         return (self.end - self.first) * self.horizon
 
     def work(self) -> Work | None:
-        """Return the piece of work that the summary is, for a store; None where nothing is kept of it."""
+        """Return the piece of work of the summary, for a store; None where it is not stored."""
         if self.identity is None:
             return None
         return Work(f"{stem_of(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
 
     def pieces(self) -> list["EvaluationRequest"]:
-        """Return the pieces of work that this is: one, unless there are many episodes."""
+        """Split the request into pieces of work: one, unless there are many episodes."""
         if self.episodes <= TOGETHER:
             return [self]
         begins = range(0, self.episodes, TOGETHER)
@@ -103,26 +103,26 @@ class EvaluationRequest(NamedTuple):
 
 
 def stem_of(experiment: Experiment) -> str:
-    """Begin the name of a file about an experiment."""
+    """Return the beginning of the name of a file about an experiment."""
     environment, scenario = short_name(experiment.task.id), experiment.scenario or "default"
     return f"{environment}.{scenario}.{experiment.episodes}.{experiment.split}{experiment.seed}"
 
 
 class Evaluation(NamedTuple):
-    """What an evaluation has found."""
+    """Results of an evaluation."""
 
     dataset: xarray.Dataset
-    """All that was kept of every episode (:func:`.evaluate.run_experiment`); or, of summaries, its coordinates and
-    attributes with what was kept of the first episodes, over policy, drawn_episode and time."""
+    """Values of every episode (:func:`.evaluate.run_experiment`); or, for summaries, coordinates and attributes with
+    the values of the first episodes, over policy, drawn_episode and time."""
     records: list[Record]
     curves: xarray.Dataset | None
     """See :func:`.curves.curves_of`; None where they were not requested of every competitor."""
     costs: Mapping[str, numpy.ndarray]
-    """Mean cost of every episode by name, ``(episodes,)``, of all whose cost is known."""
+    """Mean cost of every episode by name, ``(episodes,)``, of all competitors with a known cost."""
     flights: Sequence[Record] = ()
-    """Of every flight, where they are reported one by one."""
+    """Records of every flight, where they are reported separately."""
     differences: Mapping[str, IntervalEstimate] = {}
-    """Of a recording, by name, the log-likelihood per measurement less that of the best."""
+    """For a recording, the log-likelihood per measurement less that of the best, by name."""
 
     @property
     def has_truth(self) -> bool:
@@ -140,9 +140,9 @@ class Summary(NamedTuple):
 
     contender: Contender
     curves: CompetitorCurves | None
-    """None where none were asked for."""
+    """Curves; None where they were not requested."""
     head: xarray.Dataset
-    """Its part of the evaluation, without what was kept of every episode."""
+    """Its part of the evaluation, without the values of every episode."""
     episodes: int
 
 
@@ -156,72 +156,72 @@ class Part(NamedTuple):
         """Add the episodes that come next."""
         return self._replace(reduction=self.reduction.merge(later.reduction))
 
-    def summary(self, asked: EvaluationRequest) -> Summary:
-        """Return the summary of all episodes of what was asked for."""
-        results, bootstrap = self.reduction.results(), resampling(asked.episodes)
-        contender = contender_of(results, self.head, bootstrap, asked.metrics)
-        curves = competitor_curves(results) if asked.curves else None
-        return Summary(contender, curves, self.head, asked.episodes)
+    def summary(self, request: EvaluationRequest) -> Summary:
+        """Return the summary of all episodes of the request."""
+        results, bootstrap = self.reduction.results(), resampling(request.episodes)
+        contender = contender_of(results, self.head, bootstrap, request.metrics)
+        curves = competitor_curves(results) if request.curves else None
+        return Summary(contender, curves, self.head, request.episodes)
 
 
-def summarise(asked: EvaluationRequest, tick: Progress) -> Summary | Part:
-    """Run what is asked for and reduce it; of a piece of the episodes only, return what they contribute.
+def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
+    """Run a request and reduce it to a summary; for a piece of the episodes only, return their contribution.
 
     Raises:
         ValueError: as :func:`reduce_episodes`.
     """
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
-        yield from record_statistics(run, asked.episodes, asked.metrics)
-        if asked.curves:
-            yield from curve_statistics(run, asked.episodes)
+        yield from record_statistics(run, request.episodes, request.metrics)
+        if request.curves:
+            yield from curve_statistics(run, request.episodes)
 
-    part = reduce_episodes(asked, declare, tick)
-    if asked.end - asked.first < asked.episodes:
+    part = reduce_episodes(request, declare, tick)
+    if request.end - request.first < request.episodes:
         return part
-    return part.summary(asked)
+    return part.summary(request)
 
 
 def reduce_episodes(
-    asked: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
+    request: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
-    """Run what is asked for and reduce it to statistics, a block of episodes at a time.
+    """Run a request and reduce it to statistics, a block of episodes at a time.
 
     Args:
-        asked: one competitor over episodes.
-        declare: from some of its episodes to their statistics.
-        tick: told of measurements done.
+        request: request of one competitor over episodes.
+        declare: function from some of its episodes to their statistics.
+        tick: called with the number of measurements done.
 
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
     """
-    plan = plan_of(asked.experiment, {asked.name: asked.maker}, asked.first, asked.end)
+    plan = plan_of(request.experiment, {request.name: request.maker}, request.first, request.end)
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
-    bootstrap = resampling(asked.episodes)
-    block = block_of(plan.models[asked.name].task.horizon)
+    bootstrap = resampling(request.episodes)
+    block = block_of(plan.models[request.name].task.horizon)
 
     def part(first: int) -> Part:
-        """Run a block of episodes and reduce it; nothing of what was measured in it outlives the call."""
-        piece = plan.piece(asked.name, first, min(block, asked.end - first), True)
+        """Run a block of episodes and reduce it; its measurements are freed at the end of the call."""
+        piece = plan.piece(request.name, first, min(block, request.end - first), True)
         count = len(piece.seeds)
-        kept = plan.arrays(count, asked.experiment.drawn_episodes - first)
-        kept.write(asked.name, slice(count), run_piece(piece, tick))
+        kept = plan.arrays(count, request.experiment.drawn_episodes - first)
+        kept.write(request.name, slice(count), run_piece(piece, tick))
         run = plan.dataset(kept, piece.seeds).isel(policy=0)
         reduction = reduce_run(run, declare, bootstrap, first)
         others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
         head = run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
         return Part(reduction, head)
 
-    parts = (part(first) for first in range(asked.first, asked.end, block))
+    parts = (part(first) for first in range(request.first, request.end, block))
     found = functools.reduce(Part.merge, parts)
-    if asked.experiment.timed and asked.first == 0:
-        return found._replace(head=with_times(found.head, [plan.time(asked.name)]))
+    if request.experiment.timed and request.first == 0:
+        return found._replace(head=with_times(found.head, [plan.time(request.name)]))
     return found
 
 
 def summaries(
-    asked: Sequence[EvaluationRequest],
+    requests: Sequence[EvaluationRequest],
     workers: Workers,
     progress: Progress | None = None,
     store: Store | None = None,
@@ -229,10 +229,10 @@ def summaries(
     """Summarise competitors, of any environments.
 
     Args:
-        asked: whom, over what; they are begun in this order.
-        workers: who does it.
-        progress: told of measurements done.
-        store: keeps the summary of each, from which a second call takes it. Default: nothing is kept.
+        requests: the requests, started in this order.
+        workers: processes that do the work.
+        progress: called with the number of measurements done.
+        store: stores each summary, so that a second call reads it. Default: nothing is stored.
 
     Yields:
         Number of a competitor among them and its summary, as they are finished.
@@ -242,9 +242,9 @@ def summaries(
             :func:`.evaluate.run_experiment`.
     """
     store = store or Store()
-    work = [one.work() for one in asked]
+    work = [one.work() for one in requests]
     missing = []
-    for i, one in enumerate(asked):
+    for i, one in enumerate(requests):
         found = store.read(work[i], Summary)
         if found is None:
             missing.append(i)
@@ -254,13 +254,13 @@ def summaries(
         yield i, found
     if not workers.alone:
         for i in missing:
-            check_sendable(asked[i].experiment.task, {asked[i].name: asked[i].maker})
-    pieces = [(i, piece) for i in missing for piece in asked[i].pieces()]
+            check_sendable(requests[i].experiment.task, {requests[i].name: requests[i].maker})
+    pieces = [(i, piece) for i in missing for piece in requests[i].pieces()]
     batches = [[piece] for piece in pieces] if workers.alone else _batches(pieces)
     items = [[piece for _, piece in batch] for batch in batches]
     waiting: dict[int, dict[int, tuple[Part, int]]] = {}
     added: dict[int, Part] = {}
-    done = [0] * len(asked)
+    done = [0] * len(requests)
     sizes = [sum(piece.measurements for piece in batch) for batch in items]
     run = workers.run(lambda batch, tick: [summarise(one, tick) for one in batch], items, sizes, progress)
     for (i, piece), found in (
@@ -270,22 +270,22 @@ def summaries(
             store.write(work[i], found)
             yield i, found
             continue
-        # In the order of the episodes, whichever come first: sums of the same numbers in another order differ.
+        # In the order of the episodes, not of arrival: sums in another order round differently.
         waiting.setdefault(i, {})[piece.first] = found, piece.last or 0
         while done[i] in waiting[i]:
             later, done[i] = waiting[i].pop(done[i])
             added[i] = added[i].merge(later) if i in added else later
-        if done[i] == asked[i].episodes:
+        if done[i] == requests[i].episodes:
             with one_thread():
-                whole = added.pop(i).summary(asked[i])
+                whole = added.pop(i).summary(requests[i])
             store.write(work[i], whole)
             yield i, whole
 
 
 def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:
-    """Group pieces of work that share a model, which every process that runs one of them would trace for itself.
+    """Group pieces of work that share a model, so that one process traces it once.
 
-    A batch stands where its first piece stood, and holds at most ``BATCH`` measurements, or one piece.
+    A batch takes the place of its first piece, and contains at most ``BATCH`` measurements, or one piece.
     """
     batches: list[list[tuple[int, EvaluationRequest]]] = []
     last: dict[Any, tuple[list[tuple[int, EvaluationRequest]], int]] = {}
@@ -302,7 +302,7 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 @one_thread()
 def combine_summaries(found: Sequence[Summary]) -> Evaluation:
-    """Return the evaluation of which these are the summaries of all competitors."""
+    """Combine the summaries of all competitors to their evaluation."""
     evaluation = _heads_together(
         [one.head for one in found], [one.contender.losses for one in found], found[0].episodes
     )
@@ -319,7 +319,7 @@ def combine_summaries(found: Sequence[Summary]) -> Evaluation:
 def _actions_by_control(
     curves: Sequence[CompetitorCurves], controls: Sequence[str]
 ) -> list[CompetitorCurves]:
-    """Name the actions of competitors that steer by several controls by these, too."""
+    """Add the control to the names of actions where competitors use several controls."""
     if len({control for control, own in zip(controls, curves, strict=True) if own.actions}) < 2:
         return list(curves)
     return [
@@ -328,38 +328,38 @@ def _actions_by_control(
     ]
 
 
-class Alone(NamedTuple):
-    """What remains of one competitor over flights, a recording or one episode, which is resampled with the others."""
+class SeparateResults(NamedTuple):
+    """Data of one competitor over flights, a recording or one episode, which are resampled with those of the others."""
 
     reduced: Reduced
     flights: list[Reduced]
     likelihood: LikelihoodSums | None
     costs: numpy.ndarray | None
-    """Mean of every episode; None where none is known."""
+    """Mean cost of every episode; None where none is known."""
     losses: Losses | None
     curves: CompetitorCurves | None
     head: xarray.Dataset
-    """Its part of the evaluation, without what was kept of every episode, at ``DRAWN_TIMES`` measurements at most."""
+    """Its part of the evaluation, without the values of every episode, at ``DRAWN_TIMES`` measurements at most."""
 
 
-def reduce_alone(run: xarray.Dataset, asked: EvaluationRequest) -> Alone:
-    """Reduce one competitor's part of an evaluation to what remains of it."""
+def reduce_alone(run: xarray.Dataset, request: EvaluationRequest) -> SeparateResults:
+    """Reduce one competitor's part of an evaluation."""
     episodes, times = run.sizes["episode"], run.sizes["time"]
     flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
     if not run.attrs["truth"] or (recorded and episodes > MOST_RECORDINGS):
         flights = iter(())
     costs = mean_over_time(run, run["cost"].values) if "cost" in run else None
-    if costs is not None and numpy.isnan(costs).all():  # of bounds there is none
+    if costs is not None and numpy.isnan(costs).all():  # bounds have no cost
         costs = None
     chosen, curves = spread(times, DRAWN_TIMES), None
-    if asked.curves:
+    if request.curves:
         declare = functools.partial(curve_statistics, episodes=episodes)
         results = reduce_run(run, declare, bootstrap_of_episodes(run)).results()
         curves = competitor_curves(results).at_measurements(chosen, times)
     others = [name for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
-    return Alone(
-        reduce_competitor(run, asked.metrics).without_variables(),
-        [reduce_competitor(part, asked.metrics).without_variables() for part in flights],
+    return SeparateResults(
+        reduce_competitor(run, request.metrics).without_variables(),
+        [reduce_competitor(part, request.metrics).without_variables() for part in flights],
         likelihood_sums(run) if recorded else None,
         costs,
         count_losses(losses_in(run)),
@@ -368,14 +368,14 @@ def reduce_alone(run: xarray.Dataset, asked: EvaluationRequest) -> Alone:
     )
 
 
-def _run_alone(asked: EvaluationRequest, tick: Progress) -> Alone:
-    found = run_competitors(asked.experiment, {asked.name: asked.maker}, tick)
-    return reduce_alone(found.isel(policy=0), asked)
+def _run_alone(request: EvaluationRequest, tick: Progress) -> SeparateResults:
+    found = run_competitors(request.experiment, {request.name: request.maker}, tick)
+    return reduce_alone(found.isel(policy=0), request)
 
 
 @one_thread()
 def _combine_alone(
-    found: Mapping[str, Alone],
+    found: Mapping[str, SeparateResults],
     curves: Sequence[CompetitorCurves],
     evaluation: xarray.Dataset,
     metrics: OwnMetrics | None,
@@ -405,7 +405,7 @@ def _combine_alone(
 
 
 def run_requests(
-    asked: Sequence[EvaluationRequest],
+    requests: Sequence[EvaluationRequest],
     workers: Workers,
     progress: Progress | None = None,
     store: Store | None = None,
@@ -414,29 +414,29 @@ def run_requests(
     """Evaluate the competitors of one experiment.
 
     Args:
-        asked: one request for each.
-        workers: share the work.
+        requests: one request for each competitor.
+        workers: processes that share the work.
         progress: called with the number of measurements done.
-        store: as of :func:`summaries`.
-        whole: keep every number of every episode.
+        store: stores each summary, so that a second call reads it. Default: nothing is stored.
+        whole: whether to store every number of every episode.
 
     Raises:
         ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
     """
-    first, names = asked[0], [one.name for one in asked]
+    first, names = requests[0], [one.name for one in requests]
     if whole:
-        makers = {one.name: one.maker for one in asked}
+        makers = {one.name: one.maker for one in requests}
         evaluation = run_competitors(first.experiment, makers, progress, workers)
-        remains = [reduce_alone(evaluation.sel(policy=one.name), one) for one in asked]
+        remains = [reduce_alone(evaluation.sel(policy=one.name), one) for one in requests]
         curves = [one.curves for one in remains if one.curves is not None]
     elif first.episodes > 1 and not first.experiment.make_task().flights:
-        found = dict(summaries(asked, workers, progress, store))
+        found = dict(summaries(requests, workers, progress, store))
         return combine_summaries([found[i] for i in range(len(found))])
-    else:  # one competitor after the other, of which nothing is kept that is as long as the episodes
+    else:  # one competitor after the other, without storing arrays as long as the episodes
         if not workers.alone:
-            check_sendable(first.experiment.task, {one.name: one.maker for one in asked})
-        done = dict(workers.run(_run_alone, asked, [one.measurements for one in asked], progress))
-        remains = [done[i] for i in range(len(asked))]
+            check_sendable(first.experiment.task, {one.name: one.maker for one in requests})
+        done = dict(workers.run(_run_alone, requests, [one.measurements for one in requests], progress))
+        remains = [done[i] for i in range(len(requests))]
         curves = [one.curves for one in remains if one.curves is not None]
         if curves:
             curves = _actions_by_control(curves, [str(one.head["control"].values) for one in remains])
@@ -469,7 +469,7 @@ def _heads_together(
             if name in head:
                 stacked[i] = head[name].values
         variables[name] = (("policy", *example.dims), stacked)
-    # A file has an order of its own.
+    # A file may have another order.
     return xarray.Dataset(
         variables, dict(sorted(coords.items())), {**heads[0].attrs, "notes": "\n".join(notes)}
     )

@@ -1,9 +1,9 @@
-"""A command in a process of its own, so that a competitor which ends that process costs its own row alone.
+"""Supervision of a command in a child process, so that a competitor that crashes loses only its own row.
 
-A user's class runs in the process that simulates the world: its processor time is measured as that of all others, and
-nothing is sent anywhere. It can end that process, or never return. So the command forks (on Linux): the child does all
-of the work and reports whose code it runs, and its parent waits. Where the child ends in the code of a user's
-competitor, or hears nothing from it for too long, another child begins again without that one.
+A user's class runs in the process that simulates the world: its processor time is measured as that of all others,
+without messages between processes. It can end that process, or never return. So the command forks (on Linux): the child
+does all of the work and reports which competitor's code it runs, and its parent waits. Where the child ends in the code
+of a user's competitor, or that code takes too long, another child starts again without that competitor.
 """
 
 import os
@@ -19,26 +19,26 @@ from .parallel import end_with
 from .rollout import Progress
 
 POLLING = 0.5
-"""s after which the parent looks whether its child is still there."""
+"""Interval, s, at which the parent checks that its child runs."""
 START_SECONDS = 60.0
-"""s at least that the first measurement may take: what steps the world is compiled before it."""
+"""Least time limit of the first measurement, s: the world's code is compiled before it."""
 STEP = 0.1
-"""s between two reports of a competitor that goes on."""
+"""Time between two reports of a competitor in progress, s."""
 _supervised: frozenset[str] = frozenset()
-"""Names of the competitors of this process that are reported."""
+"""Names of the supervised competitors of this process."""
 _reports = -1
 """Pipe to the parent."""
 
 
 def supervise(names: Collection[str], seconds: float) -> dict[str, str]:
-    """Go on in a child process, and in another one whenever a competitor has ended it.
+    """Continue in a child process, and in another one after a competitor has ended it.
 
     Args:
-        names: of competitors whose classes run in this process.
-        seconds: that one of them may take from one measurement to the next.
+        names: names of the competitors whose classes run in this process.
+        seconds: time limit of a competitor from one measurement to the next.
 
     Returns:
-        Why some of them take no part, by their names: in the child, or in this process where none is left.
+        Reasons why some competitors take no part, by name: in the child, or in this process where none is left.
 
     Raises:
         SystemExit: in the parent, when its child has done the work, with the child's status.
@@ -49,7 +49,7 @@ def supervise(names: Collection[str], seconds: float) -> dict[str, str]:
         return failures
     try:
         sys.stdout.fileno()
-    except (AttributeError, OSError, ValueError):  # a notebook's, which a child cannot write to
+    except (AttributeError, OSError, ValueError):  # a notebook's stream, to which a child cannot write
         return failures
     while left := frozenset(names) - failures.keys():
         sys.stdout.flush()
@@ -68,18 +68,18 @@ def supervise(names: Collection[str], seconds: float) -> dict[str, str]:
 
 
 def is_supervised() -> bool:
-    """Whether a competitor that ends this process costs its own row alone."""
+    """Return whether a competitor that ends this process loses only its own row."""
     return bool(_supervised)
 
 
 @contextmanager
 def running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
-    """Report that the code of a competitor runs; gives the progress that is to be called while it does.
+    """Report to the parent that the code of a competitor runs; yields the progress function to call meanwhile.
 
     Args:
         name: of the competitor.
-        progress: that is called, too.
-        timed: whether it is ended where the progress is not called for too long.
+        progress: a progress function to call as well.
+        timed: whether the competitor is ended if the progress is not called in time.
     """
     tick = progress or (lambda measurements: None)
     if name not in _supervised:
@@ -107,13 +107,13 @@ def _report(line: str) -> None:
 
 
 def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
-    """Wait for the end of a child, and end it where a competitor is late; return in whose code it ended, and how.
+    """Wait for the end of a child, and end it where a competitor is late; return the competitor and the reason.
 
     Raises:
         SystemExit: if it ended elsewhere, with its status.
     """
     running, unread, heard, status, limit = "", b"", time.monotonic(), 0, seconds
-    # Ctrl-C is for the child, and so is a request to end.
+    # Ctrl-C and a termination request are for the child.
     before = {
         signal.SIGINT: signal.signal(signal.SIGINT, signal.SIG_IGN),
         signal.SIGTERM: signal.signal(signal.SIGTERM, lambda number, _: os.kill(child, number)),

@@ -1,7 +1,7 @@
-"""One thread for what libraries would spread over all cores.
+"""Restriction of libraries to one thread.
 
-Matrix products of many small matrices are slower on several threads than on one, most of all where other work needs the
-cores; and how a library shares a product out may change the last bit of it.
+Products of many small matrices are slower on several threads than on one, most of all where other work needs the cores;
+and the division of a product between threads may change its last bit.
 """
 
 import functools
@@ -14,25 +14,25 @@ from contextvars import ContextVar
 from threadpoolctl import ThreadpoolController
 
 SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What libraries read when they are loaded."""
+"""Environment variables that libraries read when they are loaded."""
 _INSIDE = ContextVar("inside", default=False)
-"""Whether whoever runs has one thread already."""
+"""Whether the running context already has one thread."""
 
 
 @functools.lru_cache(1)
 def _controller(modules: int) -> ThreadpoolController:
-    """Return the libraries with threads of their own; a search takes 1.5 ms, so again only where modules were imported.
+    """Return the libraries with threads of their own; a search takes 1.5 ms, so it is repeated only after imports.
 
     Args:
-        modules: how many are imported.
+        modules: number of imported modules.
     """
     return ThreadpoolController()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let BLAS and torch use one thread each, also where they are loaded meanwhile."""
-    if _INSIDE.get():  # to look through the loaded libraries again takes longer than many a piece of work
+    """Restrict BLAS and torch to one thread each, also where they are loaded inside the context."""
+    if _INSIDE.get():  # another search of the loaded libraries takes longer than some pieces of work
         yield
         return
     torch = sys.modules.get("torch")

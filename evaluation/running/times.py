@@ -1,8 +1,9 @@
-"""What competitors take of the processor, as coordinates of an evaluation, and who lies on the front of cost and time.
+"""Processor times of competitors, as coordinates of an evaluation, and the Pareto front of cost and time.
 
 The time of a measurement is that of the simulated world and of the competitor up to its estimate, on one core, of many
-episodes side by side (:func:`.rollout.measure_time`). Tracing, compilation, and what is computed of errors are not in
-it. It differs from run to run: an evaluation holds it only where it is asked for, and is otherwise the same bits.
+episodes side by side (:func:`.rollout.measure_time`). It excludes tracing, compilation, and the computation of errors.
+It differs from run to run: an evaluation contains it only on request; all other results have the same bits in every
+run.
 """
 
 import math
@@ -18,23 +19,23 @@ if TYPE_CHECKING:
 COORDINATES = ("nanoseconds", "compiled")
 """Names of the coordinates over policy."""
 METRIC = "nanoseconds"
-"""Of the records that hold the time."""
+"""Metric of the records with the time."""
 IN_PYTHON, COMPILED, OWN = WAYS = ("python", "compiled", "own")
 """Components of these records; the coordinate ``compiled`` is 0, 1 or 2."""
 PYTHON_MARK, OWN_MARK, FRONT_MARK = "py", "own", "*"
-"""In tables, of times that are mostly Python's, of those of a program alone, and of who lies on the front."""
+"""Marks in tables: times mostly of Python, times of a program alone, and competitors on the front."""
 TIME_TITLE = "ns"
-"""Of the column of times."""
+"""Title of the column of times."""
 TIME_NOTE = (
     f"{TIME_TITLE} is the processor time of a measurement on one core, of simulated world and competitor together. "
     "An asterisk marks the front, where no other ranked competitor has a lower error cost in as much time or less. "
-    f"{PYTHON_MARK} marks competitors that are asked in Python, which takes most of their time."
+    f"{PYTHON_MARK} marks competitors that run in Python, which takes most of their time."
 )
 OWN_NOTE = (
     f"{OWN_MARK} marks programs: the time of their own process, without the world, which is on no front."
 )
 EQUAL_TIMES = 1.1
-"""Ratio up to which two times are taken for the same: so much they differ from run to run."""
+"""Ratio up to which two times count as equal: the difference from run to run."""
 
 
 def with_times(dataset: "xarray.Dataset", times: Sequence[ProcessorTime | None]) -> "xarray.Dataset":
@@ -48,7 +49,7 @@ def with_times(dataset: "xarray.Dataset", times: Sequence[ProcessorTime | None])
 
 
 def way_of(time: ProcessorTime) -> str:
-    """Return which of :data:`WAYS` a time is of."""
+    """Return which of :data:`WAYS` a time belongs to."""
     return OWN if time.own else COMPILED if time.compiled else IN_PYTHON
 
 
@@ -61,17 +62,17 @@ def time_of(run: "xarray.Dataset") -> ProcessorTime | None:
 
 
 class Point(NamedTuple):
-    """A competitor between what it takes and what it is worth."""
+    """A competitor in the plane of time and cost."""
 
     name: str
     kind: str
     time: ProcessorTime
     cost: float
-    """In whatever unit, of all points the same."""
+    """Cost, in any unit, the same for all points."""
 
 
 def times_of_records(records: Sequence[Any]) -> dict[str, ProcessorTime]:
-    """Times by name, from tidy records of one environment and scenario."""
+    """Return the times by name, from tidy records of one environment and scenario."""
     return {
         r.policy: ProcessorTime(r.value, r.component == COMPILED, r.component == OWN)
         for r in records
@@ -80,11 +81,12 @@ def times_of_records(records: Sequence[Any]) -> dict[str, ProcessorTime]:
 
 
 def points_of_records(records: Sequence[Any]) -> list[Point]:
-    """Points of all competitors whose cost and time are known, but for programs, whose time is without the world; the
-    cost is relative to the paper's algorithm, in %.
+    """Return the points of all competitors with known cost and time, except programs.
+
+    The cost is relative to the paper's algorithm, in %. The time of a program does not include the world.
 
     Args:
-        records: tidy ones of one environment and scenario.
+        records: tidy records of one environment and scenario.
     """
     times = times_of_records(records)
     return [
@@ -96,10 +98,11 @@ def points_of_records(records: Sequence[Any]) -> list[Point]:
 
 
 def front(points: Sequence[Point]) -> list[str]:
-    """Names of the ranked competitors that no other beats in cost and time, the quickest first (Pareto front).
+    """Return the names of the ranked competitors that no other beats in cost and time, the quickest first (Pareto
+    front).
 
-    Whoever takes about as long, within :data:`EQUAL_TIMES`, and costs less beats, too; so noise of the clock puts
-    nobody on the front. Of equal costs it is the quickest, of those that take about as long the first by name.
+    A competitor with a similar time, within :data:`EQUAL_TIMES`, and a lower cost also dominates; so noise of the clock
+    puts no competitor on the front. Of equal costs the quickest is on the front, of similar times the first by name.
     """
     ranked = [point for point in points if point.kind in RANKED and math.isfinite(point.cost)]
     found = [
@@ -120,7 +123,7 @@ def front(points: Sequence[Point]) -> list[str]:
 
 
 def time_text(time: ProcessorTime | None) -> str:
-    """Nanoseconds in two digits, marked where the time is that of Python."""
+    """Return the nanoseconds in two digits, with a mark where the time is that of Python."""
     if time is None or time.nanoseconds <= 0.0:
         return "-"
     rounded = round(time.nanoseconds, min(1 - math.floor(math.log10(time.nanoseconds)), 0))
@@ -129,10 +132,10 @@ def time_text(time: ProcessorTime | None) -> str:
 
 
 def column_of_times(records: Sequence[Any]) -> dict[str, str]:
-    """Text of a table's column of times by name, with a mark for who lies on the front; empty where none is known.
+    """Return the texts of a table's column of times by name, with a mark for the front; empty where no time is known.
 
     Args:
-        records: tidy ones of one environment and scenario.
+        records: tidy records of one environment and scenario.
     """
     on_front = front(points_of_records(records))
     return {

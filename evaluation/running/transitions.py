@@ -1,4 +1,4 @@
-"""What an agent meets in episodes of a policy: observations, actions and rewards, as Gymnasium gives them."""
+"""Transitions in episodes of a policy: observations, actions and rewards, as Gymnasium returns them."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -16,13 +16,13 @@ class Transitions(NamedTuple):
     seed: int
     """``env.reset(seed=...)`` begins the same episode."""
     observations: numpy.ndarray
-    """``(T + 1, fields)``, the last one after the last action, in the type of the observation space."""
+    """Observations, ``(T + 1, fields)``, the last one after the last action, in the type of the observation space."""
     actions: numpy.ndarray
-    """``(T, ...)``, as they were applied: in the action space, and in its type."""
+    """Applied actions, ``(T, ...)``, in the action space and its type."""
     rewards: numpy.ndarray
-    """``(T,)``."""
+    """Rewards, ``(T,)``."""
     truncations: numpy.ndarray
-    """``(T,)``, true at the last decision only; no episode of these environments is terminated."""
+    """Truncations, ``(T,)``, true at the last decision only; no episode of these environments is terminated."""
 
 
 def transitions_of(
@@ -34,27 +34,25 @@ def transitions_of(
 ) -> list[Transitions]:
     """Step a policy through one episode for each seed, side by side in the native vector environment.
 
-    Actions are brought into the action space and its type before they are applied, since that is what an agent that
-    learns from them can do: they may differ from those of an evaluation by rounding.
+    Actions are clipped to the action space and cast to its type before they are applied, as a learning agent must: they
+    may differ from those of an evaluation by rounding.
 
     Args:
         id: environment id.
-        policy: made for it; its ``keywords`` make the environment.
+        policy: policy made for the environment; its ``keywords`` make the environment.
         seeds: of the episodes.
         tick: called with the number of decisions done.
-        **keywords: further ones of ``gymnasium.make_vec``, such as ``reward`` or ``dtype``.
+        **keywords: further keywords of ``gymnasium.make_vec``, such as ``reward`` or ``dtype``.
 
     Returns:
-        Of every episode what ``gymnasium.make`` with the same keywords gives, bit for bit.
+        Transitions of every episode, equal to those of ``gymnasium.make`` with the same keywords, bit for bit.
     """
     envs: Any = gymnasium.make_vec(id, num_envs=len(seeds), **policy.keywords, **keywords)
     observation, _ = envs.reset(seed=list(seeds))
     memory = policy.begin(seeds)
     kept: list[list[numpy.ndarray]] = [[observation], [], [], []]
     finished = numpy.zeros(len(seeds), dtype=bool)
-    while (
-        not finished.all()
-    ):  # flights differ in length: those that are finished begin anew, and are cut below
+    while not finished.all():  # flights differ in length: finished ones start again, and are cut below
         action, memory = policy.predict(observation, memory)
         action = member(envs.single_action_space, action)
         observation, reward, _, truncated, _ = envs.step(action)
@@ -72,7 +70,7 @@ def transitions_of(
 
 
 def member(space: gymnasium.Space[Any], action: numpy.ndarray) -> numpy.ndarray:
-    """Return actions of a policy, batch first, as the action space holds them: within its limits, in its type."""
+    """Return actions of a policy, batch first, clipped to the limits of the action space and in its type."""
     if isinstance(space, gymnasium.spaces.Box):
         action = numpy.clip(action, space.low, space.high)
     return numpy.asarray(action).astype(space.dtype)

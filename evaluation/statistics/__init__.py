@@ -1,4 +1,5 @@
-"""What many episodes come to: statistics by blocks of episodes, bootstrap intervals, innovations, causes.
+"""Statistics over episodes: reduction by blocks of episodes, bootstrap intervals, innovations, causes.
 
-Knows ``storage``. Begin with :mod:`.statistic`, which declares what is reduced; :mod:`.bootstrap` gives its interval.
+It imports ``storage``. Begin with :mod:`.statistic`, which declares statistics; :mod:`.bootstrap` computes their
+intervals.
 """

@@ -5,14 +5,13 @@ is a product with it. So one matrix of counts serves every statistic, and those 
 paired. ``scipy.stats.bootstrap`` gives the same intervals (tested) but resamples by index for each statistic,
 which is a hundred times slower here.
 
-Of many episodes that matrix would be the largest thing in memory, so counts are kept, in as few bytes as they need, and
-products are summed over blocks of episodes, always the same ones. Of more than ``SEPARATE`` episodes, groups of
+Of many episodes that matrix would be the largest thing in memory, so only the counts are stored, in as few bytes as
+possible, and products are summed over fixed blocks of episodes. For more than ``SEPARATE`` episodes, groups of
 successive ones are resampled: independent episodes make independent groups, whose mean varies as that of the episodes.
 
-Episodes of one recorded flight are no independent samples of what there is to fly. Where episodes belong to flights,
-whole flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their Application, 1997,
-3.8): the interval then says what other flights of the kind would give. It needs many flights: of fewer than ten it is
-too narrow.
+Episodes of one recorded flight are no independent samples of all flights. Where episodes belong to flights, whole
+flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their Application, 1997, 3.8): the
+interval then covers other flights of the same kind. It requires many flights: with fewer than ten it is too narrow.
 """
 
 import functools
@@ -26,13 +25,13 @@ import numpy
 
 RESAMPLES = 1000
 BLOCK = 2048
-"""Episodes that are weighted at a time."""
+"""Number of episodes that are weighted in one block."""
 SEPARATE = 2**15
-"""Episodes, or groups of them, that are resampled, at most: a byte of each in every resample is kept."""
+"""Maximal number of resampled episodes or groups of them: each takes a byte in every resample."""
 AT_ONCE, SEGMENTS = 32, 64
-"""Resamples in which a quantile is sought at a time, and parts of the order of the values in which it is."""
+"""Number of resamples in one search of quantiles, and number of segments of the sorted values in the search."""
 FEWEST, MEASUREMENTS = 256, 2**20
-"""Episodes that are run at a time, at least, and their measurements."""
+"""Minimal number of episodes in one block of a run, and the number of their measurements."""
 CONFIDENCE = 0.95
 
 
@@ -45,21 +44,23 @@ class IntervalEstimate(NamedTuple):
 
 
 def ratio(sums: numpy.ndarray) -> numpy.ndarray:
-    """First over second of what stands on the second axis, ``(n, 2, ...)``; NaN where the second is zero."""
+    """Return the ratio of the first to the second entry of the second axis, ``(n, 2, ...)``; NaN where the second is
+    zero.
+    """
     first, second = sums[:, 0], sums[:, 1]
     return numpy.divide(first, second, out=numpy.full(first.shape, numpy.nan), where=second > 0.0)
 
 
 def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
-    """Means from what all episodes contribute to :meth:`Bootstrap.sums`; NaN where nobody has a number."""
+    """Return the means from the :meth:`Bootstrap.sums` of all episodes; NaN where no episode has a number."""
     return sums[:, 0] if sums.shape[1] == 1 else ratio(sums)
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
-    """Values and their 95 % percentile intervals; NaN where a resample is not finite, or there is none.
+    """Return the values and their 95 % percentile intervals; NaN where a resample is not finite, or missing.
 
     Args:
-        samples: of the data and of every resample, ``(1 + resamples, ...)``.
+        samples: value of the data and of every resample, ``(1 + resamples, ...)``.
 
     Returns:
         ``(3, ...)``: value, lower and upper end.
@@ -74,28 +75,29 @@ def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
 
 
 def share_interval(share: float, number: int) -> IntervalEstimate:
-    """A share of independent episodes and its 95 % interval, which has a width where none or all are counted, too.
+    """Return a share of independent episodes and its 95 % interval, which has a width also for shares 0 and 1.
 
     Wilson's score interval (E. B. Wilson, Probable inference, the law of succession, and statistical inference, Journal
     of the American Statistical Association 22, 1927): all shares p with ``|share - p| <= z sqrt(p (1 - p) / n)``.
 
     Args:
-        share: that was counted.
-        number: of episodes.
+        share: the observed share.
+        number: number of episodes.
     """
     z = statistics.NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
     middle = (share + 0.5 * z * z / number) / (1.0 + z * z / number)
     half = z / (1.0 + z * z / number) * math.sqrt(share * (1.0 - share) / number + (0.5 * z / number) ** 2)
-    # The ends are exact there but for rounding.
+    # The ends are exact there except for rounding.
     low, high = 0.0 if share == 0.0 else middle - half, 1.0 if share == 1.0 else middle + half
     return IntervalEstimate(share, low, high)
 
 
 def block_of(times: int) -> int:
-    """Return how many episodes are run, and reduced, at a time: enough to be fast, few enough to stay in memory.
+    """Return the number of episodes that are run and reduced in one block: enough to be fast, few enough for the
+    memory.
 
     Args:
-        times: measurements of an episode.
+        times: number of measurements of an episode.
     """
     return min(BLOCK, max(FEWEST, MEASUREMENTS // times))
 
@@ -104,11 +106,11 @@ class Bootstrap:
     """Resampling of M episodes, the same for every statistic.
 
     Args:
-        episodes: M.
+        episodes: number of episodes M.
         resamples: number of bootstrap samples.
-        seed: of the resampling; fixed, so that a table can be made again.
-        clusters: what each episode belongs to, ``(episodes,)``; whole clusters are resampled then, unless all episodes
-            are of one. Values may be NaN then where an episode is over, and means are of those that are there.
+        seed: seed of the resampling; fixed, so that a table can be reproduced.
+        clusters: cluster of each episode, ``(episodes,)``; whole clusters are resampled then, unless there is only one.
+            Values may then be NaN after the end of an episode, and means leave NaN out.
     """
 
     def __init__(
@@ -118,7 +120,7 @@ class Bootstrap:
         generator = numpy.random.default_rng(seed)
         self.ragged: bool = clusters is not None
         self._group = 1 if self.ragged else -(-episodes // SEPARATE)
-        """Successive episodes that are resampled together."""
+        """Number of successive episodes that are resampled together."""
         self._clusters = None
         number = -(-episodes // self._group)
         if clusters is not None and len(set(clusters)) > 1:
@@ -126,23 +128,23 @@ class Bootstrap:
             number = int(self._clusters.max()) + 1
         counts = numpy.ones((1 + resamples, number), dtype=numpy.uint8)
         even = numpy.full(number, 1.0 / number)
-        for first in range(1, 1 + resamples, 100):  # as one draw, never all of them in 64 bits
+        for first in range(1, 1 + resamples, 100):  # as one draw, without an array of all in 64 bits
             drawn = generator.multinomial(number, even, size=min(100, 1 + resamples - first))
             if drawn.max() > numpy.iinfo(counts.dtype).max:
                 counts = counts.astype(numpy.min_scalar_type(int(drawn.max())))
             counts[first : first + len(drawn)] = drawn
         self._counts = counts
-        """Of every cluster, group or episode in the data and in every resample."""
-        # Clusters may differ in size: the mean is over the episodes of those that were drawn.
+        """Counts of every cluster, group or episode in the data and in every resample."""
+        # Clusters may differ in size: the mean is over the episodes of the drawn clusters.
         self.totals: numpy.ndarray = self._weigh(numpy.bincount(self._resampled(numpy.arange(episodes))))
         self._last: tuple[slice, numpy.ndarray] | None = None
 
     def _resampled(self, episodes: numpy.ndarray) -> numpy.ndarray:
-        """Number of the cluster or group with which each of these episodes is resampled."""
+        """Return the number of the cluster or group with which each of these episodes is resampled."""
         return episodes // self._group if self._clusters is None else self._clusters[episodes]
 
     def _weigh(self, numbers: numpy.ndarray) -> numpy.ndarray:
-        """Sum of whole numbers ``(clusters, ...)`` in every resample, ``(1 + resamples, ...)``; exact."""
+        """Return the exact sum of whole numbers ``(clusters, ...)`` in every resample, ``(1 + resamples, ...)``."""
         numbers = numbers.astype(float)
         parts = (self._counts[i : i + AT_ONCE] for i in range(0, len(self._counts), AT_ONCE))
         return numpy.concatenate([part.astype(float) @ numbers for part in parts])
@@ -153,9 +155,11 @@ class Bootstrap:
         return self._counts[:, self._resampled(numpy.arange(self.episodes))] / self.totals[:, None]
 
     def weights_of(self, some: slice) -> numpy.ndarray:
-        """Share of some episodes, or of those of some groups, ``(1 + resamples, some)``; the last ones are kept."""
+        """Return the shares of some episodes, or of those of some groups, ``(1 + resamples, some)``; the last are
+        cached.
+        """
         if self._last is None or self._last[0] != some:
-            self._last = None  # two blocks of weights are never held
+            self._last = None  # so that only one block of weights is in memory
             which = some if self._clusters is None else self._clusters[some]
             self._last = some, self._counts[:, which] / self.totals[:, None]
         return self._last[1]
@@ -163,16 +167,16 @@ class Bootstrap:
     def sums(
         self, values: Sequence[numpy.ndarray], first: int = 0, resamples: int | None = None
     ) -> list[numpy.ndarray]:
-        """Add up what some episodes contribute to means, with one matrix product for all arrays.
+        """Sum the contributions of some episodes to means, with one matrix product for all arrays.
 
         Args:
             values: arrays ``(some, ...)`` of the same episodes, at most ``BLOCK``.
-            first: number of the first of them.
-            resamples: only the first ones, which are those of a bootstrap of no more; None: all.
+            first: number of the first episode.
+            resamples: number of first resamples, equal to those of a bootstrap with fewer; None: all.
 
         Returns:
-            Of each array the weighted sums, ``(1 + resamples, 1, ...)``; of ragged episodes of the values that are
-            there and of their weights, ``(1 + resamples, 2, ...)``.
+            Weighted sums of each array, ``(1 + resamples, 1, ...)``; for ragged episodes the sums of the values without
+            NaN and of their weights, ``(1 + resamples, 2, ...)``.
         """
         some = len(values[0])
         flat = numpy.concatenate([each.reshape(some, -1) for each in values], axis=1, dtype=float)
@@ -195,7 +199,7 @@ class Bootstrap:
         ]
 
     def means(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Means over the episodes and over every resample of them.
+        """Return the means over the episodes and over every resample of them.
 
         Args:
             values: ``(episodes, ...)``.
@@ -206,21 +210,22 @@ class Bootstrap:
         return self.means_of(lambda part: values[part])
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Means as of :meth:`means`, of values that are made for some episodes at a time."""
+        """Return the means over the episodes and over every resample, of values that a function computes in blocks."""
         parts = (self.sums([values(slice(i, i + BLOCK))], i)[0] for i in range(0, self.episodes, BLOCK))
         return mean_of_sums(functools.reduce(operator.add, parts))
 
     def quantiles(
         self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
     ) -> numpy.ndarray:
-        """Quantiles over the episodes and over every resample of them, ``(1 + resamples,)``.
+        """Return the quantiles over the episodes and over every resample of them, ``(1 + resamples,)``.
 
-        The smallest value that at least that share of the weight does not exceed; NaN where nobody is chosen.
+        A quantile is the smallest value that at least that share of the weight does not exceed; NaN without chosen
+        episodes.
 
         Args:
             values: one for each episode, ``(episodes,)``.
-            share: such as 0.5 for the median.
-            chosen: which episodes count, ``(episodes,)`` booleans; None: all.
+            share: share, such as 0.5 for the median.
+            chosen: true for episodes that count, ``(episodes,)`` booleans; None: all.
         """
         which = numpy.arange(len(values)) if chosen is None else numpy.flatnonzero(chosen)
         found = numpy.full(len(self._counts), numpy.nan)
@@ -228,12 +233,12 @@ class Bootstrap:
             return found
         order = which[numpy.argsort(values[which])]
         ordered, owners = values[order], self._resampled(order)
-        # The segment first in which the quantile is, then its place there.
+        # First the segment of the quantile, then its place there.
         length = -(-len(order) // SEGMENTS)
         cells = owners * SEGMENTS + numpy.arange(len(order)) // length
         numbers = numpy.bincount(cells, minlength=self._counts.shape[1] * SEGMENTS)
         sums = numpy.cumsum(self._weigh(numbers.reshape(-1, SEGMENTS)), axis=1)
-        # Rounding must not move a share that is met exactly.
+        # Rounding must not move a share that is reached exactly.
         needed = share * sums[:, -1:] * (1.0 - 1e-9)
         segment = (sums >= needed).argmax(axis=1)
         before = numpy.where(segment > 0, sums[numpy.arange(len(sums)), segment - 1], 0.0)
@@ -248,21 +253,25 @@ class Bootstrap:
         return found
 
     def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
-        """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``; none of one episode."""
+        """Return the percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``; none for one
+        episode.
+        """
         if self._counts.shape[1] == 1:
             statistics = statistics[:1]
         return IntervalEstimate(*percentile_interval(statistics).tolist())
 
     def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
-        """Paired relative difference of means to those of another competitor, both from :meth:`means`."""
+        """Return the paired relative difference of means to those of another competitor, both from :meth:`means`."""
         return self.interval(means / others - 1.0)
 
     def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
-        """Geometric mean of the ratios of two competitors' costs in every episode, ``(episodes,)``, less one."""
+        """Return the geometric mean of the ratios of two competitors' costs in every episode, ``(episodes,)``, less
+        one.
+        """
         return self.estimate(numpy.log(costs / others), numpy.expm1)
 
     def estimate(
         self, values: numpy.ndarray, of_means: Callable[[numpy.ndarray], numpy.ndarray] = lambda m: m
     ) -> IntervalEstimate:
-        """Interval of a function of the means of ``values`` over the episodes."""
+        """Return the interval of a function of the means of ``values`` over the episodes."""
         return self.interval(of_means(self.means(values)))

@@ -1,8 +1,8 @@
-"""Cost and consistency of a competitor split by cause: how much of them falls in turns, at the start, on outliers.
+"""Cost and consistency of a competitor split by cause, such as turns, the start or outliers.
 
-Causes are those that the environment declares (:mod:`.envs.causes`), the start of the track, and what remains:
-``other`` holds where no cause does. They may hold together, so shares need not add up to one. Whatever is compared is
-paired: both competitors have their means from the same resamples of the episodes.
+Causes are those that the environment declares (:mod:`.envs.causes`), the start of the track, and ``other``, which holds
+where no other cause does. Several may hold together, so shares need not add up to one. Comparisons are paired: the
+means of both competitors come from the same resamples of the episodes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     import xarray
 
 EVERYTHING, START, OTHER = RESERVED
-"""Names of the whole, in the place of a cause, and of the causes that every evaluation adds."""
+"""Name of the whole, in place of a cause, and names of the causes that every evaluation adds."""
 CAUSE_METRICS = "cause_"
-"""Begins the names of metrics by cause."""
+"""Prefix of the names of metrics by cause."""
 VARIABLE = "causes"
-"""Of an evaluation: which causes hold, see :func:`.envs.causes.cause_number`."""
+"""Variable of an evaluation: causes that hold, see :func:`.envs.causes.cause_number`."""
 COUNT, COST, NEES, JUDGED = range(4)
-"""What is summed where a cause holds: one, the cost, the NEES over its dimension, and one where there is a NEES."""
+"""Columns of the sums where a cause holds: one, the cost, the NEES over its dimension, and one where there is a
+NEES."""
 
 
 class CauseMeasure(NamedTuple):
@@ -34,25 +35,25 @@ class CauseMeasure(NamedTuple):
     cause: str
     estimate: IntervalEstimate
     opponent: str = ""
-    """With whom it is compared."""
+    """Competitor with which it is compared."""
 
 
 class CauseCosts(NamedTuple):
     """Mean cost of a measurement under each cause, in the data and in every resample."""
 
     names: list[str]
-    """Of the causes, those that never hold left out; first ``EVERYTHING``."""
+    """Names of the causes without those that never hold; first ``EVERYTHING``."""
     means: numpy.ndarray
-    """``(1 + resamples, causes)``."""
+    """Mean costs, ``(1 + resamples, causes)``."""
 
     def of(self, cause: str) -> numpy.ndarray:
-        """Return those under a cause, ``(1 + resamples,)``."""
+        """Return the mean costs under a cause, ``(1 + resamples,)``."""
         found: numpy.ndarray = self.means[:, self.names.index(cause)]
         return found
 
 
 def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Return what says when each cause of an evaluation holds, by name; nothing where it holds no causes."""
+    """Return a phrase for each cause of an evaluation, by name; empty for an evaluation without causes."""
     if "cause" not in dataset.coords:
         return {}
     declared = zip(dataset["cause"].values.tolist(), dataset["cause_phrase"].values.tolist(), strict=True)
@@ -64,7 +65,7 @@ def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
     """Yield every cause and whether it holds at each measurement, booleans ``(episodes, time)``; the whole first.
 
     Args:
-        run: one policy's part of an evaluation that holds causes.
+        run: one competitor's part of an evaluation with causes.
     """
     numbers = numpy.nan_to_num(run[VARIABLE].values).astype(numpy.int64)
     yield EVERYTHING, numpy.ones(numbers.shape, dtype=bool)
@@ -79,12 +80,12 @@ def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
 def cause_sums(
     run: "xarray.Dataset", nees: numpy.ndarray | None, units: TimeUnits | None = None
 ) -> numpy.ndarray:
-    """Sum what is split over the measurements in which each cause holds.
+    """Return the sums over the measurements in which each cause holds.
 
     Args:
-        run: one policy's part of some episodes.
-        nees: over its dimension, ``(episodes, time)``, NaN where there is none; None where nobody says it.
-        units: of time of one episode, which stand in the place of episodes; None: episodes.
+        run: one competitor's part of some episodes.
+        nees: NEES over its dimension, ``(episodes, time)``, NaN where there is none; None without NEES.
+        units: units of time of one episode, which take the place of episodes; None: episodes.
 
     Returns:
         ``(episodes, causes, 4)``, in the order of :func:`held_causes`.
@@ -108,12 +109,12 @@ def split(
 
     Args:
         sums: means over the episodes of :func:`cause_sums`, ``(1 + resamples, causes, 4)``.
-        run: of whose variables none is needed.
-        bootstrap: over the episodes.
+        run: its part of an evaluation, of which only coordinates and attributes are needed.
+        bootstrap: bootstrap over the episodes.
 
     Returns:
         For every cause ``cause_measurement_share``, ``cause_cost_share``, ``cause_cost`` (mean cost of a measurement)
-        and ``cause_anees`` (mean NEES over its dimension), with intervals; and the costs, to be compared.
+        and ``cause_anees`` (mean NEES over its dimension), with intervals; and the costs, for comparisons.
     """
     names = [EVERYTHING, *run["cause"].values.tolist(), START, OTHER]
     measures, present, costs = [], [], []
@@ -134,17 +135,17 @@ def split(
 
 
 def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -> numpy.ndarray:
-    """Weigh causes by how much of the cost falls under them, and how much dearer a measurement is there.
+    """Return weights of causes by their share of the cost and their mean cost of a measurement.
 
-    The share of the cost times the logarithm of the mean cost under the cause over that of all measurements: much cost
-    in few measurements weighs most, a cause that holds nearly always little.
+    A weight is the share of the cost times the logarithm of the mean cost under the cause over that of all
+    measurements. A large cost in few measurements has the largest weight, a cause that nearly always holds a small one.
 
     Args:
-        cost_share: of the whole cost, of any shape.
-        measurement_share: of all measurements, likewise.
+        cost_share: share of the whole cost, of any shape.
+        measurement_share: share of all measurements, of the same shape.
 
     Returns:
-        Weights of that shape; zero where no cost falls.
+        Weights of that shape; zero where there is no cost.
     """
     some = (cost_share > 0.0) & (measurement_share > 0.0)
     dearer = numpy.divide(cost_share, measurement_share, out=numpy.ones_like(cost_share), where=some)
@@ -152,12 +153,12 @@ def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -
 
 
 def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) -> str:
-    """Return with whom a competitor is compared: the cheapest other one that is ranked; empty where there is nobody.
+    """Return the opponent of a competitor: the ranked one with the lowest cost among the others; empty without one.
 
     Args:
-        name: of the competitor.
+        name: name of the competitor.
         costs: mean costs by name.
-        ranked: names of those that are ranked; of the others one is taken where no ranked one is left.
+        ranked: names of the ranked competitors; the opponent is an unranked one where there is no other ranked one.
     """
     others = [other for other in costs if other != name]
     return min([other for other in others if other in ranked] or others, key=costs.__getitem__, default="")
@@ -166,7 +167,7 @@ def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) ->
 def compare(
     own: CauseCosts, other: CauseCosts, opponent: str, bootstrap: Bootstrap
 ) -> Iterator[CauseMeasure]:
-    """Compare the cost under every cause, paired: ``cause_cost_ratio``, that of a competitor over its opponent's."""
+    """Return the paired ratio of a competitor's cost to its opponent's under every cause, ``cause_cost_ratio``."""
     for name in own.names:
         if name in other.names:
             both = numpy.stack([own.of(name), other.of(name)], axis=1)

@@ -1,8 +1,8 @@
-"""Innovations of recorded measurements: measured less predicted, in the sensor's units, of whoever estimates.
+"""Innovations of recorded measurements: measurement minus prediction, in the sensor's units, for every estimator.
 
-What is predicted follows from the estimate after the measurement before, as the log format of the environment says. A
-filter whose model is that of the log has innovations that are white: successive ones are not correlated. Intervals are
-those of :mod:`.predictions`, which one recording has, too.
+The prediction follows from the estimate after the previous measurement, by the log format of the environment. A filter
+with the right model has white innovations: successive ones are not correlated. Intervals are those of
+:mod:`.predictions`, which exist for a single recording, too.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
     """Return an evaluation of a recording with the variable ``prediction_error`` (policy, episode, time, measured).
 
-    NaN where nothing was received, at the first measurement, and of a smoother, which predicts nothing. Where no log
-    format says what an estimate predicts, or no estimates were kept, the evaluation stays as it is.
+    It is NaN for missing measurements, at the first measurement, and for a smoother, which does not predict. Without a
+    log format with predictions, or without estimates, the evaluation is returned unchanged.
 
     Args:
-        dataset: of an evaluation with tracks.
-        task: of the recording.
+        dataset: evaluation with tracks.
+        task: task of the recording.
     """
     log_format = find_companion(task, LogFormat)
     if log_format is None or log_format.predict is None or "estimate" not in dataset:
@@ -50,11 +50,11 @@ def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
 
 
 def received(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
-    """What was measured of what estimates predict, ``(m, episodes, time)``; None where nobody predicts.
+    """Return the measurements that estimates predict, ``(m, episodes, time)``; None without predictions.
 
     Args:
         run: one competitor's part of an evaluation with tracks.
-        task: of the recording.
+        task: task of the recording.
     """
     log_format = find_companion(task, LogFormat)
     if log_format is None or log_format.predict is None or "estimate" not in run:

@@ -1,6 +1,6 @@
-"""How well measurements of a recording were predicted, with intervals that one recording has, too.
+"""Likelihood and correlation of the predicted measurements of a recording, with intervals for a single recording, too.
 
-Neighbouring measurements are not independent: intervals come from resampling whole stretches of them.
+Neighbouring measurements are not independent, so whole stretches of them are resampled for intervals.
 """
 
 import math
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     import xarray
 
 STRETCHES = 30
-"""Into which measurements are cut for intervals, at most; a stretch has at least ``SHORTEST_STRETCH``."""
+"""Maximal number of stretches of measurements for intervals; a stretch has at least ``SHORTEST_STRETCH``."""
 SHORTEST_STRETCH = 8
 UNKNOWN = IntervalEstimate(math.nan, math.nan, math.nan)
 
 
 def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
-    """Correlation of successive prediction errors; zero where they are white.
+    """Return the correlation of successive prediction errors; zero where they are white.
 
     Args:
-        errors: ``(m, episodes, time)``.
-        mask: of the measurements, ``(episodes, time)``.
+        errors: prediction errors, ``(m, episodes, time)``.
+        mask: true for measurements that count, ``(episodes, time)``.
     """
     before = numpy.roll(errors, 1, axis=2)
     before[:, :, 0] = math.nan
@@ -37,12 +37,13 @@ def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
 def stretch_interval(
     mask: numpy.ndarray, values: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
 ) -> IntervalEstimate:
-    """Value and 95 % interval of a function of two means over measurements, by resampling stretches of them.
+    """Return the value and 95 % interval of a function of two means over measurements, by resampling stretches of
+    them.
 
     Args:
-        mask: of the measurements, ``(episodes, time)``.
+        mask: true for measurements that count, ``(episodes, time)``.
         values: ``(episodes, time, 2)``; a measurement with a NaN is left out.
-        function: of means ``(n, 2)``.
+        function: function of means ``(n, 2)``.
     """
     there = mask & numpy.isfinite(values).all(axis=-1)
     stretch = stretches_of(mask)
@@ -54,7 +55,7 @@ def stretch_interval(
 
 
 def stretches_of(mask: numpy.ndarray) -> numpy.ndarray:
-    """Return the number of the stretch of each measurement of a mask, and -1 of the others, ``(episodes, time)``."""
+    """Return the number of the stretch of each measurement of a mask, and -1 for the others, ``(episodes, time)``."""
     total = int(mask.sum())
     stretch = numpy.full(mask.shape, -1, dtype=numpy.int16)
     stretch[mask] = numpy.arange(total) // max(SHORTEST_STRETCH, -(-total // STRETCHES))
@@ -64,12 +65,12 @@ def stretches_of(mask: numpy.ndarray) -> numpy.ndarray:
 def interval_of_sums(
     sums: numpy.ndarray, counts: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
 ) -> IntervalEstimate:
-    """Value and 95 % interval of a function of two means, by resampling stretches.
+    """Return the value and 95 % interval of a function of two means, by resampling stretches.
 
     Args:
-        sums: over each stretch, ``(stretches, 2)``.
-        counts: measurements that were added up in each; a stretch without any is left out.
-        function: of means ``(n, 2)``.
+        sums: sums over each stretch, ``(stretches, 2)``.
+        counts: number of measurements in each stretch; a stretch without any is left out.
+        function: function of means ``(n, 2)``.
     """
     sums = sums[counts > 0]
     if not len(sums):
@@ -81,22 +82,22 @@ def interval_of_sums(
 
 
 class LikelihoodSums(NamedTuple):
-    """Log-likelihoods of one competitor, added up over stretches of all measurements."""
+    """Log-likelihoods of one competitor, summed over stretches of all measurements."""
 
     sums: numpy.ndarray
     counts: numpy.ndarray
-    """How many were added up in each."""
+    """Number of measurements in each stretch."""
     known: int
-    """Checksum of which measurements have one."""
+    """Checksum of the mask of measurements with a log-likelihood."""
 
     @property
     def mean(self) -> float:
-        """Of a measurement."""
+        """Mean log-likelihood of a measurement."""
         return float(self.sums.sum() / self.counts.sum())
 
 
 def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
-    """Add up one competitor's log-likelihoods; None where it has none.
+    """Return the sums of one competitor's log-likelihoods; None where it has none.
 
     Args:
         run: its part of an evaluation.
@@ -115,9 +116,9 @@ def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
 
 
 def likelihood_differences(found: Mapping[str, LikelihoodSums]) -> dict[str, IntervalEstimate]:
-    """Log-likelihood per measurement less that of the best, by name.
+    """Return the log-likelihood per measurement less that of the best, by name.
 
-    The interval is paired; there is none where both are known of different measurements.
+    The interval is paired; there is none where the two have log-likelihoods of different measurements.
     """
     if not found:
         return {}

@@ -1,9 +1,10 @@
 """Statistics of the episodes of one competitor: declared once, reduced block by block of episodes by one engine.
 
-Records, curves and the metrics of an environment are made of means over episodes, of which every bootstrap resample has
-its own, and of samples: values kept of every episode, as quantiles need them. A :class:`Statistic` declares what an
-episode contributes and what follows from all of them; :func:`reduce_run` reduces some episodes to a :class:`Reduction`,
-with one matrix product for all means of a block, and reductions are merged in the order of the episodes.
+Records, curves and the metrics of an environment are computed from means over episodes, one for every bootstrap
+resample, and from samples: values of every episode, as quantiles require. A :class:`Statistic` declares the
+contribution of an episode and the function of all contributions; :func:`reduce_run` reduces some episodes to a
+:class:`Reduction`, with one matrix product for all means of a block, and reductions are merged in the order of the
+episodes.
 """
 
 import functools
@@ -21,51 +22,51 @@ if TYPE_CHECKING:
     import xarray
 
 ALL = sys.maxsize
-"""Sample of all episodes."""
+"""Value of ``sample`` for all episodes."""
 COLUMNS = 512
-"""Columns of one matrix product, about: enough to be fast, few enough to stay in memory."""
+"""Approximate number of columns of one matrix product: enough to be fast, few enough for the memory."""
 
 Key = tuple[str, ...]
 Function = Callable[[numpy.ndarray], Any]
 
 
 def identity(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the means, or the sample, as they are."""
+    """Return the means, or the sample, unchanged."""
     return values
 
 
 class Statistic(NamedTuple):
-    """A statistic before it is reduced: what each of some episodes contributes."""
+    """A statistic before its reduction: the contributions of some episodes."""
 
     key: Key
     values: numpy.ndarray
-    """``(episodes, ...)``."""
+    """Contributions, ``(episodes, ...)``."""
     function: Function = identity
-    """From the means, ``(1 + resamples, ...)``, or from the sample, ``(episodes, ...)``, to the statistic."""
+    """Function from the means, ``(1 + resamples, ...)``, or the sample, ``(episodes, ...)``, to the statistic."""
     resamples: int | None = None
-    """Resamples that have a mean of their own; None: those of the bootstrap."""
+    """Number of resamples with a mean; None: those of the bootstrap."""
     sample: int = 0
-    """Number of the first episodes whose values are kept, in place of means of all; zero: means."""
+    """Number of first episodes whose values are stored, in place of means of all; zero: means."""
     optional: bool = False
-    """A block that lacks it adds nothing to its means; otherwise it is then known of no episode."""
+    """Whether a block without it adds nothing to the means; otherwise it then exists for no episode."""
     of_units: Callable[[TimeUnits], numpy.ndarray] | None = None
-    """What each unit of time contributes where one episode is resampled over time, ``(units, ...)``: as an episode
-    does, or of a mean its sum and how many numbers; None: it is one number of the whole episode."""
+    """Contribution of each unit of time where one episode is resampled over time, ``(units, ...)``: that of an episode,
+    or for a mean the sum and the number of terms; None: it is one number of the whole episode."""
 
 
 class Reduction(NamedTuple):
-    """What some episodes of one competitor contribute to its statistics."""
+    """Contributions of some episodes of one competitor to its statistics."""
 
     functions: dict[Key, Function]
     sums: dict[Key, numpy.ndarray]
-    """As of :meth:`.bootstrap.Bootstrap.sums`."""
+    """Weighted sums, from :meth:`.bootstrap.Bootstrap.sums`."""
     samples: dict[Key, list[numpy.ndarray]]
-    """``(episodes, ...)``, piece by piece."""
+    """Samples, ``(episodes, ...)``, as a list of pieces."""
     optional: set[Key]
     of_units: dict[Key, numpy.ndarray]
-    """Of one episode what its units of time contribute, where a statistic can be resampled over time."""
+    """Contributions of the units of time of one episode, for statistics that can be resampled over time."""
     known: dict[Key, Any]
-    """Of one episode statistics that cannot."""
+    """Other statistics of one episode."""
 
     def merge(self, later: "Reduction") -> "Reduction":
         """Add the episodes that come next."""
@@ -76,10 +77,10 @@ class Reduction(NamedTuple):
         return Reduction(self.functions | later.functions, sums, samples, optional, {}, {})
 
     def results(self, blocks: BlockBootstrap | None = None) -> dict[Key, Any]:
-        """Return every statistic of all episodes; once, since samples are given away.
+        """Return every statistic of all episodes; only once, since it empties the samples.
 
         Args:
-            blocks: of one episode, over whose units it was reduced.
+            blocks: for one episode, the bootstrap over its units.
         """
         found = {}
         for key, function in self.functions.items():
@@ -89,7 +90,7 @@ class Reduction(NamedTuple):
                 found[key] = function(mean_of_sums(self.sums[key]))
             elif key in self.samples:
                 values = numpy.concatenate(self.samples[key])
-                self.samples[key].clear()  # so that little is held twice
+                self.samples[key].clear()  # so that memory does not contain them twice
                 if blocks is not None and key in self.of_units:
                     values = blocks.resample(values, self.of_units[key])
                 found[key] = function(values)
@@ -105,9 +106,9 @@ def reduce_run(
     """Reduce some episodes of one competitor.
 
     Args:
-        run: one policy's part of an evaluation.
-        declare: from a block of its episodes to their statistics.
-        bootstrap: over the episodes of the whole evaluation; of one episode its units of time.
+        run: one competitor's part of an evaluation.
+        declare: function from a block of its episodes to their statistics.
+        bootstrap: bootstrap over the episodes of the whole evaluation; for one episode its units of time.
         first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
     """
     block = block_of(run.sizes["time"])
@@ -132,11 +133,11 @@ def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap | TimeUn
                 yield s
             elif s.of_units is not None:
                 found.samples[s.key], found.of_units[s.key] = [s.values], s.of_units(bootstrap)
-            else:  # at once, since it may hold every measurement
+            else:  # at once, since it may contain every measurement
                 found.known[s.key] = s.function(s.values)
 
     def product(s: Statistic) -> tuple[int | None, int]:
-        """Tell the matrix products apart."""
+        """Return the key of a statistic's matrix product."""
         nonlocal columns
         columns += s.values[0].size
         return s.resamples, columns // COLUMNS

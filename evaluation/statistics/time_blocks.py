@@ -1,18 +1,18 @@
-"""Intervals of one episode: blocks of successive measurements are resampled, as there are no other episodes.
+"""Intervals of one episode by resampling blocks of successive measurements, since there are no other episodes.
 
 A circular block bootstrap (Politis and Romano: A circular block-resampling procedure for stationary data, in LePage and
-Billard, Exploring the Limits of Bootstrap, 1992): a resample is made of blocks that begin anywhere, the last of which
-go on at the start, until they are as long as the episode. The length of the blocks follows from the autocorrelation
+Billard, Exploring the Limits of Bootstrap, 1992): a resample consists of blocks with random beginnings, which wrap
+around at the end, with the total length of the episode. The length of the blocks follows from the autocorrelation
 (Politis and White: Automatic block-length selection for the dependent bootstrap, Econometric Reviews 23, 2004, with the
-correction of Patton, Politis and White, Econometric Reviews 28, 2009). It supposes that what is averaged is stationary.
-Of long episodes blocks begin at every unit of a few measurements, whose sums are all that is kept of the episode.
+correction of Patton, Politis and White, Econometric Reviews 28, 2009). It assumes that the averaged series is
+stationary. In long episodes blocks begin at units of a few measurements, and only the sums of units are stored.
 
-Of an episode of few blocks there is no interval: of a short series the autocorrelation is estimated too small, and
-the interval with it. Of first-order autoregressive processes the 95 % interval covers 90 to 97 % where most series have
+An episode of few blocks has no interval: the estimated autocorrelation of a short series is too small, and so is the
+interval. For first-order autoregressive processes the 95 % interval covers 90 to 97 % where most series have
 ``FEWEST_BLOCKS``, some 200 correlation times, and 34 to 87 % where there are a third. Where few series of a process
-pass, these are the ones whose correlation is estimated too small, and their intervals cover about half.
-Rules for the estimate of a correlation time lie on either side: 50 correlation times (emcee) and 1,000 (Sokal: Monte
-Carlo methods in statistical mechanics, in Functional Integration, 1997, 3).
+pass, these are the ones whose correlation is estimated too small, and their intervals cover about half. Rules for the
+estimate of a correlation time lie on either side: 50 correlation times (emcee) and 1,000 (Sokal: Monte Carlo methods in
+statistical mechanics, in Functional Integration, 1997, 3).
 """
 
 import math
@@ -23,20 +23,20 @@ import numpy
 from .bootstrap import RESAMPLES, Bootstrap, ratio
 
 UNITS = 2048
-"""Places of an episode at which a block may begin, at most."""
+"""Maximal number of places in an episode at which a block may begin."""
 FEWEST, FEWEST_BLOCKS = 16, 50
-"""Measurements of an episode, and blocks, of which there is an interval."""
+"""Minimal numbers of measurements of an episode, and of blocks, for an interval."""
 
 
 class TimeUnits:
-    """An episode cut into units of successive measurements, all that is kept of it.
+    """An episode cut into units of successive measurements.
 
     Args:
-        times: measurements of the episode.
+        times: number of measurements of the episode.
 
     Attributes:
-        unit: measurements of a unit.
-        units: of the episode; the last one may be shorter.
+        unit: number of measurements of a unit.
+        units: number of units of the episode; the last one may be shorter.
     """
 
     def __init__(self, times: int) -> None:
@@ -49,11 +49,11 @@ class TimeUnits:
         return numpy.pad(values, [(0, 0), (0, beyond)]).reshape(len(values), self.units, self.unit)
 
     def sums_of_present(self, values: numpy.ndarray, times: slice = slice(None)) -> numpy.ndarray:
-        """Sum of every unit, and how many numbers there are, ``(units, 2)``.
+        """Return the sum of every unit and the number of terms, ``(units, 2)``.
 
         Args:
             values: ``(1, time)``; NaN stands for no measurement, or no event.
-            times: those that count.
+            times: measurements that count.
         """
         within = numpy.zeros(values.shape, dtype=bool)
         within[:, times] = True
@@ -66,15 +66,15 @@ class BlockBootstrap(Bootstrap):
     """Resampling of blocks of successive measurements of one episode; the rows of :meth:`sums` are its units.
 
     Args:
-        units: of the episode.
-        series: sums of every unit and how many numbers there are, each ``(units, 2)``; the one whose blocks are to be
-            longest decides.
+        units: units of the episode.
+        series: sums of every unit and the numbers of terms, each ``(units, 2)``; the series with the longest blocks
+            determines their length.
         resamples: number of bootstrap samples.
-        seed: of the resampling.
+        seed: seed of the resampling.
 
     Attributes:
-        block: measurements of a block, a multiple of the unit.
-        blocks: how many the episode holds; of fewer than ``FEWEST_BLOCKS`` there are no resamples.
+        block: number of measurements of a block, a multiple of the unit.
+        blocks: number of blocks of the episode; with fewer than ``FEWEST_BLOCKS`` there are no resamples.
     """
 
     def __init__(
@@ -94,11 +94,11 @@ class BlockBootstrap(Bootstrap):
         self.totals = self._counts.sum(axis=1)
 
     def resample(self, values: numpy.ndarray, of_units: numpy.ndarray) -> numpy.ndarray:
-        """Mean over the episode and over every resample of its blocks, ``(1 + resamples, ...)``.
+        """Return the mean over the episode and over every resample of its blocks, ``(1 + resamples, ...)``.
 
         Args:
-            values: of the episode, ``(1, ...)``.
-            of_units: what each unit contributes, as :attr:`.statistic.Statistic.of_units` has it.
+            values: values of the episode, ``(1, ...)``.
+            of_units: contribution of each unit, see :attr:`.statistic.Statistic.of_units`.
         """
         (means,) = self.sums([of_units])
         found = means[:, 0] if values.ndim > 1 else ratio(means[:, 0])
@@ -106,37 +106,37 @@ class BlockBootstrap(Bootstrap):
         return found
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Values of the episode, as their means; NaN in every resample."""
+        """Return the values of the episode, as their means; NaN in every resample."""
         own = values(slice(0, 1))
         return numpy.concatenate([own, numpy.full((len(self._counts) - 1, *own.shape[1:]), math.nan)])
 
     def quantiles(
         self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
     ) -> numpy.ndarray:
-        """Value of the episode, as any quantile; NaN in every resample."""
+        """Return the value of the episode, as any quantile; NaN in every resample."""
         return self.means(values if chosen is None else numpy.where(chosen, values, math.nan))
 
     @property
     def sentence(self) -> str:
-        """What the intervals are, or why there are none."""
+        """Return a sentence on the intervals, or on the reason why there are none."""
         blocks = f"blocks of {self.block:,} measurements, by the rule of Politis and White (2004)"
         rule = f"{blocks} from the autocorrelation"
         if self.blocks < FEWEST_BLOCKS:
             return (
-                f"This one episode has no intervals: it holds {self.blocks:.0f} {rule}, and of fewer than "
+                f"This one episode has no intervals: it contains {self.blocks:.0f} {rule}, and of fewer than "
                 f"{FEWEST_BLOCKS} intervals over time are too narrow."
             )
         return (
-            "Of one episode intervals are over time: those of a circular block bootstrap (Politis and Romano, 1992) of "
-            f"{rule}; what is one number of the whole episode has none."
+            "The intervals of one episode are over time: those of a circular block bootstrap (Politis and Romano, "
+            f"1992) of {rule}; a statistic that is one number of the whole episode has none."
         )
 
 
 def block_length(series: numpy.ndarray) -> int:
-    """Length of the blocks of a circular block bootstrap of the mean, by the rule of Politis and White.
+    """Return the length of the blocks of a circular block bootstrap of the mean, by the rule of Politis and White.
 
     Args:
-        series: ``(n,)``; NaN, which is not known, adds nothing to an autocovariance.
+        series: values, ``(n,)``; NaN adds nothing to an autocovariance.
     """
     n, known = len(series), ~numpy.isnan(series)
     centred = numpy.where(known, series - (series[known].mean() if known.any() else 0.0), 0.0)
@@ -146,7 +146,7 @@ def block_length(series: numpy.ndarray) -> int:
     covariance = numpy.fft.irfft(numpy.abs(numpy.fft.rfft(centred, size)) ** 2, size)[: most + 1] / n
     if covariance[0] <= 0.0:
         return 1
-    # Lags after which so many autocorrelations in a row are no larger than noise.
+    # Lags followed by so many successive autocorrelations below the noise level.
     large = numpy.abs(covariance[1:]) >= 2.0 * math.sqrt(math.log10(n) / n) * covariance[0]
     runs = numpy.convolve(large, numpy.ones(quiet), "valid") if len(large) >= quiet else numpy.ones(1)
     last = int(runs.argmin()) if runs.min() < 0.5 else int(numpy.flatnonzero(large).max(initial=0)) + 1
@@ -156,7 +156,7 @@ def block_length(series: numpy.ndarray) -> int:
     slope, spectrum = 2.0 * (k * taper).sum(), covariance[0] + 2.0 * taper.sum()
     if (
         spectrum <= 0.0
-    ):  # as of what alternates: a mean of any block varies less than one of as many independent ones
+    ):  # as in an alternating series: the mean of a block varies less than that of independent values
         return 1
     length = (1.5 * (slope / spectrum) ** 2 * n) ** (1.0 / 3.0)
     return int(min(max(1, math.ceil(length)), math.ceil(min(3.0 * math.sqrt(n), n / 3.0))))

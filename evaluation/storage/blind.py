@@ -1,4 +1,4 @@
-"""A recording without its truth, in files that any program reads: what competes by a file of estimates is given."""
+"""A recording without its truth, in files that any program reads, as input of programs that write estimates."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -18,17 +18,18 @@ def write_blind(folder: Path, recording: Recording, task: Task) -> None:
     """Write the measurements of a recording and the initial estimates, without the truth.
 
     ``measurements.csv`` has a row for each measurement: ``track``, ``measurement`` from 1 on, ``seconds`` since the
-    start of the track, and the numbers of every field, ``position_1``, ``position_2`` and so on; what was not received
-    is empty. ``start.csv`` has a row for each track: ``mean_X`` and ``covariance_X_Y`` of the components, and what
-    else everyone is told. ``measurements.nc`` holds both. Numbers are written in full. No file names the seed.
+    start of the track, and the numbers of every field, ``position_1``, ``position_2`` and so on; missing measurements
+    are empty. ``start.csv`` has a row for each track: ``mean_X`` and ``covariance_X_Y`` of the components, and the
+    other values given to every filter. ``measurements.nc`` contains both. Numbers have all digits. No file contains the
+    seed.
 
     Args:
-        folder: for the files.
-        recording: of episodes numbered from 0 on.
-        task: of the simulation, on NumPy arrays.
+        folder: folder for the files.
+        recording: recording of episodes numbered from 0 on.
+        task: task of the simulation, on NumPy arrays.
 
     Raises:
-        ValueError: if they cannot be written, or the episodes fly flights, of which an evaluation takes others.
+        ValueError: if they cannot be written, or the episodes fly flights, since an evaluation selects other ones.
     """
     import pandas
 
@@ -58,12 +59,12 @@ def write_blind(folder: Path, recording: Recording, task: Task) -> None:
     with whole_files(folder) as waiting:
         pandas.DataFrame(rows).to_csv(waiting / MEASUREMENTS, index=False)
         pandas.DataFrame(start).to_csv(waiting / START, index=False)
-        # The source of a simulated recording names its seed, from which anyone can simulate the truth.
+        # The source of a simulated recording contains its seed, from which the truth can be simulated.
         source = f"filtergym record {recording.environment} --blind, {recording.name}"
         dataclasses.replace(recording, truth=None, source=source).write(waiting / NETCDF)
 
 
 def _numbered(name: str, values: numpy.ndarray) -> Iterator[tuple[str, numpy.ndarray]]:
-    """Columns of an array ``(..., rows)`` by name, numbered from 1 on where a field has several numbers."""
+    """Return the columns of an array ``(..., rows)`` by name, numbered from 1 on where a field has several numbers."""
     for place in numpy.ndindex(values.shape[:-1]):
         yield "_".join([name, *(str(i + 1) for i in place)]), values[place] * 1

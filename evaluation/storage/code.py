@@ -1,4 +1,4 @@
-"""Which code makes numbers: what is kept of unfinished work is of use to that code only."""
+"""Digest of the code that computes results: stored unfinished work is valid for that code only."""
 
 import functools
 import hashlib
@@ -11,19 +11,19 @@ from platform import python_version
 ROOMS = ("", ".filters", ".compiler", ".envs", ".evaluation", ".baselines", ".agents")
 """Packages below the package."""
 SUFFIXES = frozenset((".py", ".json", ".yml", ".safetensors"))
-"""Of files that numbers depend on."""
+"""Suffixes of files on which results depend."""
 LIBRARIES = ("numpy", "scipy", "xarray", "llvmlite", "torch", "stable-baselines3")
 
 
 def package_folders() -> list[Path]:
-    """Return the folders of the package; of an editable installation those that one works in."""
+    """Return the folders of the package; for an editable installation those of the working copy."""
     package = __name__.partition(".")[0]
     specs = [find_spec(package + room) for room in ROOMS]
     return [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
 
 
 def files_digest(folders: Iterable[Path]) -> str:
-    """Return a digest of names and contents of the files in some folders that numbers depend on."""
+    """Return a digest of names and contents of the files in some folders on which results depend."""
     digest = hashlib.sha256()
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.suffix in SUFFIXES):
@@ -34,7 +34,7 @@ def files_digest(folders: Iterable[Path]) -> str:
 
 
 def library_versions(libraries: Iterable[str]) -> dict[str, str]:
-    """Return the versions of those that are installed, by name."""
+    """Return the versions of the installed ones by name."""
     versions = {}
     for library in libraries:
         try:
@@ -46,9 +46,9 @@ def library_versions(libraries: Iterable[str]) -> dict[str, str]:
 
 @functools.cache
 def code_digest() -> str:
-    """Return a digest of the package's files and of the versions of Python and of what it computes with.
+    """Return a digest of the package's files and of the versions of Python and of numerical libraries.
 
-    A process has one: what is edited later it does not run.
+    It is computed once for a process, which does not run later edits.
     """
     installed = library_versions(LIBRARIES)
     versions = [python_version(), *(installed.get(library, "") for library in LIBRARIES)]

@@ -1,8 +1,8 @@
-"""What an evaluation's dataset says beside its numbers, in a form that every file format can hold.
+"""Coordinates and attributes of an evaluation's dataset, in a form that every file format can store.
 
-NetCDF knows neither dictionaries nor lists nor booleans among attributes, and its classic format, which SciPy writes
-and R and MATLAB open, neither unsigned nor 64-bit integers. So windows and groups stand in coordinates, and what
-remains in words: see the functions of this module for what they mean.
+Attributes of NetCDF cannot be dictionaries, lists or booleans, and its classic format, which SciPy writes and R and
+MATLAB open, has neither unsigned nor 64-bit integers. So windows and groups are coordinates, and other values are text:
+the functions of this module read them.
 """
 
 import json
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import xarray
 
 MOST_BYTES = 2**31 - 1
-"""Of one variable in NetCDF's classic format, as SciPy writes it."""
+"""Maximal bytes of one variable in NetCDF's classic format, as SciPy writes it."""
 MOST_WHOLE = 2**31 - 1
 """Largest whole number of an attribute in NetCDF's classic format."""
 
@@ -33,25 +33,25 @@ FAULTS = (
     "the program answered with what is no estimate",
     "the file holds no more estimates of the track",
 )
-"""Why an estimator loses an episode; ``lost`` holds their numbers from 1 on, and 0 where none is lost."""
+"""Reasons why an estimator loses an episode; ``lost`` contains their numbers from 1 on, and 0 where none is lost."""
 NO_ROW = 1.0 + FAULTS.index("the file holds no more estimates of the track")
-"""Number of that reason."""
+"""Number of the reason that a file has no more estimates."""
 
 
 class Losses(NamedTuple):
     """Episodes that an estimator has lost."""
 
     number: int
-    """How many."""
+    """Number of lost episodes."""
     episode: int
-    """The first of them."""
+    """Number of the first lost episode."""
     measurement: int
-    """At which it was lost."""
+    """Measurement at which it was lost, from 1 on."""
     fault: int
     """Number of the reason among ``FAULTS``, from 1 on."""
 
     def sentence(self, name: str, episodes: int) -> str:
-        """Say how many of the episodes are lost, and why the first is."""
+        """Return a sentence on the number of lost episodes, and the reason of the first."""
         return (
             f"{name}: {self.number} of {episodes} episode{'s' if episodes > 1 else ''} lost: {FAULTS[self.fault - 1]} "
             f"in episode {self.episode} at measurement {self.measurement}; the last valid answer is held from there on"
@@ -59,7 +59,7 @@ class Losses(NamedTuple):
 
 
 def losses_in(run: "xarray.Dataset") -> numpy.ndarray:
-    """Return at which measurement each episode was lost, and why, ``(episodes, 2)``; zeros where it was not.
+    """Return the measurement at which each episode was lost, and the reason, ``(episodes, 2)``; zeros where it was not.
 
     Args:
         run: one policy's part of an evaluation.
@@ -74,7 +74,7 @@ def count_losses(losses: numpy.ndarray) -> Losses | None:
     """Count lost episodes; None if none is.
 
     Args:
-        losses: of all episodes, as :func:`losses_in` returns them.
+        losses: losses of all episodes, as :func:`losses_in` returns them.
     """
     lost = losses[:, 1] > 0.0
     if not lost.any():
@@ -91,41 +91,41 @@ def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
     """
     if any(variable.nbytes > MOST_BYTES for variable in dataset.variables.values()):
         raise ValueError(
-            f"a variable is larger than {MOST_BYTES:,} bytes, what NetCDF's classic format takes"
+            f"a variable is larger than {MOST_BYTES:,} bytes, the limit of NetCDF's classic format"
         )
     with whole_file(path) as partial:
         dataset.to_netcdf(partial, engine="scipy", format="NETCDF3_64BIT")
 
 
 def windows_of(dataset: "xarray.Dataset") -> dict[str, tuple[int, int]]:
-    """Windows by name: first and last measurement of each, both included, from 1 on.
+    """Return the windows by name: first and last measurement of each, both included, from 1 on.
 
     Args:
-        dataset: from an evaluation, as it was or read from a file.
+        dataset: evaluation, in memory or read from a file.
     """
     ends = (dataset[name].values.tolist() for name in ("window", "window_first", "window_last"))
     return {name: (int(first), int(last)) for name, first, last in zip(*ends, strict=True)}
 
 
 def slices_of(dataset: "xarray.Dataset") -> dict[str, slice]:
-    """Windows by name, as parts of the time axis."""
+    """Return the windows by name, as parts of the time axis."""
     return {name: slice(first - 1, last) for name, (first, last) in windows_of(dataset).items()}
 
 
 def with_windows(dataset: "xarray.Dataset", windows: Mapping[str, tuple[int, int]]) -> "xarray.Dataset":
-    """Return a dataset with these windows, in place of those that it has."""
+    """Return a dataset with its windows replaced."""
     dataset = dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore")
     return dataset.assign_coords(window_coords(windows))
 
 
 def window_coords(windows: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return the coordinates that say what the windows are."""
+    """Return the coordinates that describe the windows."""
     first, last = (numpy.array([ends[i] for ends in windows.values()], dtype=numpy.int64) for i in (0, 1))
     return {"window": list(windows), "window_first": ("window", first), "window_last": ("window", last)}
 
 
 def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
-    """Components of every group, such as ``position``, in the order of the components."""
+    """Return the components of every group, such as ``position``, in the order of the components."""
     found: dict[str, list[str]] = {}
     for name, group in zip(
         dataset["component"].values.tolist(), dataset["group"].values.tolist(), strict=True
@@ -136,16 +136,16 @@ def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
 
 
 def keywords_of(dataset: "xarray.Dataset") -> dict[str, Any]:
-    """Parameters of the task that the evaluation was asked for; sequences are lists, as JSON has them.
+    """Return the task parameters of the evaluation; sequences are lists, as in JSON.
 
-    Other objects, of a task of one's own, are text, as Python's ``repr`` shows them.
+    Other objects, of a user's task, are text, as Python's ``repr`` gives them.
     """
     found: dict[str, Any] = json.loads(dataset.attrs["keywords"])
     return found
 
 
 def keywords_as_text(keywords: Mapping[str, Any]) -> str:
-    """Return parameters as a JSON object; what JSON does not know is told as Python's ``repr`` shows it."""
+    """Return parameters as a JSON object; values that JSON does not have are text, as Python's ``repr`` gives them."""
     return json.dumps(keywords, default=_plain)
 
 
@@ -156,17 +156,17 @@ def _plain(value: Any) -> Any:
 
 
 def whole_number(value: int) -> int | str:
-    """Return a whole number for an attribute: in words if NetCDF's classic format has no room for it."""
+    """Return a whole number for an attribute: as text if it is too large for NetCDF's classic format."""
     return value if abs(value) <= MOST_WHOLE else str(value)
 
 
 def seed_of(dataset: "xarray.Dataset") -> int:
-    """Return the number of the experiment."""
+    """Return the seed of the experiment."""
     return int(dataset.attrs["seed"])
 
 
 def notes_of(dataset: "xarray.Dataset") -> list[str]:
-    """What is to be told of the scenario, and of lost episodes, a line each."""
+    """Return notes on the scenario and on lost episodes, one line each."""
     notes = str(dataset.attrs["notes"]).splitlines()
     for name in dataset["policy"].values.tolist() if "lost" in dataset else ():
         if (losses := count_losses(losses_in(dataset.sel(policy=name)))) is not None:

@@ -1,17 +1,17 @@
-"""Estimates that another program has made, read from a file: CSV, NetCDF, or trajectories in the format of the TUM
-RGB-D benchmark.
+"""Estimates of another program, read from a file: CSV, NetCDF, or trajectories in the format of the TUM RGB-D
+benchmark.
 
-A row is an estimate: its track, its time in seconds, the mean of each component, and what is stated of its error. The
+A row is an estimate: its track, its time in seconds, the mean of each component, and optionally its covariance. The
 columns are those that ``filtergym evaluate --estimates`` and the programs of ``filtergym export`` write:
 
     track (or recording, episode)      name of the track; left out where there is one track
     seconds (or time, t), log_time     time of the log, or s since the start of the track; see below
     estimate_X (or mean_X, X)          mean of the component X, in its unit
     sigma_X                            its standard deviation; or
-    covariance_X_Y                     of two components, in either order; zero where a pair is left out
-    log_likelihood, nis, nis_degrees   how well the measurement was predicted
+    covariance_X_Y                     of two components, in either order; zero where a pair is left out log_likelihood,
+    nis, nis_degrees   statistics of the predicted measurement
 
-Times are read as those of a log are: seconds, or a unit that a date since 1970 must have, dates, or times of day.
+Times are read as in a log: seconds, a smaller unit since 1970, dates, or times of day.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,40 +30,40 @@ SECONDS = ("seconds", "time", "t")
 LOG_TIME = "log_time"
 LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 AXES = ("position_x", "position_y", "position_z")
-"""Components of a position, of which a trajectory has two or three."""
+"""Components of a position; a trajectory has the first two or all three."""
 
 
 class EstimateTable(NamedTuple):
     """Estimates of all tracks of a file, R rows of C components."""
 
     track: numpy.ndarray
-    """Name of the track of each row, ``(R,)``; empty words where the file names none."""
+    """Name of the track of each row, ``(R,)``; empty strings where the file names none."""
     time: numpy.ndarray
-    """s by ``clock``, ``(R,)``."""
+    """Time by ``clock``, s, ``(R,)``."""
     clock: str
-    """What the times are: ``dates`` in s since 1970, ``times of day`` since midnight, ``seconds``, or ``log``: seconds
+    """Clock of the times: ``dates`` in s since 1970, ``times of day`` since midnight, ``seconds``, or ``log``: seconds
     of the log."""
     mean: numpy.ndarray
-    """``(C, R)``; NaN of a component that the file does not hold."""
+    """Means, ``(C, R)``; NaN for a component that the file does not contain."""
     known: tuple[bool, ...]
-    """Which components it holds."""
+    """Whether the file contains each component, ``(C,)``."""
     deviations: tuple[bool, ...]
-    """Of which components it says how large the errors are."""
+    """Whether the file contains a variance of each component, ``(C,)``."""
     covariance: numpy.ndarray
-    """``(C, C, R)``; NaN of the other components."""
+    """Covariances, ``(C, C, R)``; NaN for components without."""
     likelihood: Mapping[str, numpy.ndarray]
-    """What it holds of :data:`LIKELIHOOD`, ``(R,)`` each."""
+    """Columns of :data:`LIKELIHOOD` that it contains, ``(R,)`` each."""
 
 
 def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
     """Read the estimates of a file, or of a folder of trajectories.
 
     Args:
-        path: of the file; a folder holds ``NAME.TRACK.tum``, a file for each track.
-        components: names of what is estimated.
+        path: path of the file; a folder contains ``NAME.TRACK.tum``, a file for each track.
+        components: names of the estimated components.
 
     Raises:
-        ValueError: if it cannot be read, holds no estimates, or those of several competitors.
+        ValueError: if it cannot be read, contains no estimates, or those of several competitors.
     """
     try:
         if path.suffix not in SUFFIXES:
@@ -79,12 +79,12 @@ def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
 
 
 def _table_columns(path: Path, components: Sequence[str]) -> dict[str, Any]:
-    """Columns of a table, numbers or words."""
+    """Return the columns of a table, numbers or words."""
     pairs = [f"covariance_{a}_{b}" for a in components for b in components]
     forms = [form + name for name in components for form in ("estimate_", "mean_", "sigma_", "")]
     columns, names, _ = read_table(path, {*TRACK, *SECONDS, LOG_TIME, "policy", *LIKELIHOOD, *forms, *pairs})
     if not len(columns):
-        raise ValueError(f"it holds no rows of known columns; it has {list_names(names) or 'none'}")
+        raise ValueError(f"it contains no rows of known columns; it has {list_names(names) or 'none'}")
     words = (*TRACK, *SECONDS, LOG_TIME, "policy")
     return {
         str(name): values if name in words else numbers(str(name), values).to_numpy()
@@ -93,12 +93,12 @@ def _table_columns(path: Path, components: Sequence[str]) -> dict[str, Any]:
 
 
 def _netcdf_columns(path: Path) -> dict[str, Any]:
-    """The same of the variables of a NetCDF file, over policy, episode, time and component as they are written."""
+    """Return the columns from the variables of a NetCDF file, over policy, episode, time and component."""
     import pandas
 
     with open_netcdf(path, decode_times=False) as data:
         if sum(variable.size for variable in data.variables.values()) > MOST_NUMBERS:
-            raise ValueError(f"it holds more than {MOST_NUMBERS:,} numbers: split it")
+            raise ValueError(f"it contains more than {MOST_NUMBERS:,} numbers: split it")
         if data.sizes.get("policy", 1) > 1:
             raise _several(data["policy"].values.tolist())
         data = data.isel(policy=0) if "policy" in data.dims else data
@@ -131,17 +131,17 @@ def _netcdf_columns(path: Path) -> dict[str, Any]:
                 for j, b in enumerate(names)
             }
         found |= {name: flat(of(name)) for name in LIKELIHOOD if name in data}
-    # Beyond the end of a shorter episode there is neither time nor estimate.
+    # After the end of a shorter episode there is neither time nor estimate.
     there = numpy.isfinite(found["seconds"])
     return {name: values[there] for name, values in found.items()}
 
 
 def _several(names: Sequence[str]) -> ValueError:
-    return ValueError(f"it holds estimates of several competitors, {list_names(names)}: keep those of one")
+    return ValueError(f"it contains estimates of several competitors, {list_names(names)}: keep those of one")
 
 
 def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> EstimateTable:
-    """Put the columns of a file into arrays."""
+    """Return the columns of a file as arrays."""
     import pandas
 
     if "policy" in columns and len(names := sorted({*map(str, columns["policy"])})) > 1:
@@ -152,7 +152,7 @@ def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> Estima
         if form is not None:
             found[name] = columns[form + name]
     if not found:
-        raise ValueError(f"it holds no estimate of {', '.join(components)}: name the columns estimate_X")
+        raise ValueError(f"it contains no estimate of {', '.join(components)}: name the columns estimate_X")
     time_name = next((name for name in (LOG_TIME, *SECONDS) if name in columns), None)
     if time_name is None:
         raise ValueError("it needs a column seconds, the time since the start of the track")
@@ -174,7 +174,7 @@ def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> Estima
 
 
 def _track_name(value: Any) -> str:
-    """Name of a track; of a number without a fraction the whole number."""
+    """Return the name of a track; for a number without a fraction the whole number."""
     text = str(value).strip()
     return text.removesuffix(".0") if text.removesuffix(".0").isdigit() else text
 
@@ -182,7 +182,7 @@ def _track_name(value: Any) -> str:
 def _covariance(
     columns: Mapping[str, Any], components: Sequence[str], rows: int
 ) -> tuple[tuple[bool, ...], numpy.ndarray]:
-    """Of which components something is stated of the errors, and the covariance ``(C, C, R)``, NaN of the others."""
+    """Return which components have a variance, and the covariances ``(C, C, R)``, NaN for the others."""
     count = len(components)
     found = numpy.full((count, count, rows), numpy.nan)
     for i, a in enumerate(components):
@@ -199,7 +199,7 @@ def _covariance(
 
 
 def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
-    """Positions of one file, or of a folder with a file for each track; the orientation is not read."""
+    """Return the positions of one file, or of a folder with a file for each track; the orientation is not read."""
     import pandas
 
     axes = [components.index(name) for name in AXES if name in components]
@@ -228,7 +228,7 @@ def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
 
 
 def _trajectory(file: Path) -> numpy.ndarray:
-    """Time and position of every line, ``(rows, 4)``."""
+    """Return the time and position of every line, ``(rows, 4)``."""
     found = []
     for number, line in enumerate(read_content(file).decode("utf-8").splitlines()):
         words = line.split()
@@ -242,5 +242,5 @@ def _trajectory(file: Path) -> numpy.ndarray:
             raise ValueError(f"line {number + 1} of {file.name} is no pose: {quote_shortened(line)}")
         found.append(values[:4])
     if not found:
-        raise ValueError(f"{file.name} holds no poses")
+        raise ValueError(f"{file.name} contains no poses")
     return numpy.array(found)

@@ -1,4 +1,4 @@
-"""What every competitor has estimated, as a file that other programs read."""
+"""Estimates of every competitor, as a file for other programs."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ from .estimate_tables import AXES
 from .files import whole_file, whole_files
 
 SERIES = ("seconds", "nis", "nis_degrees", "log_likelihood")
-"""Written beside the estimates, where they are known."""
+"""Variables that are written with the estimates, where they exist."""
 
 
 def check_estimates(path: Path) -> None:
@@ -26,14 +26,14 @@ def estimates_of(dataset: xarray.Dataset) -> xarray.Dataset:
     """Return estimates of an evaluation with tracks: ``estimate`` and ``sigma`` over policy, recording, time and
     component, ``seconds``, and where they are known ``nis``, ``nis_degrees``, ``log_likelihood`` and ``truth``.
 
-    ``seconds`` count from the start of the track; of a recording from the first measurement of the log, and
-    ``log_time`` is the time as it stands there, so that rows can be joined with those of the log.
+    ``seconds`` count from the start of the track; for a recording from the first measurement of the log, and
+    ``log_time`` is the time in the log, so that rows can be joined with those of the log.
     """
     variance = numpy.diagonal(dataset["covariance"].values, axis1=-2, axis2=-1)
     sigma = dataset["estimate"].copy(data=numpy.sqrt(numpy.maximum(variance, 0.0)))
     names = dataset["flight"].values if "flight" in dataset.coords else dataset["episode"].values.astype(str)
     if "seconds" in dataset and "started" in dataset.coords:
-        # Of the log's own clock, from its first measurement on: some of them make the start of the track.
+        # By the log's own clock, from its first measurement on: the first ones start the track.
         dataset = dataset.assign(seconds=dataset["seconds"] + dataset["started"])
     if "seconds" not in dataset and "measurement_interval" in dataset:
         dataset = dataset.assign(seconds=dataset["measurement_interval"].cumsum("time"))
@@ -48,11 +48,11 @@ def estimates_of(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def write_estimates(path: Path, dataset: xarray.Dataset) -> None:
-    """Write what every competitor has estimated, a line or an entry for each measurement of each episode.
+    """Write the estimates of every competitor, a line or an entry for each measurement of each episode.
 
     Args:
         path: ending in ``.csv`` or ``.nc``; or a folder ending in ``.tum``, see :func:`write_trajectories`.
-        dataset: from an evaluation with ``tracks=True``.
+        dataset: evaluation with ``tracks=True``.
 
     Raises:
         ValueError: if it cannot be written.
@@ -81,7 +81,7 @@ def _write_csv(path: Path, found: xarray.Dataset) -> None:
         flat = flat.reset_coords("log_time")
     flat = flat.drop_vars("time", errors="ignore").assign(numbered)
     table = flat.to_dataframe(dim_order=["policy", "episode", "time"]).reset_index()
-    # Beyond the end of a shorter episode there is no estimate.
+    # After the end of a shorter episode there is no estimate.
     there = numpy.isfinite(table[next(name for name in columns if name.startswith("estimate_"))])
     table[there].to_csv(path, columns=["policy", "recording", "measurement", *columns], index=False)
 
@@ -89,17 +89,17 @@ def _write_csv(path: Path, found: xarray.Dataset) -> None:
 def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
     """Write positions as trajectories in the format of the TUM RGB-D benchmark, which ``evo`` reads.
 
-    A file has the lines ``time x y z qx qy qz qw``, s and m; the orientation is none, and a z that is not estimated
-    zero. The time is that of the log, of dates since 1970; without a log it counts from the start of the track.
-    There is a file for each competitor and episode, ``NAME.EPISODE.tum``, and one for the truth where it is known,
-    ``truth.NAME.EPISODE.tum``: in a closed loop every competitor has a truth of its own.
+    A file has the lines ``time x y z qx qy qz qw``, s and m; the orientation is the identity, and a z that is not
+    estimated is zero. The time is that of the log, of dates since 1970; without a log it counts from the start of the
+    track. There is a file for each competitor and episode, ``NAME.EPISODE.tum``, and one for the truth where it is
+    known, ``truth.NAME.EPISODE.tum``: in a closed loop every competitor has a truth of its own.
 
     Args:
-        folder: whose files of these names are replaced.
-        dataset: from an evaluation with ``tracks=True``.
+        folder: folder whose files of these names are replaced.
+        dataset: evaluation with ``tracks=True``.
 
     Raises:
-        ValueError: if no position is estimated, or nothing can be written there.
+        ValueError: if no position is estimated, or the folder cannot be written.
     """
     components = dataset["component"].values.tolist()
     axes = [components.index(name) for name in AXES if name in components]
@@ -120,7 +120,7 @@ def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
 
 
 def _log_seconds(own: xarray.Dataset) -> numpy.ndarray:
-    """Times of the log in s, ``(T,)``; NaN beyond the end of a shorter episode."""
+    """Return the times of the log in s, ``(T,)``; NaN beyond the end of a shorter episode."""
     import pandas
 
     found = numpy.full(own.sizes["time"], numpy.nan)
@@ -132,5 +132,5 @@ def _log_seconds(own: xarray.Dataset) -> numpy.ndarray:
 def _write_trajectory(path: Path, seconds: numpy.ndarray, positions: numpy.ndarray) -> None:
     rows = numpy.zeros((len(positions), 8))
     rows[:, 0], rows[:, 1 : 1 + positions.shape[1]], rows[:, 7] = seconds, positions, 1.0
-    # Beyond the end of a shorter episode, or where nobody knows the truth, there is no position.
+    # After the end of a shorter episode, or without truth, there is no position.
     numpy.savetxt(path, rows[numpy.isfinite(rows).all(axis=1)], fmt="%.9f")

@@ -1,7 +1,7 @@
-"""Files and folders that are whole or as they were: written beside their place, then moved into it.
+"""Atomic writing of files and folders: written next to their place, then moved into it.
 
-Whatever the operating system refuses on the way, such as a full disk, is one sentence that names the place. Two
-processes that write the same are kept apart by locks, which end with their process.
+An error of the operating system, such as a full disk, becomes one sentence with the path. Locks, which end with their
+process, exclude two writers of the same file.
 """
 
 import os
@@ -21,11 +21,11 @@ except ImportError:  # Windows, where a folder cannot be locked, and a file that
 UNIX = fcntl is not None
 
 UNFINISHED = ".unfinished-"
-"""Begins the name of a folder whose files wait until all of them are complete."""
+"""Prefix of the name of a folder whose files wait until all of them are complete."""
 LOCK = ".lock"
-"""In such a folder: locked as long as its writer is alive."""
+"""Lock file in such a folder, locked as long as its writer is alive."""
 YOUNG = 60.0
-"""s, within which a folder may not have its lock yet."""
+"""Age of a folder, s, up to which it may not have its lock yet."""
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def _explain_refusals(place: str) -> Iterator[None]:
 
 
 def writable_folder(path: Path) -> Path:
-    """Check that a folder can be written to, before any long work begins; where there is none it is not made yet.
+    """Check that a folder can be written to, before any long work begins; a missing one is not made yet.
 
     Raises:
         ValueError: if it cannot.
@@ -51,20 +51,20 @@ def writable_folder(path: Path) -> Path:
 
 @contextmanager
 def _make_folder(path: Path) -> Iterator[None]:
-    """Make a folder; if what shall be written into it fails, what was made is taken away again."""
+    """Make a folder; remove it again if writing into it fails."""
     made = [place for place in (path, *path.parents) if not place.exists()]
     path.mkdir(parents=True, exist_ok=True)
     try:
         yield
     except BaseException:
         for place in made:
-            with suppress(OSError):  # something else is in it
+            with suppress(OSError):  # it contains other files
                 place.rmdir()
         raise
 
 
 def _lock(handle: int) -> bool:
-    """Lock an open file or folder, if nobody else has; the lock ends when it is closed, or with the process."""
+    """Lock an open file or folder, unless it is locked; the lock ends when it is closed, or with the process."""
     try:
         if fcntl is None:
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
@@ -78,11 +78,11 @@ def _lock(handle: int) -> bool:
 
 
 _CLAIMED: dict[str, int] = {}
-"""Folders that this process writes, and what holds their locks."""
+"""Folders that this process writes, and the file handles of their locks."""
 
 
 def claim_folder(folder: Path) -> None:
-    """Make a folder this process's own until it ends: no other process may write a run or a benchmark there.
+    """Claim a folder for this process until it ends: no other process may write a run or a benchmark there.
 
     Raises:
         ValueError: if another process has claimed it, or it cannot be made.
@@ -102,7 +102,7 @@ def claim_folder(folder: Path) -> None:
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Claim a folder for a while; what was made for that and is empty afterwards is taken away.
+    """Claim a folder inside the context; folders made for it that are empty afterwards are removed.
 
     Raises:
         ValueError: as of :func:`claim_folder`.
@@ -117,7 +117,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
         if not UNIX:
             Path(name, LOCK).unlink(missing_ok=True)
         for place in made:
-            with suppress(OSError):  # something is in it
+            with suppress(OSError):  # it is not empty
                 place.rmdir()
 
 
@@ -156,20 +156,20 @@ def writable_file(path: Path) -> Path:
 
 
 def _partial(path: Path) -> Path:
-    # Beside what a link points to: the link stays.
+    # Next to the target of a link: the link stays.
     place = Path(os.path.realpath(path))
     return place.with_name(f".{place.name}.partial")
 
 
 @contextmanager
 def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
-    """Give a new file that takes the place of an old one only when it is complete.
+    """Yield a new file that replaces an old one only when it is complete.
 
-    What is read of the old one in the meantime is what the new one replaces: no other process writes it.
+    Meanwhile no other process writes the file, so the old contents read inside the context are those that it replaces.
 
     Args:
-        path: of the file.
-        patience: how long to wait for another process that writes it, s.
+        path: path of the file.
+        patience: time to wait for another process that writes it, s.
 
     Raises:
         ValueError: if it cannot be written.
@@ -181,13 +181,13 @@ def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
-        # From here on a file of this name is of whoever writes next.
+        # From here on a file of this name belongs to the next writer.
         partial.replace(os.path.realpath(path))
 
 
 @contextmanager
 def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
-    """Make a file that nobody else writes, and hold it; arguments and errors as of :func:`whole_file`."""
+    """Open a file that no other process writes, with its lock; arguments and errors as of :func:`whole_file`."""
     held = partial if UNIX else partial.with_name(partial.name + LOCK)
     handle = _open_locked(held, partial.name[1:-8], time.monotonic() + patience)
     try:
@@ -196,23 +196,23 @@ def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
     finally:
         os.close(handle)
         if held != partial:
-            with suppress(OSError):  # the next writer holds it
+            with suppress(OSError):  # the next writer has it open
                 held.unlink()
 
 
 def _open_locked(partial: Path, name: str, until: float) -> int:
-    """Make a file that no other process writes, and lock it, or try again until a time of the monotonic clock.
+    """Open a file that no other process writes, and lock it; try again until a time of the monotonic clock.
 
     Args:
         partial: the file.
-        name: of what is written, for the error.
-        until: s.
+        name: name of the written file, for the error.
+        until: end of the attempts, s.
     """
     while True:
         handle = os.open(partial, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             if _lock(handle):
-                # Between the two the other one may have moved it into its place.
+                # Meanwhile the other process may have moved it into its place.
                 with suppress(FileNotFoundError):
                     if os.path.samestat(os.fstat(handle), os.stat(partial)):
                         return handle
@@ -228,7 +228,7 @@ def _open_locked(partial: Path, name: str, until: float) -> int:
 
 @contextmanager
 def _hold(path: Path) -> Iterator[Path]:
-    """Make a file and hold its lock."""
+    """Open a file with its lock."""
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         _lock(handle)
@@ -239,8 +239,9 @@ def _hold(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
-    """Give a new folder whose files go into another one together, when all of them are complete; those of its folders
-    into the same ones there.
+    """Yield a new folder whose files are moved into another one together, when all of them are complete.
+
+    Files of its subfolders go into the same subfolders there.
 
     Raises:
         ValueError: if they cannot be written.
@@ -268,7 +269,7 @@ def _beside(folder: Path) -> tuple[Path, Path]:
 
 
 def find_folder(folder: Path) -> Path:
-    """Return where a folder of :func:`whole_folder` is: beside its place if a crash came while it was moved.
+    """Return the path of a folder of :func:`whole_folder`: next to its place after a crash during the move.
 
     The old one is moved away only when the new one is complete, so without the folder both others are whole.
     """
@@ -279,7 +280,7 @@ def find_folder(folder: Path) -> Path:
 
 
 def settle_folder(folder: Path) -> None:
-    """Finish what a crash interrupted, and remove what it left.
+    """Finish a move that a crash interrupted, and remove its remains.
 
     Raises:
         ValueError: if it cannot be moved into its place.
@@ -294,7 +295,7 @@ def settle_folder(folder: Path) -> None:
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """Give a new folder that takes the place of an old one only when it is complete.
+    """Yield a new folder that replaces an old one only when it is complete.
 
     Raises:
         ValueError: if it cannot be written.

@@ -1,9 +1,9 @@
-"""The store of unfinished work: after whatever ended a command, the same command goes on with what is missing.
+"""Store of unfinished work: after an interruption the same command computes only the missing results.
 
-The result of each piece of work is one file. Its name ends with a digest of the content of all that makes the result:
-what was asked for, and the code that answers. What depends on anything else has another name, and is made again.
+The result of each piece of work is one file. Its name ends with a digest of everything that determines the result: the
+request and the code. A changed request or code has another name, and is computed again.
 
-A file is MessagePack of a declared type. Reading it executes and imports nothing, and gives that type or nothing.
+A file is MessagePack of a declared type. Reading it executes and imports nothing, and returns that type or None.
 """
 
 import hashlib
@@ -32,19 +32,19 @@ Result = TypeVar("Result")
 
 
 class Work(NamedTuple):
-    """A piece of work, told apart from others by all that its result depends on."""
+    """A piece of work, identified by everything that its result depends on."""
 
     name: str
-    """Begins the name of its file. What has the same name is removed together."""
+    """Beginning of the name of its file. Files with the same name are removed together."""
     content: str
-    """Whatever its result depends on beside the code of the package."""
+    """Everything that its result depends on apart from the code of the package."""
 
 
 class Store:
     """Results of pieces of work in a folder.
 
     Args:
-        folder: made with the first result; None: nothing is kept.
+        folder: folder, made with the first result; None: nothing is stored.
 
     Raises:
         ValueError: if the folder cannot be written to.
@@ -66,8 +66,8 @@ class Store:
         """Return the result of a piece of work; None where there is none.
 
         Args:
-            work: None: a piece that is never kept, since nobody can say whether what makes it is what it was.
-            kind: type of its results.
+            work: the piece; None for one that is never stored, since changes of its code cannot be recognised.
+            kind: type of its result.
         """
         path = self._path(work)
         if path is None or not path.is_file():
@@ -75,12 +75,13 @@ class Store:
         try:
             return msgspec.msgpack.decode(path.read_bytes(), type=kind, dec_hook=_decode)
         except (msgspec.MsgspecError, OSError, ValueError, TypeError, LookupError):
-            return None  # somebody else's, or damaged: it is made again
+            return None  # of another program, or damaged: it is computed again
 
     def write(self, work: Work | None, result: Any) -> None:
-        """Keep the result of a piece of work: numbers, words, arrays and datasets, in containers of declared types.
+        """Store the result of a piece of work: numbers, strings, arrays and datasets, in containers of declared types.
 
-        What cannot be written, on a full disk, is made again after an interruption: a warning says so.
+        A result that cannot be written, for example on a full disk, is computed again after an interruption, with a
+        warning.
         """
         path = self._path(work)
         if path is not None:
@@ -92,7 +93,7 @@ class Store:
                 warnings.warn(f"{error}: after an interruption it is computed again", stacklevel=2)
 
     def result(self, work: Work | None, kind: type[Result], make: Callable[[], Result]) -> Result:
-        """Return the result of a piece of work, which is made and kept where there is none."""
+        """Return the result of a piece of work; compute and store it where there is none."""
         found = self.read(work, kind)
         if found is None:
             found = make()
@@ -100,7 +101,7 @@ class Store:
         return found
 
     def clear(self) -> None:
-        """Remove what has the names of the work that was asked for, and the folder if nothing else is in it."""
+        """Remove the files with the names of the requested work, and the folder if it is empty."""
         if self.folder is None or not self.folder.is_dir():
             return
         own = rf"\.?(.+)\.[0-9a-f]{{{DIGITS}}}{re.escape(SUFFIX)}(\.partial)?"  # a crash leaves partial ones
@@ -113,18 +114,18 @@ class Store:
 
 
 def _encode(value: Any) -> Any:
-    """Put into plain values what MessagePack has no words for."""
+    """Encode a value that MessagePack does not have."""
     if isinstance(value, numpy.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
     if isinstance(value, numpy.generic):
         return value.item()
     if isinstance(value, xarray.Dataset):
         return bytes(value.to_netcdf(engine="scipy", format="NETCDF3_64BIT"))
-    raise NotImplementedError(f"a {type(value).__name__} cannot be kept")
+    raise NotImplementedError(f"a {type(value).__name__} cannot be stored")
 
 
 def _decode(kind: type, value: Any) -> Any:
-    """Return what :func:`_encode` was given."""
+    """Decode a value of :func:`_encode`."""
     if kind is numpy.ndarray:
         dtype, shape, content = value
         return numpy.frombuffer(content, dtype).reshape(shape).copy()

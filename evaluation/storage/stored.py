@@ -1,4 +1,4 @@
-"""What was written as JSON is what is read, or is refused."""
+"""Reading of JSON files with checks of types and limits."""
 
 import types
 from pathlib import Path
@@ -11,10 +11,10 @@ Stored = TypeVar("Stored")
 
 
 def read_json(path: Path) -> Any:
-    """Return what a JSON file holds.
+    """Return the contents of a JSON file.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if the file does not exist.
         ValueError: if it cannot be read, or breaks a limit of :mod:`~filtergym.envs.foreign_files`.
     """
     try:
@@ -47,7 +47,7 @@ def restore(cls: type[Stored], values: Any) -> Stored:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Say whether a value from JSON is of a declared type; a whole number is a float, too."""
+    """Return whether a value from JSON has a declared type; a whole number is a float, too."""
     origin, of = get_origin(hint), get_args(hint)
     if hint is Any:
         return True

@@ -1,4 +1,4 @@
-"""Small datasets as JSON: curves and tracks, for whoever has neither NetCDF nor Python."""
+"""Small datasets as JSON: curves and tracks, for users without NetCDF or Python."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,12 +13,12 @@ PARTS = ("coords", "variables", "attrs")
 
 
 def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwise: int) -> dict[str, Any]:
-    """Return a dataset of numbers and words as what JSON can say, null for NaN.
+    """Return a dataset of numbers and strings as JSON values, null for NaN.
 
     Args:
-        dataset: whatever is no number is words.
+        dataset: values that are no numbers become strings.
         digits: significant digits of variables, by their names.
-        otherwise: of all others.
+        otherwise: significant digits of the other variables.
     """
 
     def as_json(name: str, values: numpy.ndarray) -> Any:
@@ -42,10 +42,10 @@ def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwis
 
 
 def dataset_from_json(stored: Any) -> xarray.Dataset:
-    """Return the dataset that :func:`dataset_as_json` has described.
+    """Return the dataset from the JSON values of :func:`dataset_as_json`.
 
     Raises:
-        ValueError: if it is none: its parts do not fit together, or hold anything but numbers and words.
+        ValueError: if it is no dataset: its parts do not fit together, or contain other types than numbers and strings.
     """
     if not isinstance(stored, dict) or not all(isinstance(stored.get(part), dict) for part in PARTS):
         raise ValueError(f"expected {', '.join(PARTS)} of a dataset, got {quote_shortened(stored)}")
@@ -66,9 +66,9 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
         elif fits(values, list[int]) or isinstance(values, int):
             array = _array(values, numpy.int64)
         else:
-            raise ValueError(f"{name!r} must hold numbers or words")
+            raise ValueError(f"{name!r} must contain numbers or strings")
         if array.ndim != len(entry[0]):
-            raise ValueError(f"{name!r} has {array.ndim} dimensions, and names {len(entry[0])}")
+            raise ValueError(f"{name!r} has {array.ndim} dimensions, but names {len(entry[0])}")
         return entry[0], array
 
     coords, variables = (

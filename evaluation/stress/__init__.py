@@ -1,5 +1,5 @@
-"""The crash test: what happens to measurements in the field, and what filters make of it.
+"""Crash test of filters by alterations of their measurements, as they happen in the field.
 
-Begin with :mod:`.alterations`, the list of what is done to measurements; :mod:`.streams` records them,
-:mod:`.crash_test` runs a filter over all and judges it.
+Begin with :mod:`.alterations`, the list of alterations; :mod:`.streams` records measurements, :mod:`.crash_test` runs a
+filter on all alterations and rates it.
 """

@@ -1,8 +1,8 @@
-"""What happens to measurements between the sensors and a filter: a list of named alterations.
+"""Alterations of measurements between the sensors and a filter, as a list with names.
 
 Each is a pure function of a :class:`.streams.Stream` and a generator of random numbers. It returns another stream, or
-None where the environment's measurements have nothing that it could alter: no time, or nothing that says what was
-received. What fields mean is declared by the world (:class:`~filtergym.envs.contract.world.World`).
+None where it does not apply: the environment's measurements have no time, or no mark of received measurements. The
+world declares the meaning of fields (:class:`~filtergym.envs.contract.world.World`).
 """
 
 from collections.abc import Callable
@@ -16,29 +16,29 @@ from ...filters.smoothing import semidefinite_root
 from .streams import Stream
 
 SETTLED = 60
-"""Measurements before anything happens."""
+"""Number of measurements before the alteration."""
 AFTERWARDS = 100
-"""Measurements after what passes."""
+"""Number of measurements after a temporary alteration."""
 LASTING = 200
-"""Measurements of a stream in which it does not."""
+"""Number of measurements of a stream with a lasting alteration."""
 EVERY = 10
-"""Of so many measurements one is delivered twice or late."""
+"""One in this number of measurements is delivered twice or late."""
 
 Function = Callable[[Stream, numpy.random.Generator], Stream | None]
 
 
 class Alteration(NamedTuple):
-    """One thing that happens in the field."""
+    """One alteration of measurements, as it happens in the field."""
 
     name: str
     description: str
     function: Function
     length: int = SETTLED + LASTING
-    """Measurements that a stream must have for it."""
+    """Number of measurements that it requires of a stream."""
 
 
 def _cut(stream: Stream, begin: int, end: int | None) -> Stream:
-    """A stream that ends soon after what passes, or goes on for a while."""
+    """Return a stream that ends soon after a temporary alteration, or has a lasting one."""
     length = LASTING if end is None else end + AFTERWARDS
     return replace(stream.select(numpy.arange(min(length, len(stream)))), begin=begin, end=end)
 
@@ -49,7 +49,7 @@ def _unaltered(stream: Stream, generator: numpy.random.Generator) -> Stream:
 
 def _gap(scans: int) -> Function:
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-        """Leave measurements out of a timed stream; of another one say that nothing was received."""
+        """Remove measurements from a timed stream; in others mark them as not received."""
         if stream.is_timed:
             seconds = stream.seconds
             kept = numpy.r_[:SETTLED, SETTLED + scans : len(stream)]
@@ -91,7 +91,7 @@ def _reordered(order: Callable[[int], list[int]]) -> Function:
 
 
 def _stamped(change: Callable[[numpy.ndarray], numpy.ndarray], passes: bool = True) -> Function:
-    """Other time stamps; ``change`` is given the times from ``SETTLED - 1`` on."""
+    """Return an alteration of time stamps; ``change`` takes the times from ``SETTLED - 1`` on."""
 
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
         if not stream.is_timed:
@@ -132,7 +132,7 @@ def _outlier(sigmas: float) -> Function:
 
 def _wrong_noise(factor: float) -> Function:
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-        """State another R; where none is stated, let the errors be larger than it."""
+        """Change the stated R; where none is stated, enlarge the errors."""
         field = type(stream.task.world).stated_field
         if field:
             stated = getattr(stream.measurements, field).copy()
@@ -161,7 +161,9 @@ def _frozen(stream: Stream, generator: numpy.random.Generator) -> Stream:
 
 
 def _not_a_number(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-    """What cannot be said to be missing is refused at the door."""
+    """Set readings to NaN; it does not apply where measurements cannot be marked as missing, since the input rejects
+    NaN.
+    """
     if not type(stream.task.world).received_field:
         return None
     readings = stream.readings.copy()
@@ -178,16 +180,16 @@ def _initial_covariance(factor: float) -> Function:
 
 
 def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
-    """Begin anew in the middle: from the truth there, with errors of the initial covariance."""
+    """Restart in the middle: from the truth there, with errors of the initial covariance."""
     before, initial = stream.at(SETTLED - 1), stream.initial
     root = semidefinite_root(initial.covariance)
     errors = numpy.einsum("ijn,jn->in", root, generator.standard_normal(initial.mean.shape))
-    told = {}
+    others = {}
     for name, value in initial._asdict().items():
         if name not in ("mean", "covariance"):
-            # What else is told is the measurement there, or one of its fields.
-            told[name] = before if isinstance(value, type(before)) else getattr(before, name, value)
-    begun = initial._replace(mean=stream.truth[SETTLED - 1] + errors, **told)
+            # The other initial values are the measurement there, or one of its fields.
+            others[name] = before if isinstance(value, type(before)) else getattr(before, name, value)
+    begun = initial._replace(mean=stream.truth[SETTLED - 1] + errors, **others)
     later = stream.select(numpy.arange(SETTLED, len(stream)))
     return _cut(replace(later, initial=begun).renumbered(), Causes.of(stream.task).start, 1)
 
@@ -247,4 +249,4 @@ ALTERATIONS: tuple[Alteration, ...] = (
     Alteration("restart", "the track begins anew in the middle", _restart),
     Alteration("rounded-readings", "readings and start are rounded to single precision", _rounded),
 )
-"""The catalogue, in the order of the table."""
+"""All alterations, in the order of the table."""

@@ -1,8 +1,9 @@
-"""A filter under every alteration of its measurements: what it makes of them, in one word and one sentence.
+"""Run of a filter under every alteration of its measurements, with a verdict in one word and one sentence.
 
-Checked are at every measurement that mean and covariance are finite, the covariance symmetric and positive definite;
-then the size of the error against the same filter's on unaltered measurements of the same episodes, whether it comes
-back to that after what passes, whether the covariance says how large the errors are (ANEES), and the time of updates.
+The test checks at every measurement that mean and covariance are finite, and the covariance symmetric and positive
+definite. It compares the error with that of the same filter on unaltered measurements of the same episodes, and checks
+that the error recovers after a temporary alteration, that the covariance agrees with the errors (ANEES), and the time
+of updates.
 
 The size of an error is the root of the mean over components of (error / scale)^2, the scale being the RMS error of the
 paper's algorithm on unaltered measurements: one number for every environment.
@@ -33,87 +34,87 @@ from .alterations import AFTERWARDS, ALTERATIONS, SETTLED, Alteration
 from .streams import Stream, record_streams
 
 RECOVERY = 50
-"""Measurements after what passes, within which a filter must be back at the errors that it had without; judged over as
-many that follow."""
+"""Number of measurements after a temporary alteration within which a filter must recover the errors that it has
+without; evaluated over as many that follow."""
 BACK = 3.0
-"""Ratio of errors up to which an episode is back."""
+"""Ratio of errors up to which an episode has recovered."""
 FEW = 0.1
-"""Share of the episodes that need not be."""
+"""Share of the episodes that need not recover."""
 HARM = 1.25
 """Ratio of errors from which on a filter is degraded."""
 INCONSISTENT = 2.0
-"""Factor by which ANEES may be off one, or off that of unaltered measurements."""
+"""Factor by which ANEES may differ from one, or from that of unaltered measurements."""
 SLOW, SLOW_SECONDS, HICCUPS = 50.0, 0.1, 3
-"""Times the median update, and s, from which on updates are slow, if there are so many: a machine has other work."""
+"""Multiple of the median update, time in s, and number of updates above both from which on updates count as slow."""
 MOST_WORDS = 160
-"""Characters of what a filter raises."""
+"""Maximal number of characters of a filter's error in a report."""
 CHUNK = 1000
-"""Measurements of a long run that are held at a time."""
+"""Measurements of a long run in memory at a time."""
 LONG_EPISODES = 8
 MOST_KEPT = 20_000
-"""Measurements of a long run that are recorded once for all filters."""
+"""Maximal number of measurements of a long run that are recorded once for all filters."""
 UNALTERED, RESTORE, LONG = ALTERATIONS[0].name, "restore", "long-run"
 DESCRIPTIONS: Mapping[str, str] = {
     **{one.name: one.description for one in ALTERATIONS},
     RESTORE: "the state is saved, and restored in another filter",
     LONG: "many measurements, one after another",
 }
-UNSAID = "the measurement has nothing that says it"
+NOT_CONTAINED = "the measurement does not contain it"
 PASSED, DEGRADED, FAILED, NOTHING = "passed", "degraded", "failed", "does not apply"
 
 
 class Finding(NamedTuple):
-    """What a filter has made of one alteration."""
+    """Result of a filter under one alteration."""
 
     competitor: str
     alteration: str
     verdict: str
     """"passed", "degraded", "failed", or "does not apply"."""
     reason: str
-    """One sentence; of what passed empty, or what is remarkable."""
+    """One sentence; for a passed test empty, or a remark."""
     error: float | None
-    """Error over that on unaltered measurements, of the unaltered over that of the reference; geometric mean over
+    """Error over that on unaltered measurements, for unaltered ones over that of the reference; geometric mean over
     episodes."""
     reference_error: float | None
-    """Likewise of the reference filter."""
+    """Same ratio of the reference filter."""
     anees: float | None
     """Mean NEES over its dimension, from the alteration on."""
     anees_low: float | None
     anees_high: float | None
     lost: int
-    """Episodes whose estimate is none any more."""
+    """Number of episodes with an invalid estimate."""
     episodes: int
 
 
 class Run(NamedTuple):
-    """What a filter answered to a stream of N episodes."""
+    """Results of a filter on a stream of N episodes."""
 
     size: numpy.ndarray
-    """Of the error, ``(K, N)``."""
+    """Size of the error, ``(K, N)``."""
     nees: numpy.ndarray
-    """Over its dimension, ``(K, N)``."""
+    """NEES over its dimension, ``(K, N)``."""
     fault: numpy.ndarray
-    """Number of the reason among ``FAULTS`` why an estimate is none, 0 where it is one, ``(K, N)``."""
+    """Number among ``FAULTS`` of the reason why an estimate is invalid, 0 where it is valid, ``(K, N)``."""
     slow: float
-    """Time of the slowest update but a few, s."""
+    """Time of the slowest update except for a few, s."""
     median: float
-    """Of an update, s."""
+    """Median time of an update, s."""
     error: str = ""
-    """What it raised, if anything."""
+    """Error that the filter raised, if any."""
 
 
 class StreamFilter(OnlineFilter):
-    """A filter that is given measurements of the task as they are, whatever is wrong with them."""
+    """An online filter that receives measurements of the task unchecked."""
 
     def begin(self, initial: Any) -> None:
         """Start the tracks from the task's own initial estimate."""
-        self._go_on(self._begin(initial, {}))
+        self._set_state(self._begin(initial, {}))
 
     def _check_input(self, memory: Any) -> None:
-        """Measurements are given as they are: there is no memory of an input."""
+        """Do nothing: without an input there is no memory of it to check."""
 
     def take(self, measurement: Any) -> dict[str, numpy.ndarray]:
-        """Take a measurement in; return mean, covariance and what else is reported, arrays ``(..., N)``."""
+        """Update with a measurement; return mean, covariance and the other reported quantities, arrays ``(..., N)``."""
         if self.tracks > 1:
             return self._advance(measurement, {})
         found = self._advance(select_lanes(measurement, 0), {})
@@ -121,25 +122,25 @@ class StreamFilter(OnlineFilter):
 
 
 def _subtract(stream: Stream, means: numpy.ndarray) -> numpy.ndarray:
-    """Errors ``(K, C, N)`` of means at the first K measurements; of angles the shortest differences."""
+    """Return the errors ``(K, C, N)`` of means at the first K measurements; for angles the shortest differences."""
     means, truth = (numpy.moveaxis(values, 1, 0) for values in (means, stream.truth[: len(means)]))
     return numpy.moveaxis(stream.task.subtract(means, truth), 0, 1)
 
 
 class CrashTest:
-    """Streams of measurements, altered in every way, and the reference filter that all are compared with.
+    """Streams of measurements with every alteration, and the reference filter for comparisons.
 
     Args:
-        experiment: whose environment, scenario, seed, split and parameters it has; its episodes are the streams.
-        steps: of the long run.
-        reference: name of the reference filter, and what makes it; none in an environment without one.
-        alterations: that are tried, beginning with that which alters nothing.
+        experiment: gives environment, scenario, seed, split and parameters; its episodes are the streams.
+        steps: number of measurements of the long run.
+        reference: name of the reference filter and its maker; None in an environment without one.
+        alterations: alterations to apply; the first must change nothing.
 
     Raises:
-        ValueError: if the environment does not say what its sensors read.
+        ValueError: if the environment does not declare the readings of its sensors.
 
     Attributes:
-        streams: by the names of the alterations; None where one does not apply.
+        streams: streams by the names of the alterations; None where one does not apply.
     """
 
     def __init__(
@@ -157,7 +158,7 @@ class CrashTest:
         world = experiment.task.World
         if not world.reading_field and not world.received_field:
             raise ValueError(
-                f"{experiment.task.id} does not say what its sensors read: give its World reading_field, and "
+                f"{experiment.task.id} does not declare the readings of its sensors: give its World reading_field, and "
                 "stated_field or reading_deviations"
             )
         (whole,) = self._record(self._seeds, length, length)
@@ -180,7 +181,7 @@ class CrashTest:
             }
 
     def _record(self, seeds: Sequence[int], length: int, chunk: int) -> Iterator[Stream]:
-        """Streams of episodes of the simulation that are as long as it takes."""
+        """Return streams of episodes of the simulation, as long as required."""
         task, keywords = self.experiment.task, dict(self.experiment.keywords)
         usual = self.experiment.make_task()
         interval = usual.decision_interval
@@ -192,10 +193,10 @@ class CrashTest:
         return record_streams(model, seeds, length, chunk)
 
     def filter_of(self, name: str, maker: Any, tracks: int) -> StreamFilter:
-        """Make a competitor, as it would run on measurements from outside.
+        """Make a competitor as an online filter.
 
         Raises:
-            ValueError: for what needs the truth or later measurements, or cannot be made.
+            ValueError: for a competitor that needs the truth or later measurements, or cannot be made.
         """
         experiment = self.experiment
         keywords = {**getattr(maker, "task_keywords", {}), **experiment.keywords}
@@ -214,13 +215,13 @@ class CrashTest:
     # --- running
 
     def _errors(self, filter: StreamFilter, stream: Stream) -> numpy.ndarray:
-        """Errors of the mean, ``(K, C, N)``."""
+        """Return the errors of the mean, ``(K, C, N)``."""
         filter.begin(stream.initial)
         means = numpy.stack([filter.take(stream.at(k))["mean"] for k in range(len(stream))])
         return _subtract(stream, means)
 
     def _run(self, filter: StreamFilter, stream: Stream, begin: bool = True) -> Run:
-        """Give a filter a stream; what it raises ends the run."""
+        """Run a filter on a stream; an error ends the run."""
         found: list[dict[str, numpy.ndarray]] = []
         spent: list[float] = []
         error = ""
@@ -232,7 +233,7 @@ class CrashTest:
                 with numpy.errstate(all="ignore"):
                     found.append(filter.take(measurement))
                 spent.append(time.perf_counter() - began)
-        except Exception as raised:  # whatever a filter of anybody's stumbles over
+        except Exception as raised:  # a user's filter can raise any error
             error = _shortened(raised)
         if not found:
             none = numpy.empty((0, stream.episodes))
@@ -254,29 +255,29 @@ class CrashTest:
         slow = sorted(spent)[max(len(spent) - HICCUPS, 0)]
         return Run(size, normalised, fault, slow, float(numpy.median(spent)), error)
 
-    # --- judging
+    # --- verdicts
 
     def findings(
         self, name: str, maker: Any, tick: Callable[[int], None] = lambda done: None
     ) -> Iterator[Finding]:
-        """Run a competitor through the catalogue.
+        """Run a competitor under all alterations.
 
         Args:
-            name: of it.
-            maker: what makes it, or the competitor itself.
-            tick: told of alterations done.
+            name: its name.
+            maker: its maker, or the competitor itself.
+            tick: called with the number of alterations done.
 
         Yields:
-            What it made of each alteration.
+            Result under each alteration.
 
         Raises:
-            ValueError: for what needs the truth or later measurements, or cannot be made.
+            ValueError: for a competitor that needs the truth or later measurements, or cannot be made.
         """
         filter = self.filter_of(name, maker, self.experiment.episodes)
         plain = self._run(filter, self._stream(UNALTERED))
         for alteration, stream in self.streams.items():
             if stream is None:
-                yield self._finding(name, alteration, NOTHING, UNSAID)
+                yield self._finding(name, alteration, NOTHING, NOT_CONTAINED)
             else:
                 run = plain if alteration == UNALTERED else self._run(filter, stream)
                 yield self._judge(name, alteration, stream, run, plain)
@@ -296,7 +297,7 @@ class CrashTest:
         return Finding(name, alteration, verdict, reason, **numbers, episodes=self.experiment.episodes)
 
     def _judge(self, name: str, alteration: str, stream: Stream, run: Run, plain: Run) -> Finding:
-        """Say what became of a filter under one alteration."""
+        """Return the verdict on a filter under one alteration."""
         reference = self._reference.get(alteration)
         if alteration == UNALTERED:
             ratio = self._ratio(run, reference, stream, slice(SETTLED, None))
@@ -306,7 +307,7 @@ class CrashTest:
             others = self._ratio(reference, self._reference.get(UNALTERED), stream, slice(stream.begin, None))
         lost = numpy.asarray((run.fault > 0.0).any(axis=0))
         begin = stream.begin
-        if stream.end is not None:  # of what passes nobody can know; afterwards they can
+        if stream.end is not None:  # errors during a temporary alteration do not count
             begin = stream.end + RECOVERY
         anees = self._mean(run.nees[begin:])
         fields = {
@@ -329,7 +330,7 @@ class CrashTest:
         return self._finding(name, alteration, DEGRADED if words else PASSED, "; ".join(words), **fields)
 
     def _failure(self, run: Run, plain: Run, stream: Stream, lost: numpy.ndarray) -> str:
-        """Say how it failed; empty where it has not."""
+        """Return a sentence on the failure; empty without one."""
         count = stream.episodes
         if run.error:
             return f"stops at measurement {len(run.size) + 1}: {run.error}"
@@ -352,7 +353,7 @@ class CrashTest:
         return ""
 
     def _harm(self, alteration: str, fields: Mapping[str, Any]) -> Iterator[str]:
-        """Say how much larger the errors are, and those of the reference."""
+        """Yield sentences on the increase of the errors, and of those of the reference."""
         error, other = fields["error"], fields["reference_error"]
         if not error > HARM:
             return
@@ -363,7 +364,7 @@ class CrashTest:
             yield f"error {_text(error)} times that without{beside}"
 
     def _inconsistency(self, alteration: str, anees: IntervalEstimate, plain: Run) -> Iterator[str]:
-        """Say where the covariance does not tell how large the errors are."""
+        """Yield sentences on an inconsistent covariance."""
         usual = 1.0 if alteration == UNALTERED else max(1.0, float(numpy.nanmean(plain.nees[SETTLED:])))
         if anees.low > INCONSISTENT * usual:
             yield f"overconfident, {_anees_text(anees)}"
@@ -371,7 +372,9 @@ class CrashTest:
             yield f"cautious, {_anees_text(anees)}"
 
     def _ratio(self, run: Run | None, other: Run | None, stream: Stream, part: slice) -> numpy.ndarray:
-        """Error of each episode over that of another run at the same measurements of the recorded stream, ``(N,)``."""
+        """Return the error of each episode over that of another run at the same measurements of the recorded
+        stream, ``(N,)``.
+        """
         if run is None or other is None:
             return numpy.full(stream.episodes, numpy.nan)
         chosen = numpy.arange(len(stream))[part]
@@ -387,13 +390,13 @@ class CrashTest:
         return ratio
 
     def _mean(self, values: numpy.ndarray) -> IntervalEstimate:
-        """Mean over measurements and episodes, with its interval."""
+        """Return the mean over measurements and episodes, with its interval."""
         with numpy.errstate(all="ignore"):
             each = values.mean(axis=0) if len(values) else numpy.full(values.shape[1], numpy.nan)
             return self._bootstrap.estimate(each)
 
     def _restore(self, name: str, maker: Any) -> Finding:
-        """Save the state in the middle, and let another filter go on from it."""
+        """Save the state in the middle, and continue from it with another filter."""
         count, stream = self.experiment.episodes, self._stream(UNALTERED)
         first = self.filter_of(name, maker, count)
         second = self.filter_of(name, maker, count)
@@ -412,14 +415,14 @@ class CrashTest:
                         FAILED,
                         f"another estimate {after} measurement{'s' * (after > 1)} after it was restored",
                     )
-        except Exception as raised:  # whatever a filter of anybody's stumbles over
+        except Exception as raised:  # a user's filter can raise any error
             return self._finding(
                 name, RESTORE, NOTHING, f"cannot be saved and restored: {_shortened(raised)}"
             )
         return self._finding(name, RESTORE, PASSED)
 
     def _long_streams(self) -> Iterable[Stream]:
-        """Streams of the long run; all but very long ones are kept for the next filter."""
+        """Return the streams of the long run; they are stored for the next filter unless they are very long."""
         streams = self._record(self._seeds[:LONG_EPISODES], self.steps, CHUNK)
         if self.steps > MOST_KEPT:
             return streams
@@ -427,7 +430,7 @@ class CrashTest:
         return self._kept
 
     def _long_run(self, name: str, maker: Any) -> Finding:
-        """Go on for many measurements."""
+        """Run a filter over many measurements."""
         filter = self.filter_of(name, maker, LONG_EPISODES)
         first: Run | None = None
         run: Run | None = None
@@ -453,7 +456,7 @@ class CrashTest:
 
 
 def _geometric_mean(ratio: Any) -> float:
-    """Geometric mean of what is known; NaN where nothing is."""
+    """Return the geometric mean without NaN; NaN where there are no numbers."""
     with numpy.errstate(all="ignore"):
         logs = numpy.log(numpy.atleast_1d(ratio))
     logs = logs[numpy.isfinite(logs)]
@@ -469,5 +472,5 @@ def _shortened(raised: Exception) -> str:
 
 
 def _text(value: float) -> str:
-    """Three digits."""
+    """Return a number with three digits."""
     return f"{value:.3g}" if value < 1e4 else f"{value:.1e}"

@@ -1,7 +1,7 @@
-"""Measurements of episodes as arrays with a time axis, which can be altered before a filter is given them.
+"""Measurements of episodes as arrays with a time axis, which can be altered before a filter receives them.
 
-A :class:`Stream` is recorded once from the simulation. In a closed loop it is flown by the paper's algorithm, and
-everybody else listens: what is measured is the same for all.
+A :class:`Stream` is recorded once from the simulation. In a closed loop the paper's algorithm closes it, and all
+filters receive the same measurements.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,10 +20,10 @@ from ..running.rollout import start_lanes
 
 @dataclass(frozen=True)
 class Stream:
-    """Measurements of N episodes, and what is true; K measurements each."""
+    """Measurements and truth of N episodes of K measurements each."""
 
     task: Task
-    """On NumPy arrays; its world says what the fields mean."""
+    """Task on NumPy arrays; its world declares the meaning of the fields."""
     initial: Any
     """The initial estimate given to every filter, arrays ``(..., N)``."""
     measurements: Any
@@ -31,29 +31,29 @@ class Stream:
     truth: numpy.ndarray
     """True values of the components at the measurements, ``(K, C, N)``."""
     source: numpy.ndarray
-    """Which measurement of the recorded stream each is of, ``(K,)``."""
+    """Index of each measurement in the recorded stream, ``(K,)``."""
     begin: int = 0
-    """First measurement that is altered."""
+    """Index of the first altered measurement."""
     end: int | None = None
-    """First measurement after what is altered; None where the alteration lasts."""
+    """Index of the first measurement after the alteration; None where the alteration lasts."""
 
     def __len__(self) -> int:
         return len(self.source)
 
     @property
     def episodes(self) -> int:
-        """N."""
+        """Number of episodes N."""
         return int(self.truth.shape[-1])
 
     @property
     def reading_field(self) -> str:
-        """Name of what sensors read with errors."""
+        """Name of the field with the readings of sensors."""
         world = type(self.task.world)
         return world.reading_field or world.received_field
 
     @property
     def readings(self) -> numpy.ndarray:
-        """What sensors read, ``(K, m, N)``."""
+        """Readings of sensors, ``(K, m, N)``."""
         values: numpy.ndarray = getattr(self.measurements, self.reading_field)
         return values
 
@@ -65,7 +65,7 @@ class Stream:
 
     @property
     def is_timed(self) -> bool:
-        """Whether a measurement says how much time has passed."""
+        """Whether measurements contain the time since the last one."""
         return getattr(self.measurements, "interval", None) is not None
 
     @property
@@ -78,7 +78,7 @@ class Stream:
         return map_arrays(lambda values: values[number], self.measurements)
 
     def select(self, numbers: Sequence[int] | numpy.ndarray) -> "Stream":
-        """Return the stream with these measurements, in this order; intervals stay what they are."""
+        """Return the stream with these measurements, in this order; intervals do not change."""
         index = numpy.asarray(numbers)
         return replace(
             self,
@@ -92,12 +92,12 @@ class Stream:
         return replace(self, measurements=self.measurements._replace(**fields))
 
     def with_readings(self, readings: numpy.ndarray) -> "Stream":
-        """Return the stream with other readings, where any are received."""
+        """Return the stream with other readings, where readings are received."""
         return self.with_fields(**{self.reading_field: numpy.where(self.received, readings, self.readings)})
 
     @property
     def received(self) -> numpy.ndarray:
-        """Which readings are received, ``(K, m, N)``."""
+        """Whether each reading is received, ``(K, m, N)``."""
         available = getattr(self.measurements, "available", None)
         if available is None:
             return numpy.ones(self.readings.shape, dtype=bool)
@@ -106,7 +106,7 @@ class Stream:
         return numpy.broadcast_to(available > 0.0, self.readings.shape)
 
     def with_times(self, seconds: numpy.ndarray) -> "Stream":
-        """Return a timed stream whose measurements say other times, s, ``(K, N)``."""
+        """Return a timed stream with other times of the measurements, s, ``(K, N)``."""
         interval = numpy.diff(seconds, axis=0, prepend=0.0 * seconds[:1])
         fields = {"interval": interval}
         elapsed = type(self.task.world).elapsed_field
@@ -115,7 +115,7 @@ class Stream:
         return self.with_fields(**fields)
 
     def received_as_live(self) -> "Stream":
-        """Return the stream as the door for live measurements lets it in: what is NaN was not received."""
+        """Return the stream as the input for live measurements passes it on: NaN is marked as not received."""
         field, missing = type(self.task.world).received_field, numpy.isnan(self.readings)
         if not field or not missing.any():
             return self
@@ -124,7 +124,7 @@ class Stream:
         return self.with_fields(**{field: numpy.where(missing, 0.0, self.readings), "available": available})
 
     def renumbered(self) -> "Stream":
-        """Return the stream with its measurements counted from 1 on, where they are counted."""
+        """Return the stream with its measurements numbered from 1 on, where they have numbers."""
         counter = LiveReader.of(self.task).input.counter
         values = getattr(self.measurements, counter, None)
         if values is None:
@@ -134,7 +134,7 @@ class Stream:
 
 
 def _since_received(seconds: numpy.ndarray, received: numpy.ndarray) -> numpy.ndarray:
-    """Time since the last measurement before that was received, or the start, ``(K, N)``."""
+    """Return the time since the last received measurement before, or the start, s, ``(K, N)``."""
     last, found = 0.0 * seconds[0], []
     for now, there in zip(seconds, received, strict=True):
         found.append(now - last)
@@ -143,16 +143,16 @@ def _since_received(seconds: numpy.ndarray, received: numpy.ndarray) -> numpy.nd
 
 
 def record_streams(model: Model, seeds: Sequence[int], length: int, chunk: int) -> Iterator[Stream]:
-    """Record what the sensors say in episodes of these seeds, as the paper's algorithm flies them.
+    """Record the measurements in episodes of these seeds, with the paper's algorithm in the loop.
 
     Args:
-        model: of the control of the paper's algorithm, with a horizon of at least ``length``.
-        seeds: of the episodes.
-        length: measurements.
-        chunk: measurements of a stream.
+        model: model of the control of the paper's algorithm, with a horizon of at least ``length``.
+        seeds: seeds of the episodes.
+        length: number of measurements.
+        chunk: number of measurements of a stream.
 
     Yields:
-        Streams that go on from each other; the initial estimate is that of the first.
+        Streams that continue each other; the initial estimate is that of the first.
     """
     task, count = model.on_numpy().task, len(seeds)
     began: list[Episode] = []
@@ -178,7 +178,7 @@ def record_streams(model: Model, seeds: Sequence[int], length: int, chunk: int) 
 
 
 def _stack(parts: Sequence[Any]) -> Any:
-    """Nested tuples of arrays with a first axis of their number."""
+    """Stack nested tuples of arrays along a new first axis."""
     first = parts[0]
     if isinstance(first, tuple):
         columns = (_stack([part[i] for part in parts]) for i in range(len(first)))

@@ -18,7 +18,7 @@ from ..envs.engine.scenario_choice import find_scenario
 from ..envs.linear.equations import StateSpaceMeasurement
 from ..envs.linear.inputs import Input
 from ..envs.linear.sensors import Sensor
-from ..evaluation.competitors.filters import put_in_loop
+from ..evaluation.competitors.filters import close_loop
 from ..evaluation.competitors.kinds import kind_of
 from ..evaluation.competitors.stepping import CompiledUpdate, ModelUpdate
 from ..filters.angles import PERIODS
@@ -132,7 +132,7 @@ class Estimates:
                 raise ValueError(
                     f"competitor must be an estimator, one of {', '.join(known)}, got {competitor!r}"
                 )
-            own = put_in_loop(own, maker, "estimator", str(competitor), lanes)
+            own = close_loop(own, maker, "estimator", str(competitor), lanes)
         self.action_space: Any = None if control is None else own.action_space
         self._own, world = own, own.task.world
         self._is_compiled = can_step(own, report_estimate)
@@ -182,7 +182,7 @@ class Estimates:
         self.__init__(*state["arguments"])  # type: ignore[misc]
         vars(self).update(state["arrays"])
         if state["filters"] is not None:
-            self._update.go_on(state["filters"], ())
+            self._update.resume(state["filters"], ())
 
     def begin(self, lanes: Array, reading: Reading) -> None:
         """Begin episodes of some lanes with their first readings; the others stay as they are."""
@@ -199,7 +199,7 @@ class Estimates:
         begun = self._begun
         if not lanes.all():
             begun = select_nested(lanes[self._pad], begun, self._update.state)
-        self._update.go_on(begun, ())
+        self._update.resume(begun, ())
         self._filtered = numpy.where(lanes, mean[:, : self._lanes], self._filtered)
 
     def advance(
@@ -227,7 +227,7 @@ class Estimates:
         interval = self._intervals if moves is None else numpy.where(moves, self.model.interval, 0.0)
         self._send(values.T, available.T, interval, acted.T)
         if self._is_asked:
-            self._update.answer(self._no_action if action is None else self._actions(action, moves))
+            self._update.act(self._no_action if action is None else self._actions(action, moves))
         found = self._update.report()
         mean, variance = found["mean"].reshape(-1, self._lanes), found["variance"].reshape(-1, self._lanes)
         if self._needs_innovation:
@@ -299,7 +299,7 @@ class Estimates:
         )
         if self._lanes == 1:
             parts = tuple(None if part is None else part[..., 0] for part in parts)
-        self._update.arrive(StateSpaceMeasurement(*parts))
+        self._update.receive(StateSpaceMeasurement(*parts))
 
     def _actions(self, action: Array, moves: Array | None) -> Array:
         """Return actions of the whole width; zero in lanes whose filter stands still."""

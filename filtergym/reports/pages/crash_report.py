@@ -12,9 +12,9 @@ from ...evaluation.stress.crash_test import (
     DEGRADED,
     DESCRIPTIONS,
     FAILED,
+    NOT_CONTAINED,
     NOTHING,
     PASSED,
-    UNSAID,
     Finding,
 )
 
@@ -36,8 +36,8 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
         findings: of the competitor, in the order of the catalogue.
         described: whether each line says what happens.
     """
-    left_out = [finding.alteration for finding in findings if finding.reason == UNSAID]
-    notes = f"Does not apply, as {UNSAID}: {', '.join(left_out)}." if left_out else ""
+    left_out = [finding.alteration for finding in findings if finding.reason == NOT_CONTAINED]
+    notes = f"Does not apply, as {NOT_CONTAINED}: {', '.join(left_out)}." if left_out else ""
     table = Table(
         title=f"{findings[0].competitor}: {count_verdicts(findings)}",
         caption=notes or None,
@@ -47,7 +47,7 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
     for name in ("alteration", *["what happens"] * described, "verdict", "how"):
         table.add_column(name)
     for finding in findings:
-        if finding.reason != UNSAID:
+        if finding.reason != NOT_CONTAINED:
             what = [DESCRIPTIONS[finding.alteration]] * described
             verdict = Text(finding.verdict, STYLES[finding.verdict])
             table.add_row(finding.alteration, *what, verdict, Text(finding.reason))

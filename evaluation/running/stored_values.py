@@ -1,4 +1,4 @@
-"""What is kept of every measurement of an episode, and of the first episodes only."""
+"""Values that an evaluation stores of every measurement of an episode, and of the first episodes only."""
 
 import math
 from dataclasses import dataclass
@@ -9,20 +9,20 @@ from ...envs.engine.reward import compressed_cost
 from ...filters.gaussian import log_density
 
 DRAWN_PREFIX = "drawn_"
-"""Begins the names of what is kept of the first episodes only."""
+"""Prefix of the names of values that are stored of the first episodes only."""
 
 
 def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
-    """Normalised squared error of the components whose truth is known, with their marginal covariance.
+    """Return the normalised squared error of the components whose truth is known, with their marginal covariance.
 
     Args:
         model: task with a filter.
-        error: estimate minus truth, ``(C, N)``; NaN where the truth is not known, or nothing is estimated.
-        covariance: reported for it, ``(C, C, N)``.
+        error: estimate minus truth, ``(C, N)``; NaN where the truth or the estimate is unknown.
+        covariance: reported covariance, ``(C, C, N)``.
 
     Returns:
-        ``nees``, ``(N,)``; where some truth is not known, NaN where none is, and beside it how many components are
-        known, ``nees_degrees``.
+        ``nees``, ``(N,)``. With partly unknown truth it is NaN where all is unknown, and ``nees_degrees`` gives the
+        number of known components.
     """
     if model.task.has_whole_truth and model.filter.stated is None:
         return {"nees": log_density(error, covariance)[1]}
@@ -31,7 +31,7 @@ def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, An
     if model.filter.stated is not None:
         variance = xp.stack([covariance[i, i] for i in range(len(error))])
         known = known & (variance == variance)
-    # A component of its own, with error zero: what remains is the quadratic form of the marginal covariance.
+    # Unknown components become independent with error zero: the rest is the quadratic form of the marginal covariance.
     pairs = known[:, None] & known[None]
     apart = xp.eye(len(model.task.components), dtype=error.dtype, device=error.device)[:, :, None]
     squared = log_density(xp.where(known, error, 0.0), xp.where(pairs, covariance, apart))[1]
@@ -40,16 +40,16 @@ def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, An
 
 
 @dataclass(frozen=True)
-class Kept:
-    """What is kept of every measurement of a competitor, as a report on a model and its episodes."""
+class StoredValues:
+    """Report function of the values that are stored of every measurement of a competitor."""
 
     tracks: bool = False
-    """What a track is drawn from, too."""
+    """Whether to include the data of plots of tracks."""
     drawings: bool = False
-    """What a picture of a track shows, too, under names that begin with :data:`DRAWN_PREFIX`."""
+    """Whether to include the data of pictures of tracks, under names that begin with :data:`DRAWN_PREFIX`."""
 
     def __call__(self, model: Model, episode: Episode) -> dict[str, Any]:
-        """Report it, arrays ``(..., N)``; of the truth nothing where it is not known."""
+        """Return the values by name, arrays ``(..., N)``; without truth those that need it are left out."""
         found = {}
         if model.task.has_truth:
             error = model.error(episode)
@@ -68,5 +68,5 @@ class Kept:
 
 
 def limits(model: Model, episode: Episode) -> dict[str, Any]:
-    """What is kept of a bound."""
+    """Return the values that are stored of a bound."""
     return model.filter.records(episode.filter, episode.measurement)
