@@ -135,8 +135,8 @@ class FittedLog:
         return self._cut[key]
 
     def likelihood(self, spans: Sequence[Span], tunable: Tunable, thinned: bool = False) -> WindowLikelihood:
-        """Likelihood of a tunable's parameters on spans of the recording; of an anchored one, or where that is asked
-        for, of measurements that are ``APART``.
+        """Return the likelihood of a tunable's parameters on spans of the recording; of an anchored one, or where
+        that is asked for, of measurements that are ``APART``.
         """
         windows = self.windows(spans, tunable.anchored or thinned)
         return WindowLikelihood(self.task, windows, tunable.start, tunable.apply, tunable.in_lanes)

@@ -32,7 +32,7 @@ CERTAIN = math.inf
 
 
 def scale_ratio(squares: Any, degrees: Any, factor: float) -> Any:
-    """Log-likelihood ratio of innovations whose variance is ``factor`` times the expected one.
+    """Return the log-likelihood ratio of innovations whose variance is ``factor`` times the expected one.
 
     Args:
         squares: normalised innovation squared, chi-square if nothing is wrong.
@@ -43,12 +43,12 @@ def scale_ratio(squares: Any, degrees: Any, factor: float) -> Any:
 
 
 def shift_ratio(normalised: Any, mean: float) -> Any:
-    """Log-likelihood ratio of normalised innovations with that mean in place of zero."""
+    """Return the log-likelihood ratio of normalised innovations with that mean in place of zero."""
     return mean * (normalised - 0.5 * mean)
 
 
 def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
-    """Log-likelihood ratios of innovations that are larger, smaller, or to one side, ``(N, 4 C)``.
+    """Return the log-likelihood ratios of innovations that are larger, smaller, or to one side, ``(N, 4 C)``.
 
     Args:
         normalised: innovations over their predicted deviation, ``(N, C)``.
@@ -60,7 +60,7 @@ def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> nump
 
 
 def certain(wrong: numpy.ndarray) -> numpy.ndarray:
-    """Evidence of what nothing but a fault explains, ``(N, 1)``; ``wrong`` is ``(N,)``."""
+    """Return the evidence of what nothing but a fault explains, ``(N, 1)``; ``wrong`` is ``(N,)``."""
     return numpy.where(wrong, CERTAIN, 0.0)[:, None]
 
 
@@ -91,7 +91,8 @@ class Alarm:
         self.decisions: int = max(self.task.horizon // self.task.decision_interval, 1)
 
     def measurements(self, before: numpy.ndarray) -> numpy.ndarray:
-        """Measurements that an observation tells of, ``(N, 1)``: since the last one, or at an episode's start, one.
+        """Return the measurements that an observation tells of, ``(N, 1)``: since the last one, or at an episode's
+        start, one.
 
         Args:
             before: the last observation; NaN where an episode begins.
@@ -99,7 +100,8 @@ class Alarm:
         return numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood ratios of something wrong to nothing wrong, a column for each kind, ``(N, kinds)``.
+        """Return the log-likelihood ratios of something wrong to nothing wrong, a column for each kind, ``(N,
+        kinds)``.
 
         Args:
             observation: ``(N, fields)``.

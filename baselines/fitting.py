@@ -312,7 +312,7 @@ def _find_maxima(likelihood: WindowLikelihood, tunable: Tunable, seed: int, star
 
 
 def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarray) -> numpy.ndarray:
-    """Second derivatives of the log-likelihood by central differences, ``(P, P)``."""
+    """Return the second derivatives of the log-likelihood by central differences, ``(P, P)``."""
     P, moves = len(at), numpy.diag(step)
     pairs = [(i, j) for i in range(P) for j in range(i, P)]
     signs = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
@@ -366,7 +366,9 @@ def _search_profiles(
     tick: Callable[[float], None],
     stop: bool = True,
 ) -> tuple[dict[str, Profile], numpy.ndarray | None]:
-    """Profiles, and a point that is likelier than the fit, at which the search ends if it is to ``stop``."""
+    """Return the profiles, and a point that is likelier than the fit, at which the search ends if it is to
+    ``stop``.
+    """
     limits = numpy.array(list(tunable.limits.values())).T
     best = numpy.array([found.values[name] for name in tunable.limits])
     information = _information(likelihood, best, limits)
@@ -500,7 +502,7 @@ def _newton_step(
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:
-    """Curvature of the likelihood at its maximum; a direction without one is taken for a flat one."""
+    """Return the curvature of the likelihood at its maximum; a direction without one is taken for a flat one."""
     low, high = limits
     step = numpy.minimum(0.02, 0.01 * (high - low))
     H = _hessian(likelihood, numpy.clip(best, low + 2.0 * step, high - 2.0 * step), step)
@@ -511,7 +513,9 @@ def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: nump
 
 
 def _profile_end(way: _Way) -> tuple[float, bool]:
-    """Distance at which the likelihood has fallen far enough, and whether it has not done so at the limit."""
+    """Return the distance at which the likelihood has fallen far enough, and whether it has not done so at the
+    limit.
+    """
     distances = [0.0, *way.distances]
     # A drop grows with the square of the distance: it is interpolated in its root.
     roots = [0.0, *numpy.sqrt(numpy.clip(way.drops, 0.0, None)).tolist()]

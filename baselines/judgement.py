@@ -143,7 +143,7 @@ class Judgement:
         self._chosen, self._judged = scores.log_likelihood
 
     def _least(self, squares: PairSums | None, log_likelihood: PairSums) -> str:
-        """Shipped filter of smallest mean square; by log-likelihood where there are no squares."""
+        """Return the shipped filter of smallest mean square; by log-likelihood where there are no squares."""
         numbers = self._numbers
         means = {
             name: -log_likelihood.mean(numbers[name]) if squares is None else squares.mean(numbers[name])
@@ -152,8 +152,8 @@ class Judgement:
         return min(means, key=lambda name: (math.isnan(means[name]), means[name]))
 
     def rival(self, operations: Callable[[str], float]) -> str:
-        """Shipped filter that one would take by the measurements that chose: the default where the likeliest does not
-        beat it beyond chance, else the cheapest that is ``AS_GOOD`` as the likeliest.
+        """Return the shipped filter that one would take by the measurements that chose: the default where the
+        likeliest does not beat it beyond chance, else the cheapest that is ``AS_GOOD`` as the likeliest.
 
         Args:
             operations: of an update of a competitor.
@@ -185,23 +185,25 @@ class Judgement:
         return low > 0.0 or (low > -AS_GOOD and operations(fitted.name) < operations(rival))
 
     def _judged_squares(self) -> PairSums | None:
-        """Squares of judged errors; without truth of the prediction errors."""
+        """Return the squares of judged errors; without truth of the prediction errors."""
         predicted = self.scores.predicted
         return self.scores.squared or (None if predicted is None else predicted[1])
 
     def best_shipped(self) -> str:
-        """Shipped filter that is best on the measurements that judge."""
+        """Return the shipped filter that is best on the measurements that judge."""
         return self._least(self._judged_squares(), self._judged)
 
     def relative_error(self, name: str, other: str) -> IntervalEstimate:
-        """Judged error over that of another, less one; without truth of the prediction errors."""
+        """Return the judged error over that of another, less one; without truth of the prediction errors."""
         squares, known = self._judged_squares(), self._numbers if self.scores.squared else self._predicting
         if squares is None or name not in known or other not in known:
             return UNKNOWN
         return squares.relative_root(self._numbers[name], self._numbers[other])
 
     def difference(self, name: str, other: str) -> IntervalEstimate:
-        """Chosen log-likelihood of a filter less that of another, their fitted parameters paid for, nats."""
+        """Return the chosen log-likelihood of a filter less that of another, their fitted parameters paid for,
+        nats.
+        """
         found = self._chosen.difference(self._numbers[name], self._numbers[other])
         penalty = self._penalty(name) - self._penalty(other)
         return IntervalEstimate(*(value - penalty for value in found))

@@ -73,16 +73,16 @@ class PairSums:
             self.counts[number] += there @ there.T
 
     def total(self, i: int) -> tuple[float, int]:
-        """Sum of a competitor over all stretches, and how many measurements it is of."""
+        """Return the sum of a competitor over all stretches, and how many measurements it is of."""
         return float(self.sums[:, i, i].sum()), int(self.counts[:, i, i].sum())
 
     def mean(self, i: int) -> float:
-        """Mean of a competitor; NaN where nothing is finite."""
+        """Return the mean of a competitor; NaN where nothing is finite."""
         total, count = self.total(i)
         return total / count if count else math.nan
 
     def difference(self, i: int, j: int) -> IntervalEstimate:
-        """Mean of competitor i less that of j, paired."""
+        """Return the mean of competitor i less that of j, paired."""
         counts = self.counts[:, i, j]
         sums = numpy.stack([self.sums[:, i, j] - self.sums[:, j, i], counts], axis=1)
         return interval_of_sums(sums, counts, ratio)
@@ -127,8 +127,8 @@ class _Whiteness:
                 self._sums[i, :, j] += numpy.bincount(stretch[there], pair[j][there], count)
 
     def correlations(self) -> list[IntervalEstimate]:
-        """Correlation of successive errors of the first group together, and of each number that is measured: of each
-        received one with the last received before.
+        """Return the correlation of successive errors of the first group together, and of each number that is
+        measured: of each received one with the last received before.
         """
         pairs = zip(self._sums, self._counts, strict=True)
         return [interval_of_sums(sums, counts, ratio) for sums, counts in pairs]
@@ -222,8 +222,8 @@ class LogScores:
                 sums.add(squares, first)
 
     def _predict(self, i: int, estimate: numpy.ndarray, measurement: Any, first: int) -> numpy.ndarray:
-        """Squared prediction error of the first group, ``(E, rows)``, of what competitor i estimates, ``(C, E, rows)``;
-        its products are added up.
+        """Return the squared prediction error of the first group, ``(E, rows)``, of what competitor i estimates,
+        ``(C, E, rows)``; its products are added up.
         """
         before = numpy.concatenate([self._estimates[i], estimate[..., :-1]], axis=2)
         self._estimates[i] = estimate[..., -1:].copy()
@@ -254,7 +254,9 @@ class LogScores:
         return squares / degrees if degrees else math.nan
 
     def correlation(self, i: int) -> IntervalEstimate:
-        """Correlation of the successive judged prediction errors of competitor i; zero where they are white."""
+        """Return the correlation of the successive judged prediction errors of competitor i; zero where they are
+        white.
+        """
         return self._whiteness[i].correlations()[0]
 
     def correlations(self, i: int) -> dict[str, IntervalEstimate]:

@@ -17,13 +17,13 @@ class MeasurementNoise:
     """Noise as stated, by the sensor or its data sheet; subclasses estimate it."""
 
     def start(self, stated: Array) -> Any:
-        """Memory where nothing but the stated variance is known, ``(N,)``."""
+        """Return the memory where nothing but the stated variance is known, ``(N,)``."""
         return ()
 
     def update(
         self, memory: Any, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, Any]:
-        """Variance of a measurement and memory, in the sensor's unit.
+        """Return the variance of a measurement and memory, in the sensor's unit.
 
         Args:
             memory: after the measurement before.
@@ -74,7 +74,7 @@ class SageHusaMeasurementNoise(FadingNoise):
     """By the fading mean square of the innovations; arguments as of :class:`FadingNoise`."""
 
     def start(self, stated: Array) -> adaptation.Level:
-        """Level at the stated variance."""
+        """Return the level at the stated variance."""
         return adaptation.Level(stated, self.trust + 0.0 * stated)
 
     def update(
@@ -91,7 +91,7 @@ class VariationalBayesMeasurementNoise(FadingNoise):
     iterations = 2
 
     def start(self, stated: Array) -> adaptation.InverseGamma:
-        """Distribution about the stated variance."""
+        """Return the distribution about the stated variance."""
         shape = 0.5 * self.trust + 0.0 * stated
         return adaptation.InverseGamma(shape, shape * stated)
 

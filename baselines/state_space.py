@@ -76,7 +76,7 @@ def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
 
 
 def _numbers(measurement: StateSpaceMeasurement, xp: Any) -> Array:
-    """Values with zero in place of what was not received."""
+    """Return the values with zero in place of what was not received."""
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
 
@@ -186,11 +186,11 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         self.sensor_factors: tuple[Any, dict[str, Any]] = measurement_noise, of_sensors
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
-        """Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
+        """Return the Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.factor * self.equations.process_noise(mean, measurement, self.of_sources)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
-        """R with its factors at a predicted mean ``(n, N)``, ``(m, m, N)`` or ``(m, m, 1)``."""
+        """Return the R with its factors at a predicted mean ``(n, N)``, ``(m, m, N)`` or ``(m, m, 1)``."""
         return self.equations.sensor_noise(mean, measurement, *self.sensor_factors)
 
     def start(self, initial: Initial) -> Any:
@@ -260,7 +260,7 @@ class ExtendedSmoother(Extended):
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
 
     def _filter_in_order(self, settled: EstimateState, measured: StateSpaceMeasurement) -> EstimateState:
-        """Estimates at the start and at K measurements with what came late.
+        """Return the estimates at the start and at K measurements with what came late.
 
         Args:
             settled: what they were ``lateness`` measurements before the start and before each measurement, at least
@@ -289,7 +289,7 @@ class ExtendedSmoother(Extended):
 
 
 def _put_in_order(measured: StateSpaceMeasurement, lateness: int, xp: Any) -> StateSpaceMeasurement:
-    """Measurements ``(..., K, N)`` with what came late among those that it belongs to."""
+    """Return the measurements ``(..., K, N)`` with what came late among those that it belongs to."""
     plain = measured._replace(values=_numbers(measured, xp), late=None, late_available=None)
     assert measured.late is not None
     assert measured.late_available is not None
@@ -426,7 +426,7 @@ class KnownModel:
 
 
 def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Factors by the names of the sources of Q, and by those of the sensors.
+    """Return the factors by the names of the sources of Q, and by those of the sensors.
 
     Raises:
         ValueError: for what is neither.

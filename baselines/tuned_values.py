@@ -78,7 +78,7 @@ class TunedValues:
     """Files of tuned values, one's own first."""
 
     def _tables(self) -> Iterator[tuple[Any, dict[str, dict[str, Any]]]]:
-        """Files and what they say."""
+        """Return the files and what they say."""
         for place in self.places:
             yield place, read_table(place)
 
@@ -235,5 +235,5 @@ def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
 
 
 def table_path(id: str, folder: Path = FOLDER) -> Path:
-    """File of an environment's tuned values in a folder."""
+    """Return the file of an environment's tuned values in a folder."""
     return folder / f"{short_name(id)}.json"

@@ -85,7 +85,7 @@ def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy
 
 
 def geometric_cost(costs: numpy.ndarray) -> float:
-    """Geometric mean of the costs of episodes."""
+    """Return the geometric mean of the costs of episodes."""
     return float(numpy.exp(numpy.log(costs).mean()))
 
 
@@ -129,7 +129,7 @@ class _Generations:
         self.best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
 
     def cost(self, vector: numpy.ndarray) -> float:
-        """Cost of a candidate; infinite when the budget is spent."""
+        """Return the cost of a candidate; infinite when the budget is spent."""
         if self.spent >= self.allowed:
             return math.inf
         values = dict(zip(self.tunable.limits, map(float, vector), strict=True))

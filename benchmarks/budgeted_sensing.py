@@ -36,7 +36,7 @@ def interval(values: Any, digits: int = 3) -> str:
 
 
 def episode_rows(scenario: str, competitors: dict[str, Any]) -> list[list[str]]:
-    """Costs of everybody in a scenario, over those of the rival on the same noise."""
+    """Return the costs of everybody in a scenario, over those of the rival on the same noise."""
     dataset = filtergym.evaluate(
         sensing.BudgetedSensing.id, competitors, scenario=scenario, episodes=EPISODES[scenario]
     )
@@ -55,7 +55,7 @@ def episode_rows(scenario: str, competitors: dict[str, Any]) -> list[list[str]]:
 
 
 def spaced_costs(R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
-    """Settled mean squared error of a target that is looked at every 1, 2, ... seconds, ``(GAPS, ...)``."""
+    """Return the settled mean squared error of a target that is looked at every 1, 2, ... seconds, ``(GAPS, ...)``."""
     found = []
     for gap in range(1, GAPS + 1):
         P, total, seconds = _begun(R), 0.0, 0
@@ -70,7 +70,8 @@ def spaced_costs(R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
 
 
 def relaxed_bound(costs: numpy.ndarray) -> numpy.ndarray:
-    """Least mean cost of targets whose looks are one a second in all, ``(N,)``: the largest over the multiplier.
+    """Return the least mean cost of targets whose looks are one a second in all, ``(N,)``: the largest over the
+    multiplier.
 
     Args:
         costs: of each target by the seconds between its looks, ``(GAPS, 4, N)``.
@@ -100,7 +101,7 @@ def _begun(R: numpy.ndarray) -> numpy.ndarray:
 
 
 def schedule_rows(scenario: str, count: int = 500) -> list[list[str]]:
-    """Costs of policies over the bound, on covariances alone."""
+    """Return the costs of policies over the bound, on covariances alone."""
     parameters = sensing.BudgetedSensing.scenarios[scenario].parameters
     model = make_model(sensing.BudgetedSensing, "beam", backend="numpy", **parameters)
     own, rng = model.task.parameters, numpy.random.default_rng(0)

@@ -277,7 +277,7 @@ def python_of(name: str) -> str:
 
 
 def measure(client: str, id: str) -> dict[str, Any]:
-    """Steps per second of a client in an environment, or why there is none."""
+    """Return the steps per second of a client in an environment, or why there is none."""
     _, distribution, rollouts = CLIENTS[client]
     try:
         version = importlib.metadata.version(distribution)

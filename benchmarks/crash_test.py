@@ -23,7 +23,7 @@ COLUMNS = ["", "passed", "degraded", "failed", "degraded under", "failed under"]
 
 
 def row(name: str, findings: Sequence[Finding]) -> list[str]:
-    """Row of the table."""
+    """Return the row of the table."""
     by_verdict = {
         verdict: [one.alteration for one in findings if one.verdict == verdict]
         for verdict in ("passed", "degraded", "failed")

@@ -53,7 +53,7 @@ def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple
 
 
 def gradients(run: TrainingRun, backend: str) -> torch.Tensor:
-    """Gradients of all windows of an episode."""
+    """Return the gradients of all windows of an episode."""
     fly, policy = made(run, backend, FEWER, torch.float64)
     found = []
 
@@ -66,7 +66,7 @@ def gradients(run: TrainingRun, backend: str) -> torch.Tensor:
 
 
 def update_times(run: TrainingRun, repeat: int) -> list[float]:
-    """Milliseconds of an update with each backend."""
+    """Return the milliseconds of an update with each backend."""
     prepared = []
     for backend in BACKENDS:
         fly, policy = made(run, backend, run.envs, torch.float32)

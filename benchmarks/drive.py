@@ -181,7 +181,7 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
 def dataset(
     truth: numpy.ndarray, ins: numpy.ndarray, fix: numpy.ndarray, deviation: float, starts: numpy.ndarray
 ) -> xarray.Dataset:
-    """Recordings in the form of files.
+    """Return the recordings in the form of files.
 
     Args:
         truth: positions from the start of each window on, m, ``(episode, 1 + time, axis)``.
@@ -227,14 +227,14 @@ def dataset(
 
 
 def errors(recorded: xarray.Dataset) -> numpy.ndarray:
-    """INS position less truth, m, a row for each recording and axis, ``(n, time)``."""
+    """Return the INS position less truth, m, a row for each recording and axis, ``(n, time)``."""
     difference = (recorded["ins"].to_numpy() - recorded["truth"].to_numpy()).transpose(0, 2, 1)
     return difference.reshape(-1, difference.shape[-1])
 
 
 def modelled(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
-    """Covariance of the environment's INS error at times, s, ``(n, n)``, m^2: the integral of a constant, of an
-    exponentially correlated and of a white rate error.
+    """Return the covariance of the environment's INS error at times, s, ``(n, n)``, m^2: the integral of a
+    constant, of an exponentially correlated and of a white rate error.
     """
     s, t, tau = time[:, None], time, levels["correlation_time"]
     coloured = 2.0 * tau * numpy.minimum(s, t) - tau**2 * (
@@ -250,8 +250,8 @@ def modelled(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
 def likeliest(
     recorded: xarray.Dataset, correlation_time: float | None = None
 ) -> tuple[dict[str, float], float]:
-    """Levels of the INS errors under which fixes less INS positions are likeliest, and their log-likelihood for each
-    of them.
+    """Return the levels of the INS errors under which fixes less INS positions are likeliest, and their log-likelihood
+    for each of them.
 
     The receiver's noise is part of it: what matters is what a filter can see through that.
 

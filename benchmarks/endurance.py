@@ -31,7 +31,7 @@ CHECKED_EVERY = 10
 
 
 def actions(space: gymnasium.Space, generator: numpy.random.Generator, size: int) -> numpy.ndarray:
-    """Random actions, half of the continuous ones on the edge of the space."""
+    """Return the random actions, half of the continuous ones on the edge of the space."""
     if isinstance(space, gymnasium.spaces.Discrete):
         return generator.integers(space.n, size=size)
     assert isinstance(space, gymnasium.spaces.Box)

@@ -38,7 +38,7 @@ Controller = Callable[[numpy.ndarray], Any]
 
 
 def cart_pole() -> Controller:
-    """Linear-quadratic regulator of the upright pole, whose force is rounded to left or right."""
+    """Return the linear-quadratic regulator of the upright pole, whose force is rounded to left or right."""
     model, n = CLASSIC_CONTROL["CartPole"], 4
     step = 1e-6
     origin = numpy.zeros(n)
@@ -51,7 +51,7 @@ def cart_pole() -> Controller:
 
 
 def pendulum(x: numpy.ndarray) -> Any:
-    """Energy pumping (Astrom and Furuta, 2000), then proportional and derivative control near the top."""
+    """Return the energy pumping (Astrom and Furuta, 2000), then proportional and derivative control near the top."""
     angle = (x[0] + math.pi) % (2.0 * math.pi) - math.pi
     energy = x[1] ** 2 / 6.0 + 5.0 * math.cos(angle) - 5.0
     near = math.cos(angle) > 0.85
@@ -60,12 +60,12 @@ def pendulum(x: numpy.ndarray) -> Any:
 
 
 def mountain_car(x: numpy.ndarray) -> Any:
-    """Full force along the velocity."""
+    """Return the full force along the velocity."""
     return numpy.array([math.copysign(1.0, x[1])], dtype=numpy.float32)
 
 
 def acrobot(x: numpy.ndarray) -> Any:
-    """Torque along the rate of the second link, which pumps energy."""
+    """Return the torque along the rate of the second link, which pumps energy."""
     return 2 if x[3] > 0.0 else 0
 
 

@@ -119,7 +119,7 @@ class Compilers(NamedTuple):
 
 
 def size_of(file: Path, compilers: Compilers) -> Size:
-    """Size of an exported filter, compiled to be small by gcc."""
+    """Return the size of an exported filter, compiled to be small by gcc."""
     code = _code_bytes(file, [compilers.own, "-fstack-usage"])
     usage = file.with_suffix(".small.su").read_text(encoding="utf-8").splitlines()
     stack = max(int(line.split("\t")[1]) for line in usage)
@@ -128,7 +128,7 @@ def size_of(file: Path, compilers: Compilers) -> Size:
 
 
 def _code_bytes(file: Path, compiler: list[str]) -> int:
-    """Bytes of code and constants."""
+    """Return the bytes of code and constants."""
     made = file.with_suffix(".small.o").name
     subprocess.run([*compiler, *FLAGS, "-Os", "-c", file.name, "-o", made], cwd=file.parent, check=True)
     # The one beside it: arm-none-eabi-size of arm-none-eabi-gcc.
@@ -140,7 +140,9 @@ def _code_bytes(file: Path, compiler: list[str]) -> int:
 def run_in_c(
     name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compilers: Compilers
 ) -> tuple[float, float, Writer, Size]:
-    """Largest difference, in standard deviations, nanoseconds an update, what wrote the files, and their size."""
+    """Return the largest difference, in standard deviations, nanoseconds an update, what wrote the files, and their
+    size.
+    """
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
     batch = BATCH.format(
@@ -215,7 +217,7 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
 
 
 def least_time(call: Any, count: int) -> float:
-    """Least nanoseconds of a call, over runs of some calls."""
+    """Return the least nanoseconds of a call, over runs of some calls."""
     call()
     times = []
     for _ in range(7):

@@ -107,7 +107,7 @@ def sets(smoothing: float) -> dict[str, Flights]:
 
 
 def _every(pieces: list) -> list:
-    """Pieces of a set, or every second, third, ... of a set that is too long for one scenario."""
+    """Return the pieces of a set, or every second, third, ... of a set that is too long for one scenario."""
     scans = sum(piece.intervals(INTERVAL) for piece in pieces)
     return pieces[:: 1 + int(scans // MOST_SCANS)]
 

@@ -52,7 +52,7 @@ class Nearest(NamedTuple):
 
 
 def asked_names(problem: Problem) -> list[str]:
-    """Names of all that is ranked, each under its own control, but random actions."""
+    """Return the names of all that is ranked, each under its own control, but random actions."""
     policies = problem.baselines.policies
     return [name for name in ranked_names(problem) if policies.get(name) is not RandomPolicy]
 

@@ -39,7 +39,7 @@ SEQUENCES = 100
 
 
 def accelerations(family: str, count: int, rng: numpy.random.Generator) -> numpy.ndarray:
-    """Size of the acceleration in every interval, m/s^2."""
+    """Return the size of the acceleration in every interval, m/s^2."""
     true = TRUE[family]
     if family == "constant-velocity":
         return numpy.full(count, true["acceleration"])
@@ -74,8 +74,9 @@ def simulated_log(folder: Path, family: str, measurements: int, seed: int) -> Re
 
 
 def likelihood_of_sequences(recording: Recording, values: dict[str, float]) -> float:
-    """Log-likelihood of a log without gaps under ``imm-two``, nats: of each sequence of modes a Kalman filter, of which
-    the ``SEQUENCES`` likeliest are kept and none are merged. With a ratio of one it is that of one Kalman filter.
+    """Return the log-likelihood of a log without gaps under ``imm-two``, nats: of each sequence of modes a Kalman
+    filter, of which the ``SEQUENCES`` likeliest are kept and none are merged. With a ratio of one it is that of one
+    Kalman filter.
 
     Args:
         recording: of one track.

@@ -35,7 +35,7 @@ def tree(root: int) -> list[int]:
 
 
 def resident(processes: list[int]) -> float:
-    """Memory of processes together, GiB; what they share is shared out among them."""
+    """Return the memory of processes together, GiB; what they share is shared out among them."""
     total = 0
     for process in processes:
         try:

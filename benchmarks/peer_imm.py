@@ -12,7 +12,7 @@ PEER_OF = "filtergym/ManeuveringTarget-v0"
 
 
 def imm_steps_per_second(steps: int) -> float:
-    """Rate of ``predict`` and ``update`` of one estimator, in steps per second of processor time."""
+    """Return the rate of ``predict`` and ``update`` of one estimator, in steps per second of processor time."""
     from filterpy.kalman import IMMEstimator, KalmanFilter
 
     T = 6.0

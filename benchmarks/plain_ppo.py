@@ -112,7 +112,7 @@ def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
 
 
 def table(runs: list[dict]) -> Table:
-    """Mean over the seeds with Student's interval for a new one, and every seed."""
+    """Return the mean over the seeds with Student's interval for a new one, and every seed."""
     from scipy.stats import t
 
     title = "Stable-Baselines3, its defaults and ours: cost against the paper, %"

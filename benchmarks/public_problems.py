@@ -85,7 +85,7 @@ INTERVAL = 0.02
 
 
 def taylor(x: Any, order: int) -> list[Any]:
-    """KalmanNet's transition: the Taylor series of ``exp(A(x) T)`` to some order, applied to the state."""
+    """Return KalmanNet's transition: the Taylor series of ``exp(A(x) T)`` to some order, applied to the state."""
     answer, term = list(x), list(x)
     for j in range(1, order + 1):
         term = [entry * (INTERVAL / j) for entry in _product(x, term)]
@@ -116,12 +116,12 @@ def flow(x: Any, steps: int = 4) -> list[Any]:
 
 
 def order_five(x: Any) -> list[Any]:
-    """Transition of the generator, and of a filter with full information."""
+    """Return the transition of the generator, and of a filter with full information."""
     return taylor(x, 5)
 
 
 def order_two(x: Any) -> list[Any]:
-    """Transition of a filter with partial information."""
+    """Return the transition of a filter with partial information."""
     return taylor(x, 2)
 
 
@@ -167,7 +167,7 @@ WHEEL_SCALE = 1.075
 
 
 def drive(x: Any) -> list[Any]:
-    """Forward along the heading for a second."""
+    """Return the forward along the heading for a second."""
     middle = x[3] + 0.5 * x[4]
     return [
         x[0] + x[2] * numpy.cos(middle),
@@ -251,7 +251,7 @@ def read_tensors(file: Path) -> Any:
 
 
 def stored_linear(folder: Path, id: str) -> Recording:
-    """KalmanNet's stored test set of the linear problem, 200 tracks of 100 measurements."""
+    """Return KalmanNet's stored test set of the linear problem, 200 tracks of 100 measurements."""
     stored = read_tensors(folder / "Simulations/Linear_canonical/data/2x2_rq020_T100.pt")
     z, truth = (part.double().numpy().swapaxes(1, 2) for part in stored[4:6])
     episodes, times, _ = z.shape
@@ -268,7 +268,8 @@ def stored_linear(folder: Path, id: str) -> Recording:
 
 
 def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]:
-    """Drives of filternet's NCLT problem, and the RMSE a coordinate of the receiver alone, held where it is silent.
+    """Return the drives of filternet's NCLT problem, and the RMSE a coordinate of the receiver alone, held where it is
+    silent.
 
     Args:
         folder: of the repository.
@@ -414,7 +415,7 @@ class Problem(NamedTuple):
 
 
 def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: Path) -> dict[str, Any]:
-    """Filters of a problem by their names: as written, tuned and trained.
+    """Return the filters of a problem by their names: as written, tuned and trained.
 
     Args:
         problem: of them.
@@ -433,7 +434,9 @@ def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: 
 
 
 def tune_drives(recording: Recording) -> dict[str, float]:
-    """Factors with the least squared error over the validation drives, by the simplex method from some starts."""
+    """Return the factors with the least squared error over the validation drives, by the simplex method from some
+    starts.
+    """
     from scipy.optimize import minimize
 
     def cost(logarithms: numpy.ndarray) -> float:
@@ -452,7 +455,7 @@ def tune_drives(recording: Recording) -> dict[str, float]:
 
 
 def judge_drives(folder: Path, runs: Path) -> tuple[list[dict[str, Any]], dict[str, float]]:
-    """RMSE a coordinate of every test drive by the receiver alone and by filters, and the tuned factors."""
+    """Return the RMSE a coordinate of every test drive by the receiver alone and by filters, and the tuned factors."""
     recording, held = stored_drives(folder, "test")
     file = runs / "drives.tuned.json"
     if not file.exists():
@@ -497,7 +500,7 @@ def _text(value: float, digits: int) -> str:
 
 
 def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns and rows of the table of the problems of state-space models."""
+    """Return the columns and rows of the table of the problems of state-space models."""
     rows = []
     if "noise_floor_db" in figures:
         floor = _text(figures["noise_floor_db"], 3)
@@ -520,7 +523,7 @@ def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns and rows of the table of drives, what is published first."""
+    """Return the columns and rows of the table of drives, what is published first."""
     rows = [["published", name, *(_text(v, 2) for v in values), "", ""] for name, values in PUBLISHED.items()]
     for one in figures["drives"]:
         anees = ", ".join(_text(one["anees"][date], 1) for date in DATES) if "anees" in one else ""

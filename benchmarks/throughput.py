@@ -65,14 +65,14 @@ Record = dict[str, Any]
 
 
 def processor_seconds(call: Callable[[], object]) -> float:
-    """Time that this process was given for a call."""
+    """Return the time that this process was given for a call."""
     begin = time.process_time()
     call()
     return time.process_time() - begin
 
 
 def median_seconds(call: Callable[[], object], share: float, fewest: int = 3) -> float:
-    """Median time of a call over rounds that take ``share`` seconds together."""
+    """Return the median time of a call over rounds that take ``share`` seconds together."""
     call()  # compiles; warms caches and clocks
     times: list[float] = []
     while len(times) < fewest or sum(times) < share:
@@ -84,7 +84,7 @@ def median_seconds(call: Callable[[], object], share: float, fewest: int = 3) ->
 
 
 def step_seconds(env: Any, share: float) -> float:
-    """Median time of a step, with its share of a reset of all environments."""
+    """Return the median time of a step, with its share of a reset of all environments."""
     env.action_space.seed(0)
     actions = itertools.cycle([env.action_space.sample() for _ in range(8)])
     length = getattr(env.unwrapped, "last_decision", 500)
@@ -136,7 +136,9 @@ class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def compiled_costs() -> tuple[float, float]:
-    """Seconds of an addition or product, and of an exponential, in compiled programs that do nothing else."""
+    """Return the seconds of an addition or product, and of an exponential, in compiled programs that do nothing
+    else.
+    """
     chains, links, x = 16, 64, numpy.linspace(-1.0, 1.0, 16 * 8).reshape(16, 8)
 
     def arithmetic(x: Any) -> Any:
@@ -165,7 +167,7 @@ def compiled_costs() -> tuple[float, float]:
 
 
 def floor_seconds(model: Any) -> float:
-    """Seconds of the arithmetic that is left in the programs of a compiled step of one episode."""
+    """Return the seconds of the arithmetic that is left in the programs of a compiled step of one episode."""
     parts = model.programs.later
     programs = [parts.update, parts.advance, parts.predict, model.programs.report_program(cost_reward)]
     names = [step.operation for special in programs for step in special.program.steps]
@@ -177,7 +179,7 @@ def floor_seconds(model: Any) -> float:
 
 
 def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Record]:
-    """Step by the compiled backend, by NumPy, by JAX, and by filterpy."""
+    """Return the step by the compiled backend, by NumPy, by JAX, and by filterpy."""
     try:
         import jax  # noqa: F401
         import peer_jax
@@ -234,7 +236,9 @@ _STEP = (
 
 
 def run_apart(code: str) -> tuple[float, float]:
-    """Processor seconds and peak memory in MB of the last of two runs of some code in a process of its own."""
+    """Return the processor seconds and peak memory in MB of the last of two runs of some code in a process of its
+    own.
+    """
     # Not getrusage: what it says of a process begins with the memory of the one that started it.
     program = (
         "import re, pathlib, time, gymnasium, numpy, filtergym\ndef run():\n    "

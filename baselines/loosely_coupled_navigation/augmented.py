@@ -77,7 +77,7 @@ class AugmentedFilter:
         self.noise = noise
 
     def start(self, none: Array) -> AugmentedMemory:
-        """Memory at the start of the track.
+        """Return the memory at the start of the track.
 
         Args:
             none: zeros, ``(A, N)``.
@@ -86,7 +86,7 @@ class AugmentedFilter:
         return AugmentedMemory(none, none, p.prior_covariance(zero), zero, self.noise.start(zero), zero)
 
     def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
-        """Displacement that the rate errors make in a step, m, ``(A, N)``, and memory."""
+        """Return the displacement that the rate errors make in a step, m, ``(A, N)``, and memory."""
         p, s = self.parameters, self.parameters.sampling
         P = ins_gnss.predict_augmented(memory.covariance, s, *p.variance_growth)
         displacement = s.step * memory.drift + s.drive * memory.coloured
@@ -95,7 +95,7 @@ class AugmentedFilter:
     def update(
         self, memory: AugmentedMemory, innovation: Array, reported: Array, available: Array
     ) -> tuple[Array, AugmentedMemory]:
-        """Correction of the position, m, ``(A, N)``, and memory.
+        """Return the correction of the position, m, ``(A, N)``, and memory.
 
         Args:
             memory: after :meth:`predict`.

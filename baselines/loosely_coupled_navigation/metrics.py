@@ -51,7 +51,7 @@ UNITS = {
 def recovery_times(
     error: numpy.ndarray, available: numpy.ndarray, limit: float, held: int, longest: int
 ) -> numpy.ndarray:
-    """Samples from the end of an outage until the error stays small, for each episode.
+    """Return the samples from the end of an outage until the error stays small, for each episode.
 
     Args:
         error: size of the error, ``(episodes, time)``.
@@ -97,7 +97,7 @@ def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
 
 
 def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Measurements until a fault is detected, whether it is missed, and alarms before anything is wrong.
+    """Return the measurements until a fault is detected, whether it is missed, and alarms before anything is wrong.
 
     Args:
         alarm: ``(episodes, time)`` booleans.
@@ -154,7 +154,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Measures of recovery, detection and integrity; those of what never happens are left out.
+    """Return the measures of recovery, detection and integrity; those of what never happens are left out.
 
     ``recovery_time`` after an outage and the share of runs that do not recover within a second (``not_recovered``).
     ``detection_time`` of spoofing that is detected, the share that is not while it lasts (``missed_spoofing``), and

@@ -26,7 +26,7 @@ from .references import Matched, MatchedCovariance
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Bank of a task under control ``gain``."""
+    """Return the bank of a task under control ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 
@@ -135,7 +135,7 @@ class TimeVarying(Policy):
         available: numpy.ndarray,
         observation: numpy.ndarray,
     ) -> tuple[_Variances, numpy.ndarray]:
-        """Memory and variance of the measurement noise, ``(N, axes)`` or ``(N, 1)``: here as reported."""
+        """Return the memory and variance of the measurement noise, ``(N, axes)`` or ``(N, 1)``: here as reported."""
         return memory, reported
 
 

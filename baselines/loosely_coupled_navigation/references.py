@@ -132,6 +132,6 @@ class MatchedCovariance(_Matched):
     kind = "bound"
 
     def update(self, memory: ErrorState, measurement: Measurement, truth: Truth) -> tuple[Array, ErrorState]:
-        """Variance of every axis, ``(A, N)``."""
+        """Return the variance of every axis, ``(A, N)``."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

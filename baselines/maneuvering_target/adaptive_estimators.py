@@ -65,7 +65,7 @@ class SageHusaProcessNoise(KalmanModel):
         return ProcessNoiseTrack(*self.track(measurement, result), level)
 
     def diagonal(self, covariance: Array) -> Array:
-        """Variances, ``(4, N)``."""
+        """Return the variances, ``(4, N)``."""
         return self.xp.stack([covariance[i, i] for i in range(4)])
 
 

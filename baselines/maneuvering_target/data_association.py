@@ -26,7 +26,7 @@ class AllPlots(KalmanModel):
     detection_probability: float = 0.9
 
     def density(self, plots: Plots) -> Array:
-        """Plots of the scan over the area of the window, at least of one, 1/m^2, ``(N,)``."""
+        """Return the plots of the scan over the area of the window, at least of one, 1/m^2, ``(N,)``."""
         parameters: ManeuveringTargetParameters = self.task.parameters
         count = ordered_sum(plots.available[i] for i in range(plots.available.shape[0]))
         return self.xp.clip(count, 1.0, None) / parameters.window_area

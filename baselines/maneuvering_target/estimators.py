@@ -26,11 +26,11 @@ class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
         return self.first_track(initial)
 
     def first_track(self, initial: Initial) -> EstimateState:
-        """Estimate before the first scan."""
+        """Return the estimate before the first scan."""
         return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
 
     def mean(self, state: Any) -> Array:
-        """Position and velocity, whatever else is estimated."""
+        """Return the position and velocity, whatever else is estimated."""
         return state.mean[:4]
 
     def covariance(self, state: Any) -> Array:
@@ -38,7 +38,7 @@ class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
         return state.covariance[:4, :4]
 
     def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
-        """State after an update."""
+        """Return the state after an update."""
         return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))
 
 
@@ -159,7 +159,7 @@ class TurnModel(ConstantVelocityModel):
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def noise(self, T: Array) -> Array:
-        """Covariance of the process noise over intervals, s, ``(5, 5, N)``."""
+        """Return the covariance of the process noise over intervals, s, ``(5, 5, N)``."""
         Q = self.variance * self.motion(T)[1]
         return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, (T * self.change) ** 2)[1]
 

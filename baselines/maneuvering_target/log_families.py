@@ -192,7 +192,7 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
 
 
 def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable:
-    """Dead reckoning by a second sensor, with slow errors of the positions.
+    """Return the dead reckoning by a second sensor, with slow errors of the positions.
 
     Limits are narrow where a log says little. An error that lasts for more than five minutes cannot be told from a
     place elsewhere in a log of an hour. Dead reckoning errs by 3 to 10 m after a hundred: to believe it more is

@@ -26,7 +26,7 @@ LASTING = 10
 
 
 def gospa(distance: numpy.ndarray, cutoff: float = CUTOFF) -> numpy.ndarray:
-    """GOSPA of one target and one track, m; NaN stays.
+    """Return the GOSPA of one target and one track, m; NaN stays.
 
     Args:
         distance: between them, m.
@@ -36,8 +36,8 @@ def gospa(distance: numpy.ndarray, cutoff: float = CUTOFF) -> numpy.ndarray:
 
 
 def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
-    """First scan of the first ``LASTING`` in a row beyond ``CUTOFF``, from 0 on, ``(episodes,)``; -1 where there are
-    none.
+    """Return the first scan of the first ``LASTING`` in a row beyond ``CUTOFF``, from 0 on, ``(episodes,)``; -1 where
+    there are none.
 
     Args:
         distance: between target and track, m, ``(episodes, time)``.
@@ -65,7 +65,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Measures of tracks in clutter, of one policy.
+    """Return the measures of tracks in clutter, of one policy.
 
     ``gospa``: mean over scans and episodes, m. ``track_loss_rate``: share of episodes with ``LASTING`` scans in a row
     whose error exceeds ``CUTOFF``; ``track_loss_scan``: median of the first of them, over the tracks lost.

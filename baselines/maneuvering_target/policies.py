@@ -40,7 +40,7 @@ class InteractingMultipleModel(Policy):
         self.log_predicted: Reader = model.reader("log_predicted")
 
     def probabilities(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Posterior mode probabilities, ``(N, M)``."""
+        """Return the posterior mode probabilities, ``(N, M)``."""
         log_predicted, log_likelihood = self.log_predicted(observation), self.log_likelihood(observation)
         return imm.mode_posterior(log_predicted.T, log_likelihood.T).T
 
@@ -65,7 +65,7 @@ class ZeroEvidence(PaperAction):
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Bank of a task under control ``gain``."""
+    """Return the bank of a task under control ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 

@@ -58,7 +58,7 @@ class KnownTurn(KalmanModel):
         return TurnMemory(mean, covariance, Likelihood.unknown(mean[0]), truth)
 
     def block_diagonal(self, first: Array, second: Array) -> Array:
-        """Matrix of two blocks, ``(n + m, n + m, N)``."""
+        """Return the matrix of two blocks, ``(n + m, n + m, N)``."""
         corner = 0.0 * first[:, :1] + 0.0 * second[:1]
         return self.xp.concat(
             [
@@ -112,7 +112,7 @@ class KnownInputBound(ConstantVelocityModel):
     disturbances = DISTURBANCES
 
     def start(self, initial: Initial, truth: Truth) -> Array:
-        """Covariance of the start."""
+        """Return the covariance of the start."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:

@@ -65,7 +65,7 @@ class ClassAlarm(Alarm):
         return numpy.stack([another, one_type, refusals], axis=1)
 
     def _one_type(self, used_count: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood ratio of one type to types drawn anew, of all decisions so far."""
+        """Return the log-likelihood ratio of one type to types drawn anew, of all decisions so far."""
         counts = COUNT_SHOWN * used_count.T
         fixed = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         redrawn = self.log_esm @ counts

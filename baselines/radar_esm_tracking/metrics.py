@@ -24,7 +24,7 @@ TIMES = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 
 
 def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
-    """Ratio of means over episodes, ``(1 + resamples,)``; without numbers where there is no share."""
+    """Return the ratio of means over episodes, ``(1 + resamples,)``; without numbers where there is no share."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return means / shares
 
@@ -32,7 +32,8 @@ def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
 def time_quantile(
     bootstrap: Bootstrap, first: numpy.ndarray, chosen: numpy.ndarray, seconds: numpy.ndarray, share: float
 ) -> IntervalEstimate:
-    """Time by which a share of the chosen episodes has got there; infinite where too few do, NaN where none is chosen.
+    """Return the time by which a share of the chosen episodes has got there; infinite where too few do, NaN where none
+    is chosen.
 
     Args:
         bootstrap: of the episodes.
@@ -46,7 +47,7 @@ def time_quantile(
 
 
 def _first(condition: numpy.ndarray) -> numpy.ndarray:
-    """Index of the first true entry along time, or the number of times, ``(episodes,)``."""
+    """Return the index of the first true entry along time, or the number of times, ``(episodes,)``."""
     return numpy.where(condition.any(axis=1), condition.argmax(axis=1), condition.shape[1])
 
 
@@ -137,7 +138,7 @@ def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
 
 
 def _moments(seconds: numpy.ndarray) -> dict[float, int]:
-    """Indices of the times of :data:`TIMES` that there are."""
+    """Return the indices of the times of :data:`TIMES` that there are."""
     found = {moment: numpy.flatnonzero(numpy.isclose(seconds, moment)) for moment in TIMES}
     return {moment: int(at[0]) for moment, at in found.items() if len(at)}
 
@@ -147,7 +148,7 @@ def _last(seconds: numpy.ndarray) -> int:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Errors by true class, recognition of the class, and calibration, of one policy.
+    """Return the errors by true class, recognition of the class, and calibration, of one policy.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
     ``time_to_recognise_median``, ``_90_quantile`` (first P(true class) >= 0.9) and ``_censored``, the share of

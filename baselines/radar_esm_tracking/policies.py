@@ -60,7 +60,7 @@ class _Posterior(Policy):
         )
 
     def radar(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood of all radar measurements so far, up to a constant."""
+        """Return the log-likelihood of all radar measurements so far, up to a constant."""
         return self.accumulated(observation).T
 
     def counts(self, observation: numpy.ndarray, refused: float = 0.0) -> numpy.ndarray:
@@ -69,7 +69,7 @@ class _Posterior(Policy):
         return COUNT_SHOWN * shown.T
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Log-probability of the classes, up to a constant."""
+        """Return the log-probability of the classes, up to a constant."""
         raise NotImplementedError
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
@@ -81,7 +81,7 @@ class RadarOnly(_Posterior):
     """Class probabilities from the radar's innovations alone."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior and radar."""
+        """Return the prior and radar."""
         return self.log_prior + self.radar(observation)
 
 
@@ -89,7 +89,7 @@ class EsmOnly(_Posterior):
     """Class probabilities from the ESM decisions alone, each taken as new evidence, as in (8)."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior and ESM."""
+        """Return the prior and ESM."""
         return self.log_prior + self.log_esm @ self.counts(observation)
 
 
@@ -101,7 +101,7 @@ class Ungated(_Posterior):
     """
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior, radar, and all decisions."""
+        """Return the prior, radar, and all decisions."""
         return self.log_prior + self.radar(observation) + self.log_esm @ self.counts(observation, 1.0)
 
 
@@ -120,7 +120,7 @@ class JointType(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior, radar, and all decisions as statements about one type."""
+        """Return the prior, radar, and all decisions as statements about one type."""
         counts = self.esm * self.counts(observation, self.refused)
         esm = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         return self.log_prior + self.radar(observation) + esm
@@ -145,7 +145,7 @@ class ForgettingJointType(JointType):
         self.log_start: numpy.ndarray = self.log_prior[:, None] + self.log_composition[..., None]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Radar under the class before, change of class, decisions about the type now."""
+        """Return the radar under the class before, change of class, decisions about the type now."""
         radar, counts = self.radar(observation), self.esm * self.counts(observation, self.refused)
         joint, last_radar, last_counts = (self.log_start, 0.0, 0.0) if state is None else state
         joint = numpy.where(start, self.log_start, joint)
@@ -180,7 +180,7 @@ class Leaky(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Last weights and this scan's radar measurement, transition, this scan's decision."""
+        """Return the last weights and this scan's radar measurement, transition, this scan's decision."""
         last = imm.log_probabilities(self.last_weight(observation).T)
         this_scan = self.log_likelihood(observation).T
         predicted = self.transition.T @ imm.mode_posterior(last, this_scan)

@@ -78,17 +78,19 @@ class _KnownDraw:
         return self.xp.stack([self.xp.stack(row) for row in rows])
 
     def of(self, matrices: Array, target_class: Array) -> Array:
-        """Matrix of each lane's class, ``(3, 3, N)``."""
+        """Return the matrix of each lane's class, ``(3, 3, N)``."""
         return self.xp.take(matrices, target_class, axis=-1)
 
     def white(self, truth: Truth) -> Array:
-        """Covariance of this scan's white errors, ``(2, 2, N)``."""
+        """Return the covariance of this scan's white errors, ``(2, 2, N)``."""
         (a, b), factor = self.deviations, self.task.world.error_factor(truth) ** 2
         cross = a * b * factor * truth.radar_correlation
         return self.matrix([[a * a * factor, cross], [cross, b * b * factor]])
 
     def motion(self, truth: Truth, governed: Array) -> tuple[Array, Array]:
-        """Transition and noise of the scan before this one, ``(n, n, N)``, under the class that governed it."""
+        """Return the transition and noise of the scan before this one, ``(n, n, N)``, under the class that governed
+        it.
+        """
         models = self.task.models
         F, Q = self.of(models.Phi, governed), self.of(models.Q, governed)
         if not self.coloured:

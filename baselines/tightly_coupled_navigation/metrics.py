@@ -25,7 +25,7 @@ LASTING = 10
 
 
 def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -> IntervalEstimate:
-    """Ratio of means over episodes, with its interval."""
+    """Return the ratio of means over episodes, with its interval."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
 
@@ -110,7 +110,9 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def _integrity(run: "xarray.Dataset") -> Arrays:
-    """Errors that the covariance does not cover, innovations, and what a test of them finds, of each episode."""
+    """Return the errors that the covariance does not cover, innovations, and what a test of them finds, of each
+    episode.
+    """
     limit = chi_square_quantile(1.0 - RISK, run.sizes["component"])
     found: dict[str, numpy.ndarray] = {"misleading": (run["nees"].values > limit).mean(axis=1)}
     if "nis" not in run or numpy.isnan(run["nis"].values).all() or "sensor_fails" not in run:
@@ -146,7 +148,7 @@ def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarra
 
 
 def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Arrays:
-    """False alarms, and of the first fault of each episode whether it is found while it lasts, and when."""
+    """Return the false alarms, and of the first fault of each episode whether it is found while it lasts, and when."""
     fault, first = numpy.logical_or.reduce(fails, axis=1), fails.argmax(axis=1)
     steps, length = numpy.arange(alarm.shape[1]), alarm.shape[1]
     # What has gone wrong leaves its traces: only what comes before the first fault is a false alarm.
@@ -165,7 +167,8 @@ def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Array
 
 
 def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
-    """Number of changes, of those that were missed, and seconds waited for the others, from and to each hypothesis.
+    """Return the number of changes, of those that were missed, and seconds waited for the others, from and to each
+    hypothesis.
 
     Returns:
         ``(episodes, M, M, 3)``.
@@ -178,7 +181,7 @@ def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> num
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
+    """Return the errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,
     whose mean a few lost tracks rule; ``adaptation_time`` (mean) from the first step that carries a new motion to the

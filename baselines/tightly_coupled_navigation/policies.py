@@ -35,7 +35,9 @@ class MultiHypothesis(PaperAction):
 
 
 def chain(stay: float) -> tuple[tuple[float, ...], ...]:
-    """Transition matrix of the hypotheses that stays with one probability and leaves for all others alike."""
+    """Return the transition matrix of the hypotheses that stays with one probability and leaves for all others
+    alike.
+    """
     leave = (1.0 - stay) / (len(HYPOTHESES) - 1)
     return tuple(
         tuple(stay if i == j else leave for j in range(len(HYPOTHESES))) for i in range(len(HYPOTHESES))

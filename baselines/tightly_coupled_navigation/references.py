@@ -79,7 +79,7 @@ class _KnownMode:
         )
 
     def predict_track(self, truth: Truth, track: KnownModeState, noises: Array) -> KnownModeState:
-        """Prediction to the present measurement.
+        """Return the prediction to the present measurement.
 
         Args:
             truth: at that measurement.
@@ -119,7 +119,7 @@ class _KnownMode:
         return self.reset_acceleration(track, jumped, push)
 
     def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
-        """Readings of a state and the rows of their Jacobian there."""
+        """Return the readings of a state and the rows of their Jacobian there."""
         return range_errors.observe(
             state,
             measurement.satellite_position,
@@ -129,14 +129,14 @@ class _KnownMode:
         )
 
     def process_noises(self, models: Sequence[gnss_ins.AxisModel]) -> Array:
-        """Covariances of the process noise, ``(n, n, M)``."""
+        """Return the covariances of the process noise, ``(n, n, M)``."""
         noises, known = numpy.zeros((self.size, self.size, len(models))), gnss_ins.SIZE
         for i, model in enumerate(models):
             noises[:known, :known, i] = gnss_ins.process_noise(model, self.task.common)
         return self.task.constant(noises)
 
     def sensors(self, measurement: Measurement, truth: Truth) -> tuple[list[Array], list[Array]]:
-        """True variance of every reading, and one where it says something."""
+        """Return the true variance of every reading, and one where it says something."""
         nominal, forces = self.task.sensor_variance, self.task.sensors[2].readings
         variance = [nominal[j] * truth.noise_factor[j] ** 2 for j in range(len(nominal))]
         available = [measurement.available[j] for j in range(len(nominal))]

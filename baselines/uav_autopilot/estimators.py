@@ -169,7 +169,7 @@ class AdaptiveGusts(AdaptiveKalman):
         self.last: int = packed_covariance.position(self.n, self.n - 1, self.n - 1)
 
     def first_memory(self, initial: Start) -> tuple[SensorAware, adaptation.Level]:
-        """Gusts as designed."""
+        """Return the gusts as designed."""
         one = 0.0 * initial.mean[0] + 1.0
         return self.start_filter(initial), adaptation.Level(one, self.gust_memory * one)
 
@@ -247,7 +247,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         return AdaptiveState(*combined, likelihood, after)
 
     def stack_filters(self, filters: tuple[SensorAware, ...]) -> tuple[Array, Array]:
-        """Means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""
+        """Return the means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""
         xp = self.xp
         covariances = [packed_covariance.unpack(f.covariance, self.n) for f in filters]
         return xp.stack([f.mean for f in filters], axis=1), xp.stack(covariances, axis=2)

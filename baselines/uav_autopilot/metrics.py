@@ -105,7 +105,7 @@ def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Measures of the loop, beside those of the estimate.
+    """Return the measures of the loop, beside those of the estimate.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
     measurement, mean over the window. ``tracking_rmse``: root mean square of output minus command.
@@ -167,7 +167,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
 
 
 def _variance(averaged: Arrays, of: str, episodes: int) -> numpy.ndarray:
-    """Unbiased variance across episodes at each time, of the data and of every resample."""
+    """Return the unbiased variance across episodes at each time, of the data and of every resample."""
     biased = averaged[f"{of}_square"] - averaged[of] ** 2
     return numpy.asarray(biased * (episodes / max(episodes - 1, 1)))
 

@@ -27,7 +27,9 @@ class TrueState:
         self.task = task
 
     def start(self, initial: Start, truth: Truth) -> Array:
-        """Covariance of the start, which is reported for ever: the error is zero, and that has no density."""
+        """Return the covariance of the start, which is reported for ever: the error is zero, and that has no
+        density.
+        """
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Array]:
@@ -82,7 +84,7 @@ class _KnownNoise:
         self.size: int = size
 
     def start_covariance(self, truth: Truth) -> Array:
-        """Packed covariance of the start: the gust starts at the level of the first part."""
+        """Return the packed covariance of the start: the gust starts at the level of the first part."""
         covariance = self.initial_covariance * (1.0 + self.gust * (truth.level**2 - 1.0))
         if self.size == self.n:
             return covariance
@@ -95,7 +97,7 @@ class _KnownNoise:
         return self.xp.concat([self.xp.ones_like(truth.state), truth.disturbances["coloured"].process.decay])
 
     def predict_covariance(self, covariance: Array, truth: Truth) -> Array:
-        """Packed covariance predicted with the disturbance of the interval before this measurement."""
+        """Return the packed covariance predicted with the disturbance of the interval before this measurement."""
         predicted = self.xp.matmul(self.propagator, covariance)
         noise = truth.level**2 * self.scaled + self.other
         if self.size > self.n:
@@ -118,7 +120,7 @@ class _KnownNoise:
         )
 
     def sensor_variances(self, truth: Truth) -> Array:
-        """Variance of each sensor's white noise at this measurement, ``(m, N)``."""
+        """Return the variance of each sensor's white noise at this measurement, ``(m, N)``."""
         return self.variances * truth.sensor_level**2
 
 
@@ -168,7 +170,7 @@ class KnownNoiseBound(_KnownNoise):
     knows: str = Matched.knows
 
     def start(self, initial: Start, truth: Truth) -> Array:
-        """Covariance of the state's own distribution at the start, packed."""
+        """Return the covariance of the state's own distribution at the start, packed."""
         return self.start_covariance(truth)
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
