@@ -305,7 +305,7 @@ def test_files_that_are_no_fitted_filter_are_refused(tmp_path):
             {"values": {"log10_jerk": 1.0}},
             "must give 'constant-velocity' a number for each of log10_acceleration",
         ),
-        ({"values": [1.0]}, "is no fitted filter"),
+        ({"values": [1.0]}, "is not the file of an advised filter"),
     ):
         path.write_text(json.dumps(table | change))
         with pytest.raises(ValueError, match=message):
