@@ -322,7 +322,7 @@ def test_who_has_no_gate_is_refused(name, message):
         (lambda model: Gate(model, fallback=Constant), "gains", "fallback is made for control 'gain', but"),
         (lambda model: Gated(model, Constant), "gains", "policy is made for control 'gain', but the task"),
         (lambda model: Gate(model, window=0), "gain", "window must be at least one decision, got 0"),
-        (InnovationAlarm, "gains", "shows no 'innovation' under control 'gains'"),
+        (InnovationAlarm, "gains", "has no 'innovation' in its observation under control 'gains'"),
     ],
 )
 def test_gates_that_cannot_be(make, control, message):
