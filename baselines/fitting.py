@@ -184,7 +184,7 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         return RobustState(self.own.start(initial), Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: RobustState, given: FilterInput) -> RobustState:
-        """Update as stated and with wide deviations, select the likelier result, and set the likelihood of the mixture."""
+        """Update as stated and with wide deviations, select the likelier result, and compute the mixture likelihood."""
         (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(given.measurement, state.own)
         nis = None if own.nis is None else self.xp.where(is_outlier, other.nis, own.nis)
         likelihood = Likelihood(log_likelihood, nis, own.nis_degrees).fill_unknown(log_likelihood)

@@ -53,8 +53,8 @@ def share_out(recording: Recording) -> Share:
     total = int(recording.rows.sum())
     if total < LEAST:
         raise ValueError(
-            f"recording {recording.name!r} has {total} measurements after the start of its track: to fit anything "
-            f"takes {LEAST}"
+            f"recording {recording.name!r} has {total} measurements after the start of its track: a fit needs at "
+            f"least {LEAST}"
         )
     blocks = min(MOST_BLOCKS, max(8, total // BLOCK_MEASUREMENTS)) // 4 * 4
     warm_up = max(2, min(LONGEST_WARM_UP, total // 20))

@@ -136,7 +136,7 @@ class _Whiteness:
 
 
 def _products(errors: numpy.ndarray, before: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Of errors and those before: what their correlation is the ratio of."""
+    """Return the products of successive errors, and mean squares, whose ratio of sums is the correlation."""
     return errors * before, 0.5 * (errors**2 + before**2)
 
 

@@ -65,7 +65,7 @@ def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
     keywords, make = candidate.tunable.apply(candidate.values)
     cls, control = candidate.problem.task, candidate.tunable.control
     model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
-    # In Python, so that no filter is compiled for a candidate that runs once.
+    # An instance, not a maker: no filter is compiled for a candidate that runs once.
     competitor = make(model if control else model.task)
     report = _report_cost_and_likelihood if candidate.tunable.likelihood else _report_cost
     found = run_competitor(model, competitor, kind_of(competitor), candidate.seeds, report)
