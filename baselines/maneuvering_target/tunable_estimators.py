@@ -1,6 +1,6 @@
-"""The estimators of ManeuveringTarget by name, and what can be tuned in them.
+"""The estimators of ManeuveringTarget by name, and their tunable values.
 
-Deviations and small probabilities are searched by their logarithm: their sizes are not known beforehand.
+Deviations and small probabilities are searched by their logarithm, since their orders of magnitude are unknown.
 """
 
 import dataclasses
@@ -93,7 +93,7 @@ TURNS: dict[int, dict[str, tuple[float, float]]] = {
     1: {"turn": (0.5, 7.0)},
     2: {"turn_gentle": (0.5, 3.0), "turn_steep": (3.0, 7.0)},
 }
-"""Limits of the mean acceleration of as many kinds of turns."""
+"""Limits of the mean acceleration, one for each kind of turn."""
 
 
 def _semi_markov(make: Callable[..., Any], prior: SemiMarkovPrior, likelihood: bool = False) -> Tunable:
