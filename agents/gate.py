@@ -137,10 +137,10 @@ class Trust:
         """
         none = 0.0 * observation[:, 0]
         alarm, envelope, heeded, outside = (None, None, none, none) if memory is None else memory
-        spoken, alarm = self.alarm.hear(observation, alarm, start)
+        spoken, alarm = self.alarm.update(observation, alarm, start)
         heeded = self._count_down(spoken, heeded, start)
         if self.envelope is not None:
-            left, envelope = self.envelope.hear(observation, envelope, start)
+            left, envelope = self.envelope.update(observation, envelope, start)
             outside = self._count_down(left, outside, start)
         return (heeded > 0.0) & (outside <= 0.0), TrustMemory(alarm, envelope, heeded, outside)
 

@@ -107,7 +107,7 @@ class Alarm:
         """
         raise NotImplementedError
 
-    def hear(
+    def update(
         self, observation: numpy.ndarray, memory: Sums | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, Sums]:
         """Update the sums with an observation and detect faults.

@@ -351,11 +351,11 @@ def recipes() -> None:
                 cwd=ROOT,
                 env={**os.environ, "PATH": path},
             )
-            said = [
+            lines = [
                 line for line in (done.stdout if done.returncode == 0 else done.stderr).splitlines() if line
             ]
             shown = next(
-                (line for line in said if re.match("cost against", line)), said[-1] if said else "nothing"
+                (line for line in lines if re.match("cost against", line)), lines[-1] if lines else "nothing"
             )
         except subprocess.TimeoutExpired:
             shown = f"more than {LIMIT} s"

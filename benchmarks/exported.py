@@ -133,8 +133,8 @@ def _code_bytes(file: Path, compiler: list[str]) -> int:
     subprocess.run([*compiler, *FLAGS, "-Os", "-c", file.name, "-o", made], cwd=file.parent, check=True)
     # The one beside it: arm-none-eabi-size of arm-none-eabi-gcc.
     tool = f"{compiler[0].removesuffix('gcc')}size" if compiler[0].endswith("gcc") else "size"
-    told = subprocess.run([tool, made], cwd=file.parent, check=True, capture_output=True, text=True).stdout
-    return int(told.splitlines()[1].split()[0])
+    sizes = subprocess.run([tool, made], cwd=file.parent, check=True, capture_output=True, text=True).stdout
+    return int(sizes.splitlines()[1].split()[0])
 
 
 def run_in_c(

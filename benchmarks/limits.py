@@ -87,16 +87,16 @@ def nearest(
     """
     reference = problem.baselines.score_reference
     costs = episode_costs(problem, scenario, [*(names or asked_names(problem)), reference], episodes, seed)
-    told = costs.pop(reference)
-    differences = {name: own - told for name, own in costs.items()}
+    limit = costs.pop(reference)
+    differences = {name: own - limit for name, own in costs.items()}
     errors = {
         # Where every episode is the same as the reference's, there is no difference in units of anything.
-        name: float(d.mean() / max(d.std(ddof=1) / numpy.sqrt(episodes), 1e-12 * told.mean()))
+        name: float(d.mean() / max(d.std(ddof=1) / numpy.sqrt(episodes), 1e-12 * limit.mean()))
         for name, d in differences.items()
     }
     name = min(costs, key=lambda each: costs[each].mean())
     below = [name for name, value in errors.items() if value < -SIGNIFICANT]
-    relative = float(costs[name].mean() / told.mean()) - 1.0
+    relative = float(costs[name].mean() / limit.mean()) - 1.0
     return Nearest(problem.id, scenario, reference, episodes, name, relative, errors[name], below)
 
 

@@ -85,13 +85,15 @@ def likelihood_of_sequences(recording: Recording, values: dict[str, float]) -> f
     quiet, ratio, leave_quiet, leave_noisy, scale = (10.0 ** values[f"log10_{name}"] for name in SEARCHED)
     sizes = numpy.array([quiet, quiet * ratio])
     transitions = numpy.log([[1.0 - leave_quiet, leave_quiet], [leave_noisy, 1.0 - leave_noisy]])
-    said = {name: values[0] for name, values in recording.measurements.items()}
+    measured = {name: values[0] for name, values in recording.measurements.items()}
     # Axes do not depend on each other: states (sequence, axis, 2) of position and velocity.
     m = numpy.repeat(recording.initial["mean"].reshape(1, 2, 2).swapaxes(1, 2), 2, axis=0)
     whole = recording.initial["covariance"][0] * scale**2
     P = numpy.stack([[whole[axis::2, axis::2] for axis in range(2)]] * 2)
     mode, weight, total = numpy.arange(2), numpy.log([0.5, 0.5]), 0.0
-    for z, variance, interval in zip(said["position"], said["variance"], said["interval"], strict=True):
+    for z, variance, interval in zip(
+        measured["position"], measured["variance"], measured["interval"], strict=True
+    ):
         F, G = numpy.array([[1.0, interval], [0.0, 1.0]]), numpy.array([0.5 * interval**2, interval])
         after = numpy.tile([0, 1], len(mode))
         weight = numpy.repeat(weight, 2) + transitions[numpy.repeat(mode, 2), after]

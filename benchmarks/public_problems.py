@@ -506,13 +506,13 @@ def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
         floor = _text(figures["noise_floor_db"], 3)
         rows.append(["linear, stored set", "measurement as it is", floor, "", "", ""])
     for row in figures["rows"]:
-        told = " (reference)" if row["kind"] == "reference" else ""
+        suffix = " (reference)" if row["kind"] == "reference" else ""
         runs = f"{row['seeds']}, {row['spread_db']:.2f} dB apart" if row["seeds"] > 1 else ""
         mse = f"{row['mse_db']:.3f} [{row['low_db']:.2f}, {row['high_db']:.2f}]"
         rows.append(
             [
                 row["problem"],
-                row["name"] + told,
+                row["name"] + suffix,
                 mse,
                 _text(row["anees"], 2),
                 _text(row["nanoseconds"], 0),

@@ -236,8 +236,8 @@ ESTIMATORS, TUNABLE_ESTIMATORS = with_rules(
 ESTIMATORS |= {
     "fault-bank": Variant(
         FaultBank,
-        "Kalman filters over the noises of INS and receiver, its coloured error among them, and since when the "
-        "receiver is pulled off, each with a Gaussian sum over the receiver's noise, by the prior of the training "
+        "Kalman filters over the noises of INS and receiver, its coloured error among them, and the onset of "
+        "spoofing, each with a Gaussian sum over the receiver's noise, by the prior of the training "
         "distribution.",
         prior=TRAINING,
     ),

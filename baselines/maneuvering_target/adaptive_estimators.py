@@ -124,7 +124,7 @@ class VariationalBayes(KalmanModel):
 
         before = noise_adaptation.forget(state.noise, self.forgetting, available)
         noise, result = noise_adaptation.variational_bayes(before, update, self.iterations, available)
-        # With the noise estimated before this scan: a likelihood with the noise of its own update would not be a prediction.
+        # With the noise estimated before this scan: with the noise of its own update it would not be a prediction.
         nominal = self.update_estimate(predicted, measurement._replace(variance=before.variance * variance))
-        told = self.likelihood(measurement, *nominal[2:])
-        return MeasurementNoiseTrack(result.mean, result.covariance, told, noise)
+        likelihood = self.likelihood(measurement, *nominal[2:])
+        return MeasurementNoiseTrack(result.mean, result.covariance, likelihood, noise)

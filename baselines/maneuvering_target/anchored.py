@@ -85,11 +85,11 @@ def regress_odometry(recording: Recording) -> tuple[float, float]:
     Args:
         recording: recording with a second sensor.
     """
-    said, found, moved = recording.measurements, [], []
+    measured, found, moved = recording.measurements, [], []
     for episode, rows in enumerate(recording.rows.tolist()):
-        time, seen = recording.seconds[episode, :rows], said["available"][episode, :rows] > 0.0
-        position = said["position"][episode, :rows] @ numpy.array([1.0, 1.0j])
-        reckoned = numpy.cumsum(said["odometry_displacement"][episode, :rows] @ numpy.array([1.0, 1.0j]))
+        time, seen = recording.seconds[episode, :rows], measured["available"][episode, :rows] > 0.0
+        position = measured["position"][episode, :rows] @ numpy.array([1.0, 1.0j])
+        reckoned = numpy.cumsum(measured["odometry_displacement"][episode, :rows] @ numpy.array([1.0, 1.0j]))
         ends = numpy.searchsorted(time, time + STEP)
         both = numpy.flatnonzero(ends < rows)
         both = both[seen[both] & seen[ends[both]]]

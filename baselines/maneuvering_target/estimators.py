@@ -126,7 +126,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         )
 
     def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
-        """Run one IMM cycle. Its normalised innovation squared is the mean of the filters' by their posterior weights."""
+        """Run one IMM cycle. Its normalised innovation squared is the filters' mean by their posterior weights."""
         xp, measurement = self.xp, given.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
         mixed = imm.mix(state.means, state.covariances, prediction.mixing)

@@ -14,7 +14,7 @@ class Stationary(NamedTuple):
     output_variance: float
     control_variance: float
     cost: float
-    """In the task's unit."""
+    """Mean cost, in the task's unit."""
 
 
 def stationary(task: UavAutopilot, name: str) -> Stationary | None:
