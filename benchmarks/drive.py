@@ -1,20 +1,20 @@
-"""A real drive as recordings of LooselyCoupledNavigation: an INS let loose again and again, beside RTK.
+"""A real drive as recordings of LooselyCoupledNavigation: free-running INS in windows, with RTK as truth.
 
     git clone https://github.com/rtklibexplorer/GNSS_IMU
     pip install 'filtergym[ins]'
     python benchmarks/drive.py GNSS_IMU --out docs/data/drive.nc --figure docs/images/drive.png
 
 The log (BSD-3-Clause, see ``docs/data/drive_licence.txt``): a car with a consumer IMU at 100 Hz and an RTK receiver at
-4 Hz, 549 s. What is made of it, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
+4 Hz, 549 s. Processing, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
 
-1. **Alignment** and aiding by the positions and velocities of RTK, as ``envs/logs/strapdown.py`` has them.
-2. **Windows.** At the start of each the INS takes over velocity, attitude and biases of that filter, which has seen
-   nothing later, and the position of RTK; then it runs free. Windows do not overlap.
-3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, as it is.
-4. **Fixes** are simulated: truth plus white noise. The solution in the log is RTK only; a position of its own would
+1. **Alignment** and aiding by the positions and velocities of RTK, as in ``envs/logs/strapdown.py``.
+2. **Windows.** At the start of each the INS is set to velocity, attitude and biases of that filter, which has used no
+later data, and to the position of RTK; then it runs free. Windows do not overlap. 3. **Truth** is the RTK position of
+the antenna, 1 to 2.5 cm by its own report, as it is. 4. **Fixes** are simulated: truth plus white noise. The solution
+in the log is RTK only; a position of its own would
    have to be computed from the receiver's raw observations.
 
-Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repository unless it says otherwise:
+Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repository unless noted otherwise:
 
 * The IMU's milliseconds are stretched to the logger's time tags, and these are 0.125 s late. With 0.16 to 0.2 s the
   innovations here would be least, and the error of the INS after 20 s 15 m in place of 16 m.
@@ -48,13 +48,13 @@ MOUNTING = (180.0, -6.79, 185.35)
 LEVER = (0.0, -0.05, 0.0)
 """From the IMU to the antenna, forward, right, down, m."""
 DELAY = 0.125
-"""By which the logger's time tags of the IMU are late, s; the repository's."""
+"""Delay of the logger's time tags of the IMU, s; the repository's."""
 RTK_POSITION, RTK_VELOCITY = 0.02, 0.06
-"""Standard deviations of its positions and velocities, of each axis, m and m/s; about what it reports."""
+"""Standard deviations of its positions and velocities, of each axis, m and m/s; close to the reported ones."""
 ALIGNMENT = 30.0
-"""From the end of the standstill to the first window, s: some turns, after which the heading is known."""
+"""Time from the end of the standstill to the first window, s: some turns, after which the heading is known."""
 MEASUREMENTS = 80
-"""In a window, 20 s; one more is recorded, for the last observation."""
+"""Measurements in a window, 20 s; one more is recorded, for the last observation."""
 PARAMETERS = {
     "axes": 2,
     "sampling_interval": 0.25,
@@ -64,9 +64,9 @@ PARAMETERS = {
     "correlation_time": 30.0,
     "white_intensity": 0.0,
 }
-"""Of the environment. Fixes come as often as RTK, with the deviation that the environment has by default, 1.41 m. The
-levels of the INS errors are what :func:`likeliest` finds, rounded: no constant and no white part can be seen, and of
-the coloured one ``coloured^2 / correlation_time`` is better known than each."""
+"""Parameters of the environment. Fixes come as often as RTK, with the environment's default deviation, 1.41 m. The
+levels of the INS errors are the rounded result of :func:`likeliest`: no constant and no white part is detectable, and
+of the coloured one ``coloured^2 / correlation_time`` is better determined than each."""
 
 
 def read_inertial(file: Path) -> Any:
@@ -77,7 +77,7 @@ def read_inertial(file: Path) -> Any:
             tags in ``FILE.tag`` beside it.
 
     Raises:
-        ValueError: if either is something else.
+        ValueError: if either file has another format.
     """
     import pandas
     from pyins import transform, util
@@ -86,7 +86,7 @@ def read_inertial(file: Path) -> Any:
     # A header of 60 bytes, the tick at the start (not needed), its time in whole seconds and the rest of it; then pairs
     # of milliseconds since then and bytes of the file.
     if not tags.startswith(b"TIMETAG RTKLIB") or len(tags) < 84 or (len(tags) - 76) % 8:
-        raise ValueError(f"{file.name}.tag holds no time tags of RTKLIB")
+        raise ValueError(f"{file.name}.tag contains no time tags of RTKLIB")
     _, whole, rest = struct.unpack("<IId", tags[60:76])
     last = numpy.frombuffer(tags[76:], "<u4")[-2]
     try:
@@ -113,7 +113,7 @@ def read_fixes(file: Path) -> Any:
     time, s since 1970 of GPS time; quality 1 is fixed, 2 float.
 
     Raises:
-        ValueError: if the file holds none.
+        ValueError: if the file contains none.
     """
     import pandas
 
@@ -136,8 +136,8 @@ def aligned(inertial: Any, fixes: Any) -> AidedInertial:
     """Align the INS at the standstill and aid it by RTK from there.
 
     Args:
-        inertial: of :func:`read_inertial`.
-        fixes: of :func:`read_fixes`.
+        inertial: result of :func:`read_inertial`.
+        fixes: result of :func:`read_fixes`.
 
     Raises:
         ValueError: if the recording does not begin with a standstill of 5 s, or nothing moves after it.
@@ -150,9 +150,9 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     """Cut a drive into recordings of the environment.
 
     Args:
-        inertial: of :func:`read_inertial`.
-        fixes: of :func:`read_fixes`, without gaps.
-        seed: of the simulated fixes.
+        inertial: result of :func:`read_inertial`.
+        fixes: result of :func:`read_fixes`, without gaps.
+        seed: seed of the simulated fixes.
 
     Raises:
         ValueError: if positions are missing, or none is left after the alignment.
@@ -185,10 +185,10 @@ def dataset(
 
     Args:
         truth: positions from the start of each window on, m, ``(episode, 1 + time, axis)``.
-        ins: likewise, by the INS.
-        fix: likewise from the first measurement on, by the receiver.
-        deviation: of the fixes, m.
-        starts: of the windows, s since the start of the drive.
+        ins: positions by the INS, same shape, m.
+        fix: positions by the receiver from the first measurement on, m, ``(episode, time, axis)``.
+        deviation: standard deviation of the fixes, m.
+        starts: starts of the windows, s since the start of the drive.
     """
     episodes, measured, axes = fix.shape
     T = PARAMETERS["sampling_interval"]
@@ -253,11 +253,11 @@ def likeliest(
     """Return the levels of the INS errors under which fixes less INS positions are likeliest, and their log-likelihood
     for each of them.
 
-    The receiver's noise is part of it: what matters is what a filter can see through that.
+    The receiver's noise is included: relevant are the errors that a filter can detect through it.
 
     Args:
-        recorded: of :func:`recordings`.
-        correlation_time: s; None looks for the likeliest.
+        recorded: result of :func:`recordings`.
+        correlation_time: correlation time, s; None searches the likeliest.
     """
     from scipy.optimize import minimize
 
@@ -284,7 +284,7 @@ def likeliest(
 
 
 def report(recorded: xarray.Dataset) -> None:
-    """Print how large the INS error grows, and what the environment's model makes of it."""
+    """Print the growth of the INS error, and that of the environment's model."""
     found = abs(errors(recorded))
     time = recorded["seconds"].to_numpy()[0]
     covariance = modelled(time, PARAMETERS)
@@ -305,7 +305,7 @@ def report(recorded: xarray.Dataset) -> None:
 
 
 def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
-    """Draw the drive with the windows of the INS, and how its error grows."""
+    """Draw the drive with the windows of the INS, and the growth of its error."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -336,7 +336,7 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
 
 
 def main() -> None:
-    """Make the file from a checkout."""
+    """Write the file from a checkout."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

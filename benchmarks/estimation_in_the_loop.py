@@ -1,4 +1,4 @@
-"""What noisy sensors cost an agent, and what a filter gives back: returns under truth, readings and estimates.
+"""Loss of an agent by noisy sensors, and gain by a filter: returns under truth, readings and estimates.
 
     python benchmarks/estimation_in_the_loop.py [fixed trained] [--only ENVIRONMENT ...] [--seeds N] [--out FILE]
 
@@ -9,7 +9,7 @@
     PPO of Stable-Baselines3 on the full observation, on readings, on a stack of four readings and on estimates,
     with its mean return over 50 fresh episodes.
 
-Results are appended to FILE, one line of JSON for each cell, and a cell that is there is not computed again. Tables
+Results are appended to FILE, one line of JSON for each cell, and an existing cell is not computed again. Tables
 are printed at the end: mean returns, and differences with 95 % intervals, paired by episode or by training seed.
 """
 
@@ -51,7 +51,9 @@ def cart_pole() -> Controller:
 
 
 def pendulum(x: numpy.ndarray) -> Any:
-    """Return the energy pumping (Astrom and Furuta, 2000), then proportional and derivative control near the top."""
+    """Return the force that pumps energy (Astrom and Furuta, 2000), and near the top that of proportional-derivative
+    control.
+    """
     angle = (x[0] + math.pi) % (2.0 * math.pi) - math.pi
     energy = x[1] ** 2 / 6.0 + 5.0 * math.cos(angle) - 5.0
     near = math.cos(angle) > 0.85
@@ -88,7 +90,7 @@ TRAINING: dict[str, dict[str, Any]] = {
     "Acrobot-v1": {"steps": 100_000, "n_steps": 256, "batch_size": 256, "n_epochs": 4, "gamma": 0.99,
                    "gae_lambda": 0.94},
 }  # fmt: skip
-"""Steps of a training, and what differs from PPO's defaults: as RL Baselines3 Zoo has it, for eight lanes."""
+"""Steps of a training, and differences from PPO's defaults: those of RL Baselines3 Zoo, for eight lanes."""
 LANES = 8
 FILTERS = ("extended", "unscented")
 
@@ -100,7 +102,7 @@ def sensors_of(name: str, level: str) -> dict[str, Any]:
 
 
 def differences(place: list[int], n: int, interval: float, turning: numpy.ndarray, window: int) -> Any:
-    """Return what makes a state of readings: their mean over a window, and the slope between means."""
+    """Return a function from readings to a state: their mean over a window, and the slope between means."""
     past: deque[numpy.ndarray] = deque(maxlen=window + 1)
 
     def state(reading: numpy.ndarray, starts: bool) -> numpy.ndarray:
@@ -158,7 +160,7 @@ def fly(name: str, way: str, level: str) -> list[float]:
 
 
 def make(name: str, way: str, level: str) -> Any:
-    """Return an environment as an agent in training sees it."""
+    """Return an environment as an agent in training observes it."""
     env: Any = gymnasium.make(name)
     if way != "truth":
         env = NoisyObservation(env, sensors_of(name, level))
@@ -254,7 +256,7 @@ def print_fixed(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
 
 
 def print_trained(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
-    """Print the returns of trained agents, and what estimates bring them."""
+    """Print the returns of trained agents, and their gain by estimates."""
     ways = ("raw", "stack", "estimate")
     print("\n| PPO, mean return (seeds) | noise | truth | " + " | ".join(ways) + " | estimate less stack |")
     print("|---|---|" + "---|" * (len(ways) + 2))
@@ -311,7 +313,7 @@ def draw_episode(file: Path) -> None:
 
 
 def main() -> None:
-    """Compute what is missing, and print the tables."""
+    """Compute the missing cells, and print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

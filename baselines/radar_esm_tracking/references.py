@@ -53,7 +53,7 @@ class _KnownDraw:
         )
 
     def start(self, initial: Start, truth: Truth) -> KnownClassState:
-        """Start where the filter of the true class starts, with the true correlation of the first measurement's errors."""
+        """Start as the filter of the true class, with the true correlation of the first measurement's errors."""
         mean, P = initial.mean, self.of(self.start_covariance, truth.target_class)
         white, zero = self.white(truth), 0.0 * truth.radar_correlation
         start = [[P[i, j] if i == j else zero for j in range(3)] for i in range(3)]

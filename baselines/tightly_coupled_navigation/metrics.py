@@ -148,7 +148,7 @@ def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarra
 
 
 def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Arrays:
-    """Return the false alarms, and for the first fault of each episode whether and when it is detected while it lasts."""
+    """Return the false alarms, and whether and when the first fault of each episode is detected while it lasts."""
     fault, first = numpy.logical_or.reduce(fails, axis=1), fails.argmax(axis=1)
     steps, length = numpy.arange(alarm.shape[1]), alarm.shape[1]
     # A fault has effects after its end: only alarms before the first fault are false.

@@ -98,7 +98,7 @@ def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: nump
 
 
 def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean product of neighbours, and the mean square, ``(episodes, 2)``; NaN where there are no neighbours."""
+    """Return the mean product of neighbours and the mean square, ``(episodes, 2)``; NaN without neighbours."""
     if values.shape[1] < 2:
         return numpy.full((len(values), 2), math.nan)
     return numpy.stack([(values[:, 1:] * values[:, :-1]).mean(axis=1), (values**2).mean(axis=1)], axis=1)
