@@ -1,11 +1,11 @@
-"""Every ranked competitor as C99: compiled, run over recorded episodes, and compared with what it estimated itself.
+"""Every ranked competitor as C99: compiled, run over recorded episodes, and compared with its own estimates.
 
-A line for each: operations and bytes of state in double; bytes of the source, of code and constants as ``-Os`` makes
-them of it, and of the largest stack of a function; the largest difference to the replay in double and in float, in the
-standard deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM
-makes of the same program (a lane of 512, without a network), and in NumPy for one track. What is not written says why.
-Times are of processor time, the least of several runs. ``--cross`` names a compiler of another processor, with which
-the files are compiled only, in double and in float.
+A line for each: operations and bytes of state in double; bytes of the source, of code and constants with ``-Os``, and
+of the largest stack of a function; the largest difference to the replay in double and in float, in the standard
+deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM generates
+from the same program (a lane of 512, without a network), and in NumPy for one track. For a competitor that cannot be
+exported the line gives the reason. Times are of processor time, the least of several runs. ``--cross`` names a compiler
+of another processor, with which the files are compiled only, in double and in float.
 
 Example: python benchmarks/exported.py --environment ManeuveringTarget-v0 --episodes 100 --out exported.csv
 """
@@ -103,19 +103,19 @@ class Size(NamedTuple):
 
     source: int
     code: int
-    """With constants."""
+    """Bytes of code and constants."""
     stack: int
-    """Of the function that takes most."""
+    """Bytes of the largest stack of a function."""
     cross: int | None
-    """Of code and constants for another processor."""
+    """Bytes of code and constants for another processor."""
 
 
 class Compilers(NamedTuple):
-    """What compiles the files."""
+    """Compilers of the files."""
 
     own: str
     cross: list[str]
-    """A compiler of another processor with its options, or nothing."""
+    """A compiler of another processor with its options, or an empty list."""
 
 
 def size_of(file: Path, compilers: Compilers) -> Size:
@@ -131,7 +131,7 @@ def _code_bytes(file: Path, compiler: list[str]) -> int:
     """Return the bytes of code and constants."""
     made = file.with_suffix(".small.o").name
     subprocess.run([*compiler, *FLAGS, "-Os", "-c", file.name, "-o", made], cwd=file.parent, check=True)
-    # The one beside it: arm-none-eabi-size of arm-none-eabi-gcc.
+    # The tool of the same toolchain: arm-none-eabi-size of arm-none-eabi-gcc.
     tool = f"{compiler[0].removesuffix('gcc')}size" if compiler[0].endswith("gcc") else "size"
     sizes = subprocess.run([tool, made], cwd=file.parent, check=True, capture_output=True, text=True).stdout
     return int(sizes.splitlines()[1].split()[0])
@@ -140,9 +140,7 @@ def _code_bytes(file: Path, compiler: list[str]) -> int:
 def run_in_c(
     name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compilers: Compilers
 ) -> tuple[float, float, Writer, Size]:
-    """Return the largest difference, in standard deviations, nanoseconds an update, what wrote the files, and their
-    size.
-    """
+    """Return the largest difference, in standard deviations, nanoseconds an update, the exported filter, and its size."""
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
     batch = BATCH.format(
@@ -177,9 +175,9 @@ def run_in_c(
 
 
 def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
-    """Of the same program, one of many lanes."""
+    """Return the nanoseconds an update of the same program in LLVM's code, one of many lanes."""
     program = traced.update
-    # What is written must not be what is read: the state after an update goes elsewhere.
+    # Input and output must not be the same memory: the state after an update goes elsewhere.
     after = max(STATE, MEASUREMENT, ANSWER, ESTIMATE, SHOWN, 3) + 1
     results = [r._replace(argument=after) if r.argument == STATE else r for r in program.results]
     program = program._replace(results=results)
@@ -199,7 +197,7 @@ def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
 
 
 def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
-    """Of the competitor itself on NumPy's arrays, one track."""
+    """Return the nanoseconds an update of the competitor itself on NumPy's arrays, one track."""
     kind = kind_of(maker)
     keywords = getattr(maker, "task_keywords", {})
     plain = make_model(problem.task, control_of(maker, None, problem.task, name), **keywords)
@@ -231,7 +229,7 @@ def least_time(call: Any, count: int) -> float:
 def lines(
     problem: Problem, names: list[str], episodes: int, measurements: int, compilers: Compilers
 ) -> Iterator[dict[str, Any]]:
-    """A line for each competitor."""
+    """Yield a line for each competitor."""
     for name in names:
         maker = find_competitor(problem, name).maker
         line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
@@ -247,7 +245,7 @@ def lines(
         operations, state, weights, _ = writer.sizes
         line |= {"operations": operations, "state_bytes": state, "weight_bytes": weights}
         if operations > 10_000:
-            # What takes a compiler minutes is run in float by NumPy.
+            # A program that takes a compiler minutes runs in float by NumPy.
             line["float_sigmas"] = given.largest_difference(
                 run_filter(traced, given, numpy.float32)[:, mean_rows(traced)]
             )
@@ -289,7 +287,7 @@ def summary(found: list[dict[str, Any]]) -> str:
             if key != "float_ns"
         }
         ns = numbers["double_ns"]
-        # What LLVM makes of a program has no network in it.
+        # LLVM's code of a program contains no network.
         faster = (ns / numbers["llvm_ns"])[numbers["weight_bytes"] == 0.0]
         name = environment.removesuffix("-v0")
         cells = [name, f"{len(there)} of {len(own)}"]
@@ -321,7 +319,7 @@ def main() -> None:
     parser.add_argument("--compiler", default=shutil.which("cc"))
     parser.add_argument("--cross", default="", help='such as "arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb"')
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--read", type=Path, help="summarise what --out has written, and run nothing")
+    parser.add_argument("--read", type=Path, help="summarise the file of --out without running anything")
     asked = parser.parse_args()
     if asked.read is not None:
         print(summary(list(csv.DictReader(asked.read.open(encoding="utf-8")))))

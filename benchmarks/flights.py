@@ -1,13 +1,13 @@
-"""Every set of real flights at hand, raw and smoothed: which competitors carry over from simulated ones.
+"""All available sets of real flights, raw and smoothed, as a test of competitors beyond simulated flights.
 
     pip install --no-deps traffic
     python benchmarks/flights.py --out docs/data/flights.csv
 
 The sets are samples of ADS-B flights in the Python package ``traffic``, which is read, not imported. A sample of at
-least ``FEWEST`` flights is a set of its own; what else lies in its folder is another one if that has as many, and the
-rest together is "others". Each sample has its radar in the median of its positions, the radar's noise is simulated,
-and scans are 6 s apart. Samples whose positions are more than ``COARSEST`` seconds apart are left out, as are those on
-the ground and those whose errors are the point of them.
+least ``FEWEST`` flights is a set of its own; the other samples of its folder are another one if they have as many
+together, and the rest together is "others". Each sample has its radar in the median of its positions, the radar's noise
+is simulated, and scans are 6 s apart. Samples whose positions are more than ``COARSEST`` seconds apart are left out, as
+are those on the ground and those that demonstrate errors.
 """
 
 import argparse
@@ -24,9 +24,9 @@ from filtergym.names import find_competitors
 ID = "filtergym/ManeuveringTarget-v0"
 FEWEST, COARSEST, INTERVAL, SMOOTHING = 20, 10.0, 6.0, 10.0
 MOST_SCANS = 90_000
-"""Of a set: of a larger one every second flight is flown, or every third, ..."""
+"""Most scans of a set: of a larger one every second flight is used, or every third, ..."""
 LEFT_OUT = ("noisy", "onground")
-"""Folders of what is no flight in the air, or wrong on purpose."""
+"""Folders of samples that are no flights in the air, or that contain deliberate errors."""
 COMPETITORS = (
     "imm",
     "semi-markov",
@@ -47,7 +47,7 @@ METRICS = {
     "win_rate": ("wins", 100.0),
     "anees": ("anees", 1.0),
 }
-"""Records that are kept, their columns and their unit in the table."""
+"""Records in the table, with their columns and units."""
 
 
 def main() -> None:

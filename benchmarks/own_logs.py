@@ -2,8 +2,8 @@
 
 python benchmarks/own_logs.py
 
-The machines and their models are docs/examples/own_logs. What is fitted to one log is judged on ten others. The limit
-is our filter with the factors on Q and R that have the least error on these ten: nobody knows them beforehand.
+The machines and their models are docs/examples/own_logs. A filter that is fitted to one log is judged on ten others.
+The limit is our filter with the factors on Q and R of least error on these ten, which are unknown beforehand.
 """
 
 import argparse
@@ -33,17 +33,19 @@ from filtergym.papers.grid import markdown_table
 
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples" / "own_logs"
 LATE = 0.15
-"""Of the camera, s."""
+"""Delay of the camera, s."""
 COLUMNS = ("machine", "filter", "RMSE", "of filterpy's", "factors", "processor time, s")
 CANDIDATES = 40
-"""Factors that are tried for the limit, three times, each time closer to the best."""
+"""Candidate factors for the limit, refined three times around the best."""
 
 
-# --- filters of filterpy, of rows of a log by column
+# --- filters of filterpy, which read rows of a log by column
 
 
 def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the data sheets: GPS 3 m, odometry 0.2 m/s; Q by hand: white acceleration of 2 m/s^2 in a second."""
+    """Filter GPS and odometry. Data sheets: GPS 3 m, odometry 0.2 m/s; Q by hand: white acceleration of 2 m/s^2 in a
+    second.
+    """
     kf, last = KalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([100.0, 100, 25, 25]), []
     columns = ("time", "gps_x", "gps_y", "odometry_x", "odometry_y")
@@ -61,8 +63,8 @@ def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the data sheets: gauge 2 cm, stick 1 cm; by hand: a rate that wanders by 0.02 m/h in an hour, 5 cm of
-    drift a day.
+    """Filter a level gauge and a stick. Data sheets: gauge 2 cm, stick 1 cm; by hand: a rate that wanders by 0.02 m/h
+    in an hour, 5 cm of drift a day.
     """
     kf, last = KalmanFilter(3, 1), 0.0
     kf.x, kf.P, found = np.array([10.0, 0, 0]), np.diag([0.01, 0.0025, 0.0025]), []
@@ -81,8 +83,8 @@ def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the by hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad since the drone accelerates; innovations
-    wrapped.
+    """Filter pitch and roll. By hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad since the drone accelerates;
+    innovations wrapped.
     """
     kf, last = ExtendedKalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([0.01, 0.01, 0.0025, 0.0025]), []
@@ -103,8 +105,8 @@ def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def battery(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the data sheets: current 50 mA, voltage 10 mV; Q by hand: a charge that wanders by 0.1 % and 1 mV in a
-    minute.
+    """Filter the charge of a battery. Data sheets: current 50 mA, voltage 10 mV; Q by hand: a charge that wanders by
+    0.1 % and 1 mV in a minute.
     """
     kf, last = ExtendedKalmanFilter(2, 1), 0.0
     kf.x, kf.P, found = np.array([0.8, 0]), np.diag([0.01, 1e-4]), []
@@ -122,8 +124,8 @@ def battery(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def late_vision(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the data sheets: camera 2 cm, accelerometer 0.1 m/s^2; a late fix is moved on by the velocity times
-    its delay.
+    """Filter late camera fixes. Data sheets: camera 2 cm, accelerometer 0.1 m/s^2; a late fix is moved on by the
+    velocity times its delay.
     """
     kf, dt, late = KalmanFilter(3, 1, 1), 0.01, round(LATE / 0.01)
     kf.x, kf.P, found = np.zeros(3), np.diag([0.01, 0.1, 0.04]), []
@@ -187,7 +189,7 @@ def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[st
 
 
 def processor_time(name: str, folder: Path) -> float:
-    """Of the three commands of the page, which fit, judge and export, s."""
+    """Return the processor time of the three commands of the page, which fit, judge and export, s."""
     machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", used()
     for words in (
         ["advise", folder / f"{name}.csv", "--environment", machine, "--out", filter],
