@@ -140,7 +140,7 @@ def _code_bytes(file: Path, compiler: list[str]) -> int:
 def run_in_c(
     name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compilers: Compilers
 ) -> tuple[float, float, Writer, Size]:
-    """Return the largest difference, in standard deviations, nanoseconds an update, the exported filter, and its size."""
+    """Return the largest difference, in standard deviations, nanoseconds an update, the exporter, and the size."""
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
     batch = BATCH.format(

@@ -82,7 +82,7 @@ def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
 
 
 def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
-    """Return the share of the intervals from a number of episodes that contain the truth, for each statistic, as text."""
+    """Return the share of intervals from a number of episodes that contain the truth, for each statistic, as text."""
     generator, bootstrap = numpy.random.default_rng(number), Bootstrap(number)
     true = numpy.array(truths(pool))
     below, above = numpy.zeros(len(true)), numpy.zeros(len(true))
