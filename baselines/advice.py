@@ -44,7 +44,16 @@ from .fitting import (
     with_noise_scale,
     with_outliers,
 )
-from .judgement import AS_GOOD, FEWEST, JudgedFilter, Judgement, Share, likeliest_of, roles_of, share_out
+from .judgement import (
+    AS_GOOD,
+    FEWEST,
+    JudgedFilter,
+    Judgement,
+    Share,
+    likeliest_of,
+    roles_of,
+    split_recording,
+)
 from .log_scores import replay_log, score_log
 from .onboard import OnboardJudgement
 from .problem import Problem
@@ -88,7 +97,7 @@ class FittedLog:
     @cached_property
     def share(self) -> Share:
         """Which blocks fit, choose and judge."""
-        return share_out(self.recording)
+        return split_recording(self.recording)
 
     @cached_property
     def interval(self) -> float:
@@ -96,9 +105,9 @@ class FittedLog:
         return float(numpy.nanmedian(numpy.diff(self.recording.seconds, axis=1)))
 
     def with_noise(self, family: Tunable, own: bool = False, robust: bool = False) -> Tunable:
-        """Add the scale of the measurement noise to a tunable where that is wanted and possible: measurements ``APART``
-        contain little information on it. With ``robust`` add the share of outliers, except to a user's ``own`` family,
-        whose records may lack the log-likelihood.
+        """Return a tunable with the scale of the measurement noise, where that is wanted and possible. An anchored one
+        is returned unchanged: measurements ``APART`` contain little information on the scale. With ``robust`` the share
+        of outliers is added, except to a user's ``own`` family, whose records may be incomplete.
         """
         log_format = find_companion(self.problem.task, LogFormat)
         if family.anchored or log_format is None or log_format.scale_noise is None:

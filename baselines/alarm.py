@@ -58,7 +58,7 @@ def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> nump
     return numpy.where(numpy.tile(there, 4), numpy.concatenate(ratios, axis=1), 0.0)
 
 
-def certain(wrong: numpy.ndarray) -> numpy.ndarray:
+def fault_evidence(wrong: numpy.ndarray) -> numpy.ndarray:
     """Return the evidence of an observation that only a fault explains, ``(N, 1)``; ``wrong`` is ``(N,)``."""
     return numpy.where(wrong, CERTAIN, 0.0)[:, None]
 
@@ -68,7 +68,7 @@ class Sums(NamedTuple):
 
     sums: numpy.ndarray
     """Of each log-likelihood ratio, ``(N, kinds)``."""
-    shown: numpy.ndarray
+    observation: numpy.ndarray
     """Last observation, ``(N, fields)``."""
 
 
@@ -120,7 +120,7 @@ class Alarm:
         Returns:
             Booleans ``(N,)``, and memory.
         """
-        before = numpy.full_like(observation, math.nan) if memory is None else memory.shown
+        before = numpy.full_like(observation, math.nan) if memory is None else memory.observation
         evidence = self.evidence(observation, numpy.where(start[:, None], math.nan, before))
         sums = numpy.zeros_like(evidence) if memory is None else memory.sums
         limit = math.log(self.decisions * evidence.shape[1] / self.false_alarms)

@@ -77,7 +77,7 @@ class Artefact(NamedTuple):
     """How its log was read; None in files without it."""
 
 
-def setup_of(problem: Problem, recording: Any) -> LogSetup:
+def log_setup(problem: Problem, recording: Any) -> LogSetup:
     """Return the options with which a recording was read."""
     parameters = recording.scenario(problem.task, {}).parameters
     left_out = "horizon", "decision_interval"
@@ -120,7 +120,7 @@ def write_advised(
         command: command that wrote it.
         **further: further entries of the file, such as its held-out numbers.
     """
-    log = setup_of(problem, recording)
+    log = log_setup(problem, recording)
     log_format = find_companion(problem.task, LogFormat)
     known = log_format.columns if log_format else {}
     seconds = recording.seconds

@@ -44,7 +44,7 @@ class Share(NamedTuple):
     """Whether the three are different measurements."""
 
 
-def share_out(recording: Recording) -> Share:
+def split_recording(recording: Recording) -> Share:
     """Cut a recording into spans on which filters are fitted, chosen and judged: a half and two quarters of it.
 
     Raises:

@@ -393,17 +393,17 @@ class KnownModel:
     def start(self, initial: Initial, truth: StateSpaceTruth) -> Any:
         """Start from the initial estimate given to every filter."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
-        return _buffer(self.task, begun, self._told(truth))
+        return _buffer(self.task, begun, self._model_truth(truth))
 
     def update(
         self, memory: Any, measurement: StateSpaceMeasurement, truth: StateSpaceTruth
     ) -> tuple[Array, Array, Any, Likelihood]:
         """Predict and update with the model in force."""
-        after = _in_order(memory, measurement, self.take, self._told(truth))
+        after = _in_order(memory, measurement, self.take, self._model_truth(truth))
         return after.mean, after.covariance, after, after.likelihood
 
     @staticmethod
-    def _told(truth: StateSpaceTruth) -> StateSpaceTruth:
+    def _model_truth(truth: StateSpaceTruth) -> StateSpaceTruth:
         return truth._replace(state=None, inputs=None, sensors=None, waiting=None)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:

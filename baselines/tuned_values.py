@@ -87,7 +87,7 @@ class TunedValues:
         tables = [table for _, table in self._tables()]
         return [f"{policy}-tuned" for policy in self.tunable if any(policy in table for table in tables)]
 
-    def has_won(self, policy: str) -> bool:
+    def is_improved(self, policy: str) -> bool:
         """Return whether the stored values of a policy differ from those without tuning: a search stores the latter
         where it finds no better ones.
         """

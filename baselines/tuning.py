@@ -215,7 +215,7 @@ def tune(
             f"the search needs at least {2 * population}: give {2 * population * steps} steps"
         )
     store = store or Store()
-    asked = _search_content(problem, search, tunable, chosen)
+    content = _search_content(problem, search, tunable, chosen)
 
     def candidate(values: Mapping[str, float], seeds: Sequence[int]) -> Candidate:
         return Candidate(problem, chosen.name, tunable, values, seeds, search.backend)
@@ -224,7 +224,7 @@ def tune(
 
     def measure(values: Mapping[str, float]) -> float:
         name = f"{short_name(problem.id)}.{policy}"
-        work = Work(name, json.dumps([*asked, values])) if problem.shipped else None
+        work = Work(name, json.dumps([*content, values])) if problem.shipped else None
         cost = store.result(
             work, float, lambda: geometric_cost(episode_costs(candidate(values, train), workers))
         )

@@ -72,7 +72,7 @@ def random_steps(env: Any) -> Portion:
     return portion
 
 
-def learnt_by(model: Any) -> Portion:
+def make_training_portion(model: Any) -> Portion:
     """Run a model of Stable-Baselines3, which collects steps and learns."""
 
     def portion() -> int:
@@ -87,7 +87,9 @@ def sb3_single(id: str) -> Portion:
     from stable_baselines3.common.env_util import make_vec_env
 
     env = make_vec_env(id, SINGLE)
-    return learnt_by(PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * SINGLE, n_epochs=1))
+    return make_training_portion(
+        PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * SINGLE, n_epochs=1)
+    )
 
 
 def sb3_native(id: str) -> Portion:
@@ -97,14 +99,18 @@ def sb3_native(id: str) -> Portion:
     from filtergym.agents import to_sb3
 
     env = to_sb3(gymnasium.make_vec(id, num_envs=NATIVE, autoreset_mode="SameStep"))
-    return learnt_by(PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * NATIVE, n_epochs=1))
+    return make_training_portion(
+        PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * NATIVE, n_epochs=1)
+    )
 
 
 def sb3_contrib_single(id: str) -> Portion:
     from sb3_contrib import TQC
     from stable_baselines3.common.env_util import make_vec_env
 
-    return learnt_by(TQC("MlpPolicy", make_vec_env(id, SINGLE), learning_starts=10**9, buffer_size=10**4))
+    return make_training_portion(
+        TQC("MlpPolicy", make_vec_env(id, SINGLE), learning_starts=10**9, buffer_size=10**4)
+    )
 
 
 def rl_zoo3_single(id: str) -> Portion:
@@ -297,7 +303,7 @@ def measure(client: str, id: str) -> dict[str, Any]:
     return {"version": version, "rate": steps / seconds}
 
 
-def measured_elsewhere(client: str, id: str) -> dict[str, Any]:
+def measure_in_client(client: str, id: str) -> dict[str, Any]:
     """Run :func:`measure` in the client's own Python."""
     command = [python_of(CLIENTS[client][0]), __file__, "--measure", client, "--environment", id]
     try:
@@ -318,7 +324,7 @@ def table(clients: list[str], ids: list[str]) -> None:
     print("|---|---|" + "---|" * len(ids))
     notes: list[str] = []
     for client in clients:
-        found = [measured_elsewhere(client, id) for id in ids]
+        found = [measure_in_client(client, id) for id in ids]
         cells = []
         for result in found:
             if "rate" in result:

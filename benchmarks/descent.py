@@ -34,7 +34,7 @@ FEWER = 8
 """Number of episodes for the comparison of gradients."""
 
 
-def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple[Any, NetworkPolicy]:
+def make_episodes(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple[Any, NetworkPolicy]:
     """Return a function that runs an episode with a descent after each window, and its policy."""
     truncation = run.hyperparameters["truncation"]
     env = TaskVectorEnv(
@@ -54,7 +54,7 @@ def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple
 
 def gradients(run: TrainingRun, backend: str) -> torch.Tensor:
     """Return the gradients of all windows of an episode."""
-    fly, policy = made(run, backend, FEWER, torch.float64)
+    fly, policy = make_episodes(run, backend, FEWER, torch.float64)
     found = []
 
     def keep() -> None:
@@ -69,7 +69,7 @@ def update_times(run: TrainingRun, repeat: int) -> list[float]:
     """Return the milliseconds of an update with each backend."""
     prepared = []
     for backend in BACKENDS:
-        fly, policy = made(run, backend, run.envs, torch.float32)
+        fly, policy = make_episodes(run, backend, run.envs, torch.float32)
         prepared.append((fly, policy, torch.optim.Adam(policy.parameters(), lr=1e-3)))
     times: list[list[float]] = [[], []]
     for _ in range(repeat + 1):

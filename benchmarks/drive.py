@@ -65,7 +65,7 @@ PARAMETERS = {
     "white_intensity": 0.0,
 }
 """Parameters of the environment. Fixes come as often as RTK, with the environment's default deviation, 1.41 m. The
-levels of the INS errors are the rounded result of :func:`likeliest`: no constant and no white part is detectable, and
+levels of the INS errors are the rounded result of :func:`fit_levels`: no constant and no white part is detectable, and
 of the coloured one ``coloured^2 / correlation_time`` is better determined than each."""
 
 
@@ -132,7 +132,7 @@ def read_fixes(file: Path) -> Any:
     return table
 
 
-def aligned(inertial: Any, fixes: Any) -> AidedInertial:
+def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
     """Align the INS at the standstill and aid it by RTK from there.
 
     Args:
@@ -161,7 +161,7 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     steps = numpy.diff(fixes.index)
     if abs(steps - T).max() > 0.01:
         raise ValueError(f"positions come every {T} s, but two are {abs(steps).max():.2f} s apart")
-    navigation = aligned(inertial, fixes)
+    navigation = align_ins(inertial, fixes)
     clock = fixes.index.to_numpy() - fixes.index[0]
     first = int(numpy.searchsorted(fixes.index, navigation.trajectory.index[0] + ALIGNMENT))
     last = int(numpy.searchsorted(fixes.index, navigation.trajectory.index[-1], side="right"))
@@ -232,7 +232,7 @@ def errors(recorded: xarray.Dataset) -> numpy.ndarray:
     return difference.reshape(-1, difference.shape[-1])
 
 
-def modelled(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
+def ins_error_covariance(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
     """Return the covariance of the environment's INS error at times, s, ``(n, n)``, m^2: the integral of a
     constant, of an exponentially correlated and of a white rate error.
     """
@@ -247,7 +247,7 @@ def modelled(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
     )
 
 
-def likeliest(
+def fit_levels(
     recorded: xarray.Dataset, correlation_time: float | None = None
 ) -> tuple[dict[str, float], float]:
     """Return the levels of the INS errors under which fixes less INS positions are likeliest, and their log-likelihood
@@ -267,7 +267,7 @@ def likeliest(
     seen = (recorded["fix"] - recorded["ins"]).to_numpy().transpose(0, 2, 1).reshape(-1, len(time))
 
     def unlikely(logarithms: numpy.ndarray) -> float:
-        covariance = modelled(time, dict(zip(names, numpy.exp(logarithms), strict=True)))
+        covariance = ins_error_covariance(time, dict(zip(names, numpy.exp(logarithms), strict=True)))
         factor = numpy.linalg.cholesky(covariance + numpy.diag(deviation**2))
         white = numpy.linalg.solve(factor, seen.T)
         density = numpy.log(numpy.diag(factor)).sum() + 0.5 * len(time) * numpy.log(2.0 * numpy.pi)
@@ -287,7 +287,7 @@ def report(recorded: xarray.Dataset) -> None:
     """Print the growth of the INS error, and that of the environment's model."""
     found = abs(errors(recorded))
     time = recorded["seconds"].to_numpy()[0]
-    covariance = modelled(time, PARAMETERS)
+    covariance = ins_error_covariance(time, PARAMETERS)
     print("| after, s | median, m | root mean square, m | largest, m | by the model, m |")
     print("|---:|---:|---:|---:|---:|")
     for after in (1.0, 2.0, 5.0, 10.0, 15.0, 20.0):
@@ -299,7 +299,7 @@ def report(recorded: xarray.Dataset) -> None:
                 f"| {covariance[at, at] ** 0.5:.2g} |"
             )
     for correlation_time in (None, 1.0):
-        levels, likelihood = likeliest(recorded, correlation_time)
+        levels, likelihood = fit_levels(recorded, correlation_time)
         fitted = ", ".join(f"{name} {value:.3g}" for name, value in levels.items())
         print(f"likeliest levels: {fitted}; log-likelihood {likelihood:.3f} for each fix")
 
@@ -327,7 +327,7 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
     right.plot(time, found.T, color="tab:grey", linewidth=0.6, alpha=0.6)
     rms = numpy.sqrt((found**2).mean(axis=0))
     right.plot(time, rms, color="tab:red", label="root mean square")
-    model = numpy.sqrt(numpy.diag(modelled(time, PARAMETERS)))
+    model = numpy.sqrt(numpy.diag(ins_error_covariance(time, PARAMETERS)))
     right.plot(time, model, color="tab:blue", linestyle="--", label="the model's standard deviation")
     right.set(xlabel="since the start of the window, s", ylabel="INS error of an axis, m", ylim=(-65, 65))
     right.legend(frameon=False, loc="upper left")

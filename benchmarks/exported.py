@@ -320,23 +320,23 @@ def main() -> None:
     parser.add_argument("--cross", default="", help='such as "arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb"')
     parser.add_argument("--out", type=Path)
     parser.add_argument("--read", type=Path, help="summarise the file of --out without running anything")
-    asked = parser.parse_args()
-    if asked.read is not None:
-        print(summary(list(csv.DictReader(asked.read.open(encoding="utf-8")))))
+    args = parser.parse_args()
+    if args.read is not None:
+        print(summary(list(csv.DictReader(args.read.open(encoding="utf-8")))))
         return
-    if asked.compiler is None:
+    if args.compiler is None:
         sys.exit("no C compiler here")
     warnings.simplefilter("ignore")
     found: list[dict[str, Any]] = []
-    for id in asked.environment or list(catalogue()):
+    for id in args.environment or list(catalogue()):
         problem = problem_of(id)
-        names = asked.policy or ranked_names(problem)
-        compilers = Compilers(asked.compiler, asked.cross.split())
-        for line in lines(problem, names, asked.episodes, asked.measurements, compilers):
+        names = args.policy or ranked_names(problem)
+        compilers = Compilers(args.compiler, args.cross.split())
+        for line in lines(problem, names, args.episodes, args.measurements, compilers):
             found.append(line)
             print(", ".join(f"{key} {_short(value)}" for key, value in line.items()), flush=True)
-    if asked.out is not None:
-        with asked.out.open("w", newline="", encoding="utf-8") as file:
+    if args.out is not None:
+        with args.out.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
             writer.writerows({key: _short(value) for key, value in line.items()} for line in found)

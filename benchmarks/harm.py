@@ -115,19 +115,19 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--split", default="test")
     parser.add_argument("--cells", action="store_true", help="print every cell, too")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     table = [
         "| environment | competitor | cells harmed | worst cell | cost against the paper's there, % | ANEES | "
         "outside 0.5 to 2 | tracks lost |\n" + "|---" * 8 + "|"
     ]
-    for id in asked.environment:
+    for id in args.environment:
         problem = problem_of(id)
-        makers = competitors_of(problem, asked.policy or pretrained_agents(problem.id))
+        makers = competitors_of(problem, args.policy or pretrained_agents(problem.id))
         found: dict[str, list[Cell]] = {name: [] for name in makers}
         for cell in cells_of(problem):
-            for name, own in fly(problem, makers, asked.episodes, asked.split, cell).items():
+            for name, own in fly(problem, makers, args.episodes, args.split, cell).items():
                 found[name].append(own)
-                if asked.cells:
+                if args.cells:
                     print(
                         f"{problem.short_name} {own.name} {name} {own.text} ANEES {own.anees:.2f}", flush=True
                     )

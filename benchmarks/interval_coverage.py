@@ -52,12 +52,12 @@ def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> 
     problem = problem_of(f"filtergym/{environment}-v0")
     split = "validation" if problem.task.scenarios[scenario].training else "test"
     experiment = problem.experiment(scenario, episodes, 1, split)
-    asked = EvaluationRequest(experiment, name, find_competitor(problem, name).maker)
+    request = EvaluationRequest(experiment, name, find_competitor(problem, name).maker)
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
 
-    found: numpy.ndarray = reduce_episodes(asked, declare, lambda done: None).reduction.results()["cost",]
+    found: numpy.ndarray = reduce_episodes(request, declare, lambda done: None).reduction.results()["cost",]
     return found
 
 

@@ -51,7 +51,7 @@ class Nearest(NamedTuple):
         return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
 
 
-def asked_names(problem: Problem) -> list[str]:
+def names_without_random(problem: Problem) -> list[str]:
     """Return the names of all ranked competitors, each under its own control, without random actions."""
     policies = problem.baselines.policies
     return [name for name in ranked_names(problem) if policies.get(name) is not RandomPolicy]
@@ -66,10 +66,10 @@ def episode_costs(
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
 
     experiment = problem.experiment(scenario, episodes, seed)
-    asked = requests_of(problem, experiment, find_competitors(problem, names))
+    requests = requests_of(problem, experiment, find_competitors(problem, names))
     return {
         one.name: reduce_episodes(one, declare, lambda done: None).reduction.results()["cost",]
-        for one in asked
+        for one in requests
     }
 
 
@@ -86,7 +86,9 @@ def nearest(
         names: names of competitors; none: all ranked ones.
     """
     reference = problem.baselines.score_reference
-    costs = episode_costs(problem, scenario, [*(names or asked_names(problem)), reference], episodes, seed)
+    costs = episode_costs(
+        problem, scenario, [*(names or names_without_random(problem)), reference], episodes, seed
+    )
     limit = costs.pop(reference)
     differences = {name: own - limit for name, own in costs.items()}
     errors = {
@@ -108,13 +110,13 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--policy", action="append", help="default: all ranked competitors")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     found = []
-    for id in asked.environment or catalogue():
+    for id in args.environment or catalogue():
         problem = problem_of(id)
         for scenario in problem.task.scenarios:
-            episodes = affordable_episodes(problem, scenario, asked.episodes)
-            found.append(nearest(problem, scenario, episodes, asked.seed, asked.policy or ()))
+            episodes = affordable_episodes(problem, scenario, args.episodes)
+            found.append(nearest(problem, scenario, episodes, args.seed, args.policy or ()))
             print(f"{id} {scenario}: {found[-1].verdict}", file=sys.stderr, flush=True)
     header = [
         "environment",

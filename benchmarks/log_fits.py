@@ -120,25 +120,25 @@ def main() -> None:
     parser.add_argument(
         "--starts", type=int, default=0, help="compare with the best of this number of starts"
     )
-    asked = parser.parse_args()
+    args = parser.parse_args()
     problem = problem_of(ID)
-    true = {f"log10_{name}": math.log10(value) for name, value in TRUE[asked.family].items()}
+    true = {f"log10_{name}": math.log10(value) for name, value in TRUE[args.family].items()}
     true["log10_noise_scale"] = math.log10(SIGMA / STATED)
     errors, inside, widths = ({name: [] for name in true} for _ in range(3))
     below, likelier = [], []
     with tempfile.TemporaryDirectory() as folder:
-        for seed in range(asked.logs):
-            recording = simulated_log(Path(folder), asked.family, asked.measurements, seed)
-            family = families_of(problem, recording)[asked.family]
+        for seed in range(args.logs):
+            recording = simulated_log(Path(folder), args.family, args.measurements, seed)
+            family = families_of(problem, recording)[args.family]
             _, found, intervals = fit_all(FittedLog(problem, recording), family)
             others = [found.log_likelihood]
-            for start in range(1, asked.starts):
+            for start in range(1, args.starts):
                 rng = numpy.random.default_rng(1000 + start)
                 begin = {name: rng.uniform(low, high) for name, (low, high) in family.limits.items()}
                 other = dataclasses.replace(family, start=begin)
                 others.append(fit_all(FittedLog(problem, recording, seed=start), other)[1].log_likelihood)
             below.append(max(others) - others[0])
-            if asked.family == "imm-two" and KINDS[seed % len(KINDS)] != "outliers":
+            if args.family == "imm-two" and KINDS[seed % len(KINDS)] != "outliers":
                 both = (likelihood_of_sequences(recording, values) for values in (true, found.values))
                 likelier.append(next(both) - next(both))
             for name, value in true.items():
@@ -162,9 +162,9 @@ def main() -> None:
             f"{sum(nats > 0.0 for nats in likelier)} of {len(likelier)} logs without outliers, by "
             f"{numpy.mean(likelier):.1f} nats in the mean"
         )
-    if asked.starts:
+    if args.starts:
         most, mean = max(below), numpy.mean(below)
-        print(f"nats below the best of {asked.starts} starts: {most:.2f} at most, {mean:.2f} in the mean")
+        print(f"nats below the best of {args.starts} starts: {most:.2f} at most, {mean:.2f} in the mean")
 
 
 if __name__ == "__main__":

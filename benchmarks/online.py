@@ -189,10 +189,10 @@ def main() -> None:
     parser.add_argument("--tracks", type=int, default=5)
     parser.add_argument("--plots", type=int, default=2000, help="of each track")
     parser.add_argument("--updates", type=int, default=5000, help="that are timed")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
-        table = write_log(path, asked.tracks, asked.plots)
+        table = write_log(path, args.tracks, args.plots)
         recording = read_recording(path, ID, speeds=(0.001, 1000.0), sampling_interval=T)
         for name in COMPETITORS:
             count, differing = differing_updates(name, recording, table)
@@ -205,7 +205,7 @@ def main() -> None:
     for name, make in {**peers, "Stone Soup, one Kalman filter": stone_soup_update}.items():
         with suppress(ImportError):
             cases[name] = make()
-    found = latencies(cases, asked.updates)
+    found = latencies(cases, args.updates)
     rows = []
     for name, seconds in found.items():
         median, late = numpy.median(seconds), numpy.quantile(seconds, 0.999)

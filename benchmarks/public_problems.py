@@ -341,7 +341,7 @@ def decibels(values: Any) -> Any:
     return 10.0 * numpy.log10(values)
 
 
-def tuned(id: str, name: str, runs: Path) -> Any:
+def tune_scales(id: str, name: str, runs: Path) -> Any:
     """Tune the scales of Q and R of an estimator on training episodes, or read the values stored in ``runs``."""
     problem, file = problem_of(id), runs / f"{short_name(id)}.{name}.tuned.json"
     if not file.exists():
@@ -427,7 +427,7 @@ def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: 
     competitors: dict[str, Any] = {name: name for name in (*untuned, "covariance-matching")}
     for scale in problem.scales:
         competitors[f"extended, Q x {scale:g}"] = Variant(Extended, process_noise=scale)
-    competitors |= {f"{name}, tuned": tuned(problem.id, name, runs) for name in untuned}
+    competitors |= {f"{name}, tuned": tune_scales(problem.id, name, runs) for name in untuned}
     for algorithm, folders in agents.items():
         competitors |= {f"{algorithm}/{seed}": Path(folder) for seed, folder in enumerate(folders)}
     return competitors if problem.recording else {**competitors, "known-model": "known-model"}

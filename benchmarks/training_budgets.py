@@ -39,19 +39,19 @@ def main() -> None:
     parser.add_argument("--environment", action="append", help="short name; repeatable; default: four")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--episodes", type=int, default=1000)
-    asked = parser.parse_args()
+    args = parser.parse_args()
     rows = []
-    for name in asked.environment or ENVIRONMENTS:
+    for name in args.environment or ENVIRONMENTS:
         id, cells = f"filtergym/{name}-v0", []
         paper = baselines_of(id).score_paper
         for steps in BUDGETS:
-            runs = train(id, asked.algo, steps, asked.seeds, asked.runs / f"{name}-{asked.algo}-{steps}")
-            results = filtergym.evaluate(id, [paper, *runs], episodes=asked.episodes, seed=0)
+            runs = train(id, args.algo, steps, args.seeds, args.runs / f"{name}-{args.algo}-{steps}")
+            results = filtergym.evaluate(id, [paper, *runs], episodes=args.episodes, seed=0)
             cost = results["cost"].mean(["episode", "time"]).values
             change = 100.0 * (cost[1:] / cost[0] - 1.0)
             cells.append(f"{numpy.mean(change):+.1f} ({change.min():+.1f} to {change.max():+.1f})")
         rows.append([name, *cells])
-    header = [f"{asked.algo}, {asked.seeds} seeds", *(f"{steps:,} decisions" for steps in BUDGETS)]
+    header = [f"{args.algo}, {args.seeds} seeds", *(f"{steps:,} decisions" for steps in BUDGETS)]
     print("\n".join(markdown_table(header, rows)))
 
 

@@ -13,7 +13,7 @@ from models import Asked
 from filtergym import evaluate
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines import fitting
-from filtergym.baselines.advice import FittedLog, advise, share_out
+from filtergym.baselines.advice import FittedLog, advise, split_recording
 from filtergym.baselines.fitted_filters import families_of, own_family, read_artefact
 from filtergym.baselines.fitting import fit, fit_profiles, with_noise_scale
 from filtergym.baselines.judgement import AS_GOOD, Judgement
@@ -221,7 +221,7 @@ def test_what_the_log_says_nothing_of_is_open(tmp_path):
 
 def test_shares_are_apart_and_are_all(tmp_path):
     recording = read(write_log(tmp_path, count=962))
-    share = share_out(recording)
+    share = split_recording(recording)
     assert len(share.judged) == 6  # one in four of the blocks of forty measurements
     taken = np.zeros(int(recording.rows[0]), dtype=int)
     for spans in (share.fitted, share.chosen, share.judged):

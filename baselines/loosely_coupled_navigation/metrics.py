@@ -50,7 +50,7 @@ UNITS = {
 
 
 def recovery_times(
-    error: numpy.ndarray, available: numpy.ndarray, limit: float, held: int, longest: int
+    error: numpy.ndarray, available: numpy.ndarray, limit: float, hold: int, longest: int
 ) -> numpy.ndarray:
     """Return the samples from the end of an outage until the error stays small, for each episode.
 
@@ -58,23 +58,23 @@ def recovery_times(
         error: size of the error, ``(episodes, time)``.
         available: one where there is a measurement, same shape.
         limit: largest error that counts as small.
-        held: samples for which it must stay small.
+        hold: samples for which it must stay small.
         longest: largest number of samples, which is the result for a run that does not recover within it.
 
     Returns:
         ``(episodes,)``; zero where the error was small from the first measurement after the outage on; NaN
-        for episodes without an outage, or with less than ``longest + held`` samples after it.
+        for episodes without an outage, or with less than ``longest + hold`` samples after it.
     """
     episodes, steps = error.shape
     ends = (available[:, :-1] < 0.5) & (available[:, 1:] > 0.5)
     first = numpy.where(ends.any(axis=1), ends.argmax(axis=1) + 1, steps)
-    counted = first + longest + held <= steps
-    window = numpy.arange(longest + held)
+    counted = first + longest + hold <= steps
+    window = numpy.arange(longest + hold)
     index = numpy.minimum(first[:, None] + window, steps - 1)
     small = numpy.take_along_axis(error, index, axis=1) < limit
     runs = numpy.cumsum(numpy.concatenate([numpy.zeros((episodes, 1), int), small], axis=1), axis=1)
-    held_from = runs[:, held:] - runs[:, :-held] == held
-    found = held_from[:, :longest]
+    holds_from = runs[:, hold:] - runs[:, :-hold] == hold
+    found = holds_from[:, :longest]
     time = numpy.where(found.any(axis=1), found.argmax(axis=1), longest)
     return numpy.where(counted, time.astype(float), math.nan)
 
@@ -129,8 +129,8 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     p = task.parameters
     T, nominal = p.sampling_interval, math.sqrt(p.receiver_variance * p.axes)
     size = numpy.sqrt((run["error"].values ** 2).sum(axis=-1))
-    held, longest = (max(round(t / T), 1) for t in (HOLD_TIME, LONGEST))
-    times = recovery_times(size, run["available"].values, RECOVERY_ERROR * nominal, held, longest)
+    hold, longest = (max(round(t / T), 1) for t in (HOLD_TIME, LONGEST))
+    times = recovery_times(size, run["available"].values, RECOVERY_ERROR * nominal, hold, longest)
     found = {
         "recovery_time": times[:, None] * T,
         "not_recovered": numpy.where(numpy.isnan(times), math.nan, times == longest)[:, None],

@@ -6,7 +6,7 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Reader
-from ..alarm import Alarm, certain, innovation_evidence
+from ..alarm import Alarm, fault_evidence, innovation_evidence
 
 ROUNDING = 1e-6
 """Rounding of an interval, scan periods."""
@@ -43,4 +43,4 @@ class RadarAlarm(Alarm):
         if self.elapsed is None:
             return weighed
         irregular = ~there | (numpy.abs(self.elapsed(observation) - 1.0) > ROUNDING)
-        return numpy.concatenate([weighed, *likelihood, certain(irregular[:, 0])], axis=1)
+        return numpy.concatenate([weighed, *likelihood, fault_evidence(irregular[:, 0])], axis=1)

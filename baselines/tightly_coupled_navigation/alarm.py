@@ -4,7 +4,7 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Reader
-from ..alarm import LARGER, Alarm, certain, scale_ratio
+from ..alarm import LARGER, Alarm, fault_evidence, scale_ratio
 
 
 class SensorAlarm(Alarm):
@@ -31,4 +31,6 @@ class SensorAlarm(Alarm):
         degrees = measurements * numpy.stack(here, axis=1)
         mean = self.nis(observation).reshape(count, len(here), -1).min(axis=2)
         stuck = self.repeat(observation)[:, 0] > 0.0
-        return numpy.concatenate([scale_ratio(degrees * mean, degrees, LARGER), certain(stuck)], axis=1)
+        return numpy.concatenate(
+            [scale_ratio(degrees * mean, degrees, LARGER), fault_evidence(stuck)], axis=1
+        )

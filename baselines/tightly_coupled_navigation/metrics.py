@@ -30,7 +30,7 @@ def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -
         return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
 
 
-def lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
+def find_lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
     """Return where a condition begins to hold for some steps in a row; false where the end is too near.
 
     Args:
@@ -72,7 +72,7 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
         others = numpy.flatnonzero(true_mode[episode, first:] != after)
         last = first + int(others[0]) if len(others) else length
         believed = probability[episode, first:last, after] > 0.5
-        held = lasting(believed[None], min(LASTING, last - first))[0]
+        held = find_lasting(believed[None], min(LASTING, last - first))[0]
         wait = float(held.argmax()) + 1.0 if held.any() else math.inf
         found.append(Switch(int(episode), before, after, wait))
     return found
@@ -100,7 +100,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     moved = true_mode != true_mode[:, :1]
     begin = numpy.where(moved.any(axis=1), moved.argmax(axis=1), 0)
     in_motion = numpy.arange(true_mode.shape[1]) >= begin[:, None]
-    outside = lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
+    outside = find_lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
     each |= {
         "switches": _count_changes(switches(true_mode, run["mode_probability"].values), len(true_mode), step),
         "lost": numpy.asarray(outside.any(axis=1)),
