@@ -99,7 +99,7 @@ class Trust:
 
     Args:
         model: whose observations it is shown.
-        alarm: an object with a method ``update`` (:class:`.Alarm`), or what makes one for the model; default: that of the
+        alarm: an object with a method ``update`` (:class:`.Alarm`), or its maker for the model; default: that of the
             environment's baselines, or :class:`.InnovationAlarm`.
         window: decisions for which an alarm is heeded, that at which it speaks among them; default: the alarm's.
         envelope: of the agent's training; without it, it is trusted whatever it is shown.

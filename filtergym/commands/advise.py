@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from ..baselines.advice import FittedLog, advise, fit_all
-from ..baselines.fitted_filters import SUFFIX, families_of, own_family, log_setup, write_advised
+from ..baselines.fitted_filters import SUFFIX, families_of, log_setup, own_family, write_advised
 from ..baselines.onboard import judge_onboard
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
