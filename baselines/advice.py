@@ -1,4 +1,4 @@
-"""Which filter is best for a recording, by how much, and with which parameters.
+"""Choice of the best filter for a recording, with its fitted parameters and its gain over the shipped filters.
 
 The recording is cut into blocks. Every family of filters is fitted to half of them by maximum likelihood. One is
 chosen by its likelihood on these and on a quarter more, less one nat for each fitted parameter (Akaike, IEEE Trans. AC
@@ -79,11 +79,11 @@ class FittedLog:
 
     problem: Problem
     recording: Recording
-    """With truth or without."""
+    """Recording, with truth or without."""
     noise: bool = True
-    """Fit the scale of the measurement noise, too, where measurements state one."""
+    """Whether to fit the scale of the measurement noise, too, where measurements state one."""
     seed: int = 0
-    """Of the starts of the fits."""
+    """Seed of the starts of the fits."""
     keywords: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Parameters of the task."""
 
@@ -96,7 +96,7 @@ class FittedLog:
 
     @cached_property
     def share(self) -> Share:
-        """Which blocks fit, choose and judge."""
+        """Blocks that fit, choose and judge."""
         return split_recording(self.recording)
 
     @cached_property
@@ -260,7 +260,7 @@ class Advice(NamedTuple):
 
     @property
     def intervals(self) -> dict[str, Interval]:
-        """Of the parameters of ``fitted``."""
+        """Intervals of the parameters of ``fitted``."""
         return {name: each.interval for name, each in self.profiles[self.fitted.name].items()}
 
     def make_fitted(self) -> dict[str, Any]:
@@ -280,7 +280,7 @@ def advise(
     progress: Callable[[str, float], None] = lambda what, share: None,
     price_of: Callable[[str, Any], Mapping[str, int] | None] = lambda name, maker: None,
 ) -> Advice:
-    """Fit every family of filters to a recording, choose one, and judge it against what is shipped.
+    """Fit every family of filters to a recording, choose one, and judge it against the shipped filters.
 
     Args:
         log: the recording, and how filters are fitted to it.
@@ -291,7 +291,7 @@ def advise(
             further measures; None where they are unknown, which ranks it as the most expensive.
 
     Raises:
-        ValueError: if nothing can be fitted, or the recording is too short.
+        ValueError: if no family can be fitted, or the recording is too short.
     """
     problem, recording = log.problem, log.recording
     fits = _fit_families(log, own or {}, progress)

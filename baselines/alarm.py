@@ -34,9 +34,9 @@ def scale_ratio(squares: Any, degrees: Any, factor: float) -> Any:
     """Return the log-likelihood ratio of innovations whose variance is ``factor`` times the expected one.
 
     Args:
-        squares: normalised innovation squared, chi-square if nothing is wrong.
-        degrees: of freedom.
-        factor: on the variance.
+        squares: normalised innovation squared, chi-square without a fault.
+        degrees: degrees of freedom.
+        factor: factor on the variance.
     """
     return 0.5 * squares * (1.0 - 1.0 / factor) - 0.5 * degrees * math.log(factor)
 
@@ -67,7 +67,7 @@ class Sums(NamedTuple):
     """Memory of an alarm."""
 
     sums: numpy.ndarray
-    """Of each log-likelihood ratio, ``(N, kinds)``."""
+    """Sums of each log-likelihood ratio, ``(N, kinds)``."""
     observation: numpy.ndarray
     """Last observation, ``(N, fields)``."""
 
@@ -114,11 +114,11 @@ class Alarm:
 
         Args:
             observation: ``(N, fields)``.
-            memory: what the last call returned; None at the first.
+            memory: memory that the last call returned; None at the first.
             start: true where an episode begins, ``(N,)``.
 
         Returns:
-            Booleans ``(N,)``, and memory.
+            Whether there is a fault, booleans ``(N,)``, and memory.
         """
         before = numpy.full_like(observation, math.nan) if memory is None else memory.observation
         evidence = self.evidence(observation, numpy.where(start[:, None], math.nan, before))

@@ -46,8 +46,8 @@ def own_family(name: str, cls: Any) -> Tunable:
     Args:
         name: name of the estimator in errors.
         cls: its class, with an attribute ``parameters``: by the name of each keyword lower limit, value in force and
-            upper limit. What is named ``log10_...`` is the logarithm of the keyword. Where ``lane_parameters`` is true,
-            values may be arrays ``(N,)``, and candidates run side by side.
+            upper limit. A parameter named ``log10_...`` is the logarithm of the keyword. Where ``lane_parameters`` is
+            true, values may be arrays ``(N,)``, and candidates run side by side.
 
     Raises:
         ValueError: if it has no parameters, or values that are no limits.

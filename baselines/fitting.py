@@ -158,9 +158,9 @@ class RobustState(NamedTuple):
     """State of a filter that models outliers."""
 
     own: Any
-    """Of the filter."""
+    """State of the filter."""
     likelihood: Likelihood
-    """Of the mixture."""
+    """Likelihood of the mixture."""
 
 
 class RobustEstimator(Filter[Task, Any, RobustState]):
@@ -198,7 +198,7 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         usual, wide = (self._step(state, z) for z in (measurement, self.scaled(measurement, WIDE)))
         one = usual[1].log_likelihood + xp.log(1.0 - self.share)
         other = wide[1].log_likelihood + xp.log(self.share)
-        # Of a measurement that was not received both are NaN: the first update is kept.
+        # For a measurement that was not received both are NaN: the first update is used.
         is_outlier = other > one
         top = xp.where(is_outlier, other, one)
         return usual, wide, is_outlier, top + xp.log(xp.exp(one - top) + xp.exp(other - top))
@@ -238,7 +238,7 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
     """Maximise the likelihood of a recording's measurements.
 
     Args:
-        likelihood: of the tunable's parameters.
+        likelihood: likelihood of the tunable's parameters.
         tunable: the estimator, with limits.
         seed: seed of the starts.
         starts: number of starts.
@@ -348,7 +348,7 @@ def fit_profiles(
     Where a step of a profile is likelier than the fit, the fit starts again from there.
 
     Args:
-        likelihood: of the tunable's parameters.
+        likelihood: likelihood of the tunable's parameters.
         tunable: the estimator, with limits.
         found: result of :func:`fit`.
         tick: called with the share of the work done, which falls where the fit starts again.
@@ -452,7 +452,7 @@ def _maximise_others(
 ) -> tuple[numpy.ndarray, float]:
     """Maximise the likelihood over all parameters but one, and return the maximum and its place.
 
-    Steps are Newton's with the curvature at the maximum as long as each gains; where one does not, L-BFGS-B goes on.
+    Steps are Newton's with the curvature at the maximum as long as each gains; where one does not, L-BFGS-B continues.
     """
     from scipy.optimize import minimize
 

@@ -10,7 +10,7 @@ from ..filters import noise_adaptation as adaptation
 from ..filters.array_namespace import Array
 
 LEAST = 0.1
-"""Smallest estimate over the stated variance; ours: a third of the stated deviation, below which nothing is gained."""
+"""Smallest estimate over the stated variance; ours: a third of the stated deviation, below which there is no gain."""
 
 
 class MeasurementNoise:

@@ -43,7 +43,7 @@ class Problem:
 
     @property
     def name(self) -> str:
-        """Id by which another process finds it, see :func:`.envs.catalogue.importable_name`."""
+        """Id by which another process imports it, see :func:`.envs.catalogue.importable_name`."""
         return importable_name(self.task)
 
     @property

@@ -38,8 +38,8 @@ class Tunable:
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of the values, without their logarithm; a value without an entry is a pure number."""
     likelihood: bool = False
-    """Whether a search weighs the density of the truth beside the cost: a filter with few hypotheses costs least where
-    its covariance is too small."""
+    """Whether a search weighs the density of the truth in addition to the cost: a filter with few hypotheses costs
+    least where its covariance is too small."""
     anchored: bool = False
     """Whether it uses a second sensor of the motion, with which it distinguishes lasting errors from motion. Advice
     fits it to measurements some time apart, and compares it with other filters on these (:mod:`.advice`)."""

@@ -256,7 +256,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("section", nargs="*", choices=[*SECTIONS, []], help="what to measure")
+    parser.add_argument("section", nargs="*", choices=[*SECTIONS, []], help="sections to measure")
     parser.add_argument(
         "--against", metavar="PYTHON", help="of another checkout, measured in turn with this one"
     )

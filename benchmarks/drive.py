@@ -19,10 +19,9 @@ Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repo
 * The IMU's milliseconds are stretched to the logger's time tags, and these are 0.125 s late. With 0.16 to 0.2 s the
   innovations here would be least, and the error of the INS after 20 s 15 m in place of 16 m.
 * The IMU is mounted at (180, -6.79, 185.35) degrees roll, pitch, yaw to the vehicle, the antenna 5 cm left of it.
-* Accelerations are in units of 9.80665 m/s^2, rates in degrees/s. Nothing is low-pass filtered: the integration does
-  that.
-* Heights are above sea level and taken for ellipsoidal ones: 16 m change the scale by 3e-6.
-* Densities of white noise are measured here, over 1 s at the standstill with the engine running; around roll
+* Accelerations are in units of 9.80665 m/s^2, rates in degrees/s. No low-pass filter is used: the integration acts as
+one. * Heights are above sea level and taken for ellipsoidal ones: 16 m change the scale by 3e-6. * Densities of white
+noise are measured here, over 1 s at the standstill with the engine running; around roll
   and pitch that is ten times what the repository has from the data sheet.
 """
 
@@ -46,7 +45,7 @@ INERTIAL, FIXES = "data/drive_0708/imu_1934.csv", "data/drive_0708/gnss_1934_sf.
 MOUNTING = (180.0, -6.79, 185.35)
 """Roll, pitch and yaw of the IMU's axes to forward, right, down of the vehicle, degrees."""
 LEVER = (0.0, -0.05, 0.0)
-"""From the IMU to the antenna, forward, right, down, m."""
+"""Lever arm from the IMU to the antenna, forward, right, down, m."""
 DELAY = 0.125
 """Delay of the logger's time tags of the IMU, s; the repository's."""
 RTK_POSITION, RTK_VELOCITY = 0.02, 0.06
@@ -140,7 +139,7 @@ def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
         fixes: result of :func:`read_fixes`.
 
     Raises:
-        ValueError: if the recording does not begin with a standstill of 5 s, or nothing moves after it.
+        ValueError: if the recording does not begin with a standstill of 5 s, or the vehicle does not move after it.
     """
     sigma = numpy.full(len(fixes), RTK_POSITION)
     return aid(align(inertial, fixes), fixes, sigma, RTK_VELOCITY, LEVER)

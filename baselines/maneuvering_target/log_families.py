@@ -132,7 +132,7 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
     """Return the families that can be fitted to a log of positions, the simplest first.
 
     Args:
-        recording: of ManeuveringTarget, whose intervals and deviations set the limits; None: 1 s and 1 m.
+        recording: recording of ManeuveringTarget, whose intervals and deviations set the limits; None: 1 s and 1 m.
     """
     T = r = 1.0
     if recording is not None:

@@ -53,7 +53,7 @@ ESTIMATORS: dict[str, Any] = {
     **FEW,
     "semi-markov-wide": Variant(
         SemiMarkov,
-        "`semi-markov` with a prior that holds harder manoeuvres than those of training, too: 40 hypotheses.",
+        "`semi-markov` with a prior that includes harder manoeuvres than those of training: 40 hypotheses.",
         prior=WIDE,
     ),
     "semi-markov-vague": SEMI_MARKOV_VAGUE,

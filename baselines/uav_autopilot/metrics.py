@@ -70,7 +70,7 @@ def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: nump
     in an episode that does not begin with raised noise.
 
     Args:
-        nis: normalised innovation squared, NaN where nothing was received, ``(episodes, time)``.
+        nis: normalised innovation squared, NaN where no reading was received, ``(episodes, time)``.
         degrees: its degrees of freedom.
         raised: whether noise is raised.
 
