@@ -9,10 +9,10 @@ The log (BSD-3-Clause, see ``docs/data/drive_licence.txt``): a car with a consum
 
 1. **Alignment** and aiding by the positions and velocities of RTK, as in ``envs/logs/strapdown.py``.
 2. **Windows.** At the start of each the INS is set to velocity, attitude and biases of that filter, which has used no
-later data, and to the position of RTK; then it runs free. Windows do not overlap. 3. **Truth** is the RTK position of
-the antenna, 1 to 2.5 cm by its own report, as it is. 4. **Fixes** are simulated: truth plus white noise. The solution
-in the log is RTK only; a position of its own would
-   have to be computed from the receiver's raw observations.
+   later data, and to the position of RTK; then it runs free. Windows do not overlap.
+3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, unchanged.
+4. **Fixes** are simulated: truth plus white noise. The solution in the log is RTK only; a position of the receiver alone
+   would have to be computed from its raw observations.
 
 Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repository unless noted otherwise:
 
@@ -20,9 +20,10 @@ Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repo
   innovations here would be least, and the error of the INS after 20 s 15 m in place of 16 m.
 * The IMU is mounted at (180, -6.79, 185.35) degrees roll, pitch, yaw to the vehicle, the antenna 5 cm left of it.
 * Accelerations are in units of 9.80665 m/s^2, rates in degrees/s. No low-pass filter is used: the integration acts as
-one. * Heights are above sea level and taken for ellipsoidal ones: 16 m change the scale by 3e-6. * Densities of white
-noise are measured here, over 1 s at the standstill with the engine running; around roll
-  and pitch that is ten times what the repository has from the data sheet.
+  one.
+* Heights are above sea level and used as ellipsoidal ones: 16 m change the scale by 3e-6.
+* Densities of white noise are measured here, over 1 s at the standstill with the engine running; around roll
+  and pitch that is ten times the value that the repository takes from the data sheet.
 """
 
 import argparse

@@ -47,7 +47,7 @@ def chain(stay: float) -> tuple[tuple[float, ...], ...]:
 class Sticky(MultiHypothesis):
     """The paper's algorithm over a chain that leaves a hypothesis once in 100 s, not once in 5 s.
 
-    The chain belongs to the bank, so an evaluation sets the task's ``transition``; set it elsewhere.
+    The chain belongs to the bank, so an evaluation sets the task's ``transition``; elsewhere the user sets it.
     """
 
     task_keywords: ClassVar[dict[str, Any]] = {"transition": chain(0.9999)}
