@@ -6,8 +6,8 @@ sum reaches its limit. Without a fault a sum with limit h reaches it once in exp
 the limit follows from the tolerated number of false alarms.
 
 Signs of a fault are innovations that are larger than a filter expects, smaller, or to one side, and a reading that
-repeats itself. A missing measurement is one where the filter does not model it, as with fixed gains; a Kalman filter
-observes it and predicts only.
+repeats itself. A missing measurement counts as a sign where the filter does not model it, as with fixed gains; a Kalman
+filter only predicts then.
 
 An environment names its alarm in ``Baselines.alarm``; the default is :class:`InnovationAlarm`.
 """

@@ -63,6 +63,7 @@ class Interval(NamedTuple):
     open_low: bool
     """Whether the likelihood is still high at the lower limit of the search."""
     open_high: bool
+    """Whether the likelihood is still high at the upper limit of the search."""
 
 
 class Profile(NamedTuple):

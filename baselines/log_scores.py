@@ -1,8 +1,8 @@
 """Sums over stretches of a log of the likelihoods and errors of competitors.
 
 All competitors process the log side by side, in chunks of measurements. Only sums over stretches are stored: of one
-competitor, and of each pair over the measurements for which both have values. So memory does not grow with the length
-of the log. Intervals are those of :mod:`.evaluation.statistics.predictions`.
+competitor, and of each pair over the measurements for which both have values. So memory grows neither with the log nor
+with the number of competitors. Intervals are those of :mod:`.evaluation.statistics.predictions`.
 """
 
 import math

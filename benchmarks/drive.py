@@ -11,8 +11,8 @@ The log (BSD-3-Clause, see ``docs/data/drive_licence.txt``): a car with a consum
 2. **Windows.** At the start of each the INS is set to velocity, attitude and biases of that filter, which has used no
    later data, and to the position of RTK; then it runs free. Windows do not overlap.
 3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, unchanged.
-4. **Fixes** are simulated: truth plus white noise. The solution in the log is RTK only; a position of the receiver alone
-   would have to be computed from its raw observations.
+4. **Fixes** are simulated: truth plus white noise. The solution in the log is RTK only; a receiver's own position would
+   have to be computed from its raw observations.
 
 Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repository unless noted otherwise:
 
