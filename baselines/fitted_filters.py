@@ -233,7 +233,6 @@ def _is_place(origin: Mapping[str, float]) -> bool:
 
 
 def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, float]) -> TunedPolicy:
-    """Return the maker of a filter of a family with values of a file."""
     families = families_of(problem)
     if name not in families:
         raise ValueError(f"{path}: {problem.id} has no filter {name!r} that can be fitted")

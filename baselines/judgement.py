@@ -144,7 +144,7 @@ class Judgement:
         self._predicting = [n for n in scores.names if scores.predicted is not None and n not in anchored]
         self._chosen, self._judged = scores.log_likelihood
 
-    def _least(self, squares: PairSums | None, log_likelihood: PairSums) -> str:
+    def _least_error(self, squares: PairSums | None, log_likelihood: PairSums) -> str:
         """Return the shipped filter of smallest mean square; by log-likelihood where there are no squares."""
         numbers = self._numbers
         means = {
@@ -165,7 +165,7 @@ class Judgement:
         known = [name for name, mean in means.items() if not math.isnan(mean)]
         if not known:
             predicted = self.scores.predicted
-            return self._least(None if predicted is None else predicted[0], chosen)
+            return self._least_error(None if predicted is None else predicted[0], chosen)
         likeliest = max(known, key=means.__getitem__)
         gains = {name: chosen.difference(numbers[likeliest], numbers[name]) for name in known}
         if default in known and not gains[default].low > 0.0:
@@ -193,7 +193,7 @@ class Judgement:
 
     def best_shipped(self) -> str:
         """Return the shipped filter that is best on the measurements that judge."""
-        return self._least(self._judged_squares(), self._judged)
+        return self._least_error(self._judged_squares(), self._judged)
 
     def relative_error(self, name: str, other: str) -> IntervalEstimate:
         """Return the judged error over that of another, less one; without truth the prediction error is used."""

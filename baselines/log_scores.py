@@ -206,13 +206,13 @@ class LogScores:
             self._nis[:, i] += numpy.where(known, each, 0.0).sum(axis=(1, 2))
         estimates = [each["estimate"] for each in found]
         if self.squared is not None:
-            truth = self._of_log(self._recording.truth, first, rows)
+            truth = self._log_values(self._recording.truth, first, rows)
             errors = [self._task.subtract(each, truth)[self._components] for each in estimates]
             self.squared.add(numpy.stack([(each**2).sum(axis=0) for each in errors]), first)
             estimates = [unwrap(each, truth, self._task.periods) for each in estimates]
         if self.predicted is not None:
             names = self._recording.measurements
-            measured = {name: self._of_log(values, first, rows) for name, values in names.items()}
+            measured = {name: self._log_values(values, first, rows) for name, values in names.items()}
             squares = numpy.stack(
                 [
                     self._predict(i, each, SimpleNamespace(**measured), first)
@@ -238,7 +238,7 @@ class LogScores:
         squares: numpy.ndarray = (errors[main] ** 2).sum(axis=0)
         return squares
 
-    def _of_log(self, values: Any, first: int, rows: int) -> numpy.ndarray:
+    def _log_values(self, values: Any, first: int, rows: int) -> numpy.ndarray:
         """Return the log's values from a measurement on, ``(..., E, rows)``; NaN beyond the end of an episode."""
         some = values[self._plan.flown, first : first + rows].astype(float)
         return numpy.where(

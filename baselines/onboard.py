@@ -88,7 +88,7 @@ def judge_onboard(
     mask = withheld & judged & numpy.isfinite(own)
     if not mask.any():
         return None
-    replay = replay_log(problem.experiment(_without(recording, withheld), keywords=keywords), makers)
+    replay = replay_log(problem.experiment(_withhold(recording, withheld), keywords=keywords), makers)
     found = replay["estimate"].sel(policy=list(makers), component=["position_x", "position_y"])
     estimates = found.transpose("policy", "episode", "time", "component").values
     stretches = stretches_of(mask)[:, : estimates.shape[2]]
@@ -100,7 +100,7 @@ def judge_onboard(
     return OnboardJudgement(track.source, delay, int((stretches >= 0).sum()), root_means, relative, positions)
 
 
-def _without(recording: Recording, withheld: numpy.ndarray) -> Recording:
+def _withhold(recording: Recording, withheld: numpy.ndarray) -> Recording:
     """Return a recording in which some fixes are missed measurements."""
     measured = dict(recording.measurements)
     measured["available"] = numpy.where(withheld, 0.0, measured["available"])

@@ -65,7 +65,6 @@ class StateSpaceInteractingMultipleModel(ConstantPolicy):
 
 
 def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
-    """Return the likelihood of a measurement; NaN where none was received."""
     degrees = ordered_sum(available)
     there = degrees > 0.0
     return Likelihood(
@@ -75,7 +74,7 @@ def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
     )
 
 
-def _numbers(measurement: StateSpaceMeasurement, xp: Any) -> Array:
+def _zero_missing(measurement: StateSpaceMeasurement, xp: Any) -> Array:
     """Return the values with zero in place of missing ones."""
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
@@ -154,7 +153,7 @@ def _in_order(
     (oldest, *others), late = state.past, measurement.late_available
     assert late is not None
     first = oldest.measurement
-    both = xp.where(late > 0.0, measurement.late, _numbers(first, xp)), xp.maximum(first.available, late)
+    both = xp.where(late > 0.0, measurement.late, _zero_missing(first, xp)), xp.maximum(first.available, late)
     oldest = oldest._replace(measurement=first._replace(values=both[0], available=both[1]))
     alone = measurement._replace(late=None, late_available=None)
     past = (*others, Past(alone, truth, late[0] >= 0.0))
@@ -218,7 +217,7 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
 def _update(
     equations: Equations, mean: Array, P: Array, R: Array, measurement: StateSpaceMeasurement, xp: Any
 ) -> kalman.Update:
-    received = equations.receive(measurement._replace(values=_numbers(measurement, xp)), mean, R)
+    received = equations.receive(measurement._replace(values=_zero_missing(measurement, xp)), mean, R)
     return update_with_gain(mean, P, received, equations.gain(P, received))
 
 
@@ -280,7 +279,6 @@ class ExtendedSmoother(Extended):
         return scans.join(found)
 
     def _motion(self, mean: Array, measurement: StateSpaceMeasurement) -> smoothing.Motion:
-        """Return the motion of the state from a mean ``(n, N)`` to a measurement."""
         equations, each = self.equations, 0.0 * mean[0]
         predicted = equations.move(mean, measurement)
         noise = equations.input_noise(mean, measurement) + self.process_noise(predicted, measurement)
@@ -291,7 +289,7 @@ class ExtendedSmoother(Extended):
 
 def _put_in_order(measured: StateSpaceMeasurement, lateness: int, xp: Any) -> StateSpaceMeasurement:
     """Return the measurements ``(..., K, N)`` with late values in their places."""
-    plain = measured._replace(values=_numbers(measured, xp), late=None, late_available=None)
+    plain = measured._replace(values=_zero_missing(measured, xp), late=None, late_available=None)
     assert measured.late is not None
     assert measured.late_available is not None
     late, late_available = (values[:, lateness:] for values in (measured.late, measured.late_available))
@@ -334,7 +332,7 @@ class Unscented(Extended):
         result = unscented_update(
             mean,
             P,
-            _numbers(measurement, self.xp),
+            _zero_missing(measurement, self.xp),
             h,
             own.measured_noise(self.sensor_noise(mean, measurement), mean, measurement),
             measurement.available,
@@ -367,7 +365,7 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
 
     def take(self, state: Mixture, one: Past) -> Mixture:
         """Predict to a measurement and update with it."""
-        measurement = one.measurement._replace(values=_numbers(one.measurement, self.xp))
+        measurement = one.measurement._replace(values=_zero_missing(one.measurement, self.xp))
         predicted = self.bank.predict(state, measurement)
         return self.bank.act(predicted, measurement, 0.0 * predicted.action)
 

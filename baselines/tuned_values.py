@@ -78,7 +78,6 @@ class TunedValues:
     """Files of tuned values, the user's first."""
 
     def _tables(self) -> Iterator[tuple[Any, dict[str, dict[str, Any]]]]:
-        """Return the files and their content."""
         for place in self.places:
             yield place, read_table(place)
 

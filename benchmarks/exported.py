@@ -128,7 +128,6 @@ def size_of(file: Path, compilers: Compilers) -> Size:
 
 
 def _code_bytes(file: Path, compiler: list[str]) -> int:
-    """Return the bytes of code and constants."""
     made = file.with_suffix(".small.o").name
     subprocess.run([*compiler, *FLAGS, "-Os", "-c", file.name, "-o", made], cwd=file.parent, check=True)
     # The tool of the same toolchain: arm-none-eabi-size of arm-none-eabi-gcc.

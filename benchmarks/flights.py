@@ -103,17 +103,16 @@ def sets(smoothing: float) -> dict[str, Flights]:
         enough = len({*map(flight_of, pieces)}) >= FEWEST
         own.setdefault(folder if enough else "others", []).extend(pieces)
     ordered = sorted(own, key=lambda name: -len(own[name]))
-    return {name: Flights(tuple(_every(own[name])), name) for name in ordered}
+    return {name: Flights(tuple(_thin_pieces(own[name])), name) for name in ordered}
 
 
-def _every(pieces: list) -> list:
+def _thin_pieces(pieces: list) -> list:
     """Return the pieces of a set, or every second, third, ... of a set that is too long for one scenario."""
     scans = sum(piece.intervals(INTERVAL) for piece in pieces)
     return pieces[:: 1 + int(scans // MOST_SCANS)]
 
 
 def _rows(own: dict, records: list) -> list[dict]:
-    """Return one row for each competitor."""
     found: dict[str, dict] = {}
     for record in records:
         if record.metric in METRICS and record.window == "all" and record.component in ("", "state"):

@@ -69,7 +69,6 @@ def _missing(run: "xarray.Dataset", name: str) -> bool:
 
 
 def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
-    """Return whether a target is of each class, ``(..., classes)``."""
     return numpy.asarray(true_class[..., None] == numpy.arange(CLASSES))
 
 
