@@ -250,7 +250,7 @@ class Advice(NamedTuple):
     """None where the recording has no second sensor."""
     outliers: numpy.ndarray
     """Whether ``fitted`` treats each measurement as an outlier, ``(E, T)``."""
-    dearer: tuple[str, IntervalEstimate] | None
+    likeliest: tuple[str, IntervalEstimate] | None
     """Likeliest filter of all, and its gain on the measurements of the choice, nats per measurement, less one nat in
     all for each parameter; None where it is the advised one."""
     prices: "Prices"

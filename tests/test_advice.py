@@ -328,7 +328,7 @@ def one_family(monkeypatch):
 
 
 def test_a_short_log_says_that_it_is_short(one_family, tmp_path):
-    with pytest.raises(ValueError, match=r"has 3 measurements after the start of its track: .* takes 5"):
+    with pytest.raises(ValueError, match=r"has 3 measurements after the start of its track: .* needs at least 5"):
         advise(FittedLog(PROBLEM, read(write_log(tmp_path, count=5))), {})
     recording = read(write_log(tmp_path, count=12))
     found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
@@ -402,7 +402,7 @@ def test_of_two_that_are_as_good_the_cheaper_is_advised(one_family, tmp_path):
     assert lines[0].startswith(
         "Take constant-velocity, with the parameters below, as good as true and cheaper: "
     )
-    likelier = found._replace(dearer=("true", IntervalEstimate(0.25, -0.125, 0.5)))
+    likelier = found._replace(likeliest=("true", IntervalEstimate(0.25, -0.125, 0.5)))
     assert (
         "true is likelier where filters were chosen: it would bring +0.250 [-0.125, +0.500] nats per measurement and "
         "takes 500 operations an update for 400." in list(advice_lines(likelier, []))
