@@ -109,7 +109,7 @@ class ScaledNoise(Filter[Task, Any, Any]):
         self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> Any:
-        """Start from the initial estimate given to every filter, its covariance times the factor's square: a track
+        """Start from the initial estimate, its covariance times the factor's square: a track
         starts from measurements.
         """
         return self.own.start(initial._replace(covariance=initial.covariance * self.factor**2))

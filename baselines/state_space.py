@@ -194,7 +194,7 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         return self.equations.sensor_noise(mean, measurement, *self.sensor_factors)
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate given to every filter."""
+        """Start from the initial estimate."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun)
 
@@ -318,7 +318,7 @@ class Unscented(Extended):
         self.uncertain: Array = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate given to every filter, with a positive definite covariance."""
+        """Start from the initial estimate, with a positive definite covariance."""
         return super().start(initial._replace(covariance=initial.covariance + self.uncertain))
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
@@ -356,7 +356,7 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
         self.bank: MultipleModelBank = MultipleModelBank(task, "evidence", *factors, *_split(task, noises))
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate given to every filter."""
+        """Start from the initial estimate."""
         return _buffer(self.task, self.bank.start(initial))
 
     def update(self, state: Any, given: FilterInput) -> Any:
@@ -389,7 +389,7 @@ class KnownModel:
         self.xp: ModuleType = task.xp
 
     def start(self, initial: Initial, truth: StateSpaceTruth) -> Any:
-        """Start from the initial estimate given to every filter."""
+        """Start from the initial estimate."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun, self._model_truth(truth))
 

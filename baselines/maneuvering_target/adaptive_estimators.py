@@ -41,7 +41,7 @@ class SageHusaProcessNoise(KalmanModel):
         self.least: float = least**2
 
     def start(self, initial: Initial) -> ProcessNoiseTrack:
-        """Start from the initial estimate given to every filter."""
+        """Start from the initial estimate."""
         nothing = 0.0 * initial.mean[0]
         level = noise_adaptation.Level(self.variance + nothing, 1.0 + nothing)
         return ProcessNoiseTrack(*self.first_track(initial), level)
@@ -105,7 +105,7 @@ class VariationalBayes(KalmanModel):
         self.shape = shape
 
     def start(self, initial: Initial) -> MeasurementNoiseTrack:
-        """Start from the initial estimate given to every filter, with the radar's variances."""
+        """Start from the initial estimate, with the radar's variances."""
         shape = self.shape + 0.0 * initial.mean[:2]
         return MeasurementNoiseTrack(*self.first_track(initial), noise_adaptation.InverseGamma(shape, shape))
 

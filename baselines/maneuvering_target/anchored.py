@@ -52,7 +52,7 @@ class DeadReckoning(KalmanModel):
         self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate given to every filter, with an unknown slow error."""
+        """Start from the initial estimate, with an unknown slow error."""
         return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:

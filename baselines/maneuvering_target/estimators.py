@@ -22,7 +22,7 @@ class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
     """Base of the estimators with the constant-velocity model."""
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate given to every filter."""
+        """Start from the initial estimate."""
         return self.first_track(initial)
 
     def first_track(self, initial: Initial) -> EstimateState:
@@ -114,7 +114,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         ]
 
     def start(self, initial: Initial) -> KalmanMixture:
-        """Start all filters from the initial estimate given to every filter."""
+        """Start all filters from the initial estimate."""
         xp, M = self.xp, self.probabilities.shape[0]
         mean, covariance = self.augment(initial.mean, initial.covariance)
         return KalmanMixture(
@@ -235,7 +235,7 @@ class UnscentedTurn(TurnModel, KalmanModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate given to every filter, with a turn rate of mean zero."""
+        """Start from the initial estimate, with a turn rate of mean zero."""
         return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:

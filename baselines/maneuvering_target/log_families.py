@@ -44,7 +44,7 @@ class ConstantAcceleration(KalmanModel):
         self.H = task.constant([[float(i == j) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate given to every filter, with an acceleration of mean zero."""
+        """Start from the initial estimate, with an acceleration of mean zero."""
         xp = self.xp
         zero = 0.0 * initial.mean
         right = xp.concat([initial.covariance, zero[:, None][:, :, :] + 0.0 * zero[None, :2]], axis=1)

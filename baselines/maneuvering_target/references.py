@@ -50,7 +50,7 @@ class KnownTurn(KalmanModel):
     disturbances = DISTURBANCES
 
     def initialise(self, given: FilterInput) -> TurnMemory:
-        """Start from the initial estimate given to every filter; a coloured error is stationary from the start."""
+        """Start from the initial estimate; a coloured error is stationary from the start."""
         (mean, covariance), truth = given.measurement, given.truth
         if "coloured" in truth.disturbances:
             none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2

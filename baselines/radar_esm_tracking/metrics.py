@@ -32,8 +32,8 @@ def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
 def time_quantile(
     bootstrap: Bootstrap, first: numpy.ndarray, chosen: numpy.ndarray, seconds: numpy.ndarray, share: float
 ) -> IntervalEstimate:
-    """Return the time by which a condition holds in a share of the chosen episodes; infinite where it holds in too few,
-    NaN where none is chosen.
+    """Return the time by which a condition holds in a share of the chosen episodes; infinite where too few reach it,
+    NaN without any.
 
     Args:
         bootstrap: resamples of the episodes.

@@ -72,7 +72,7 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         self.bank: HuberBank = HuberBank(task, everywhere if thresholds is None else thresholds, manoeuvre)
 
     def start(self, initial: Initial) -> HuberState:
-        """Start every filter from the initial estimate given to every filter."""
+        """Start all filters from the initial estimate."""
         return HuberState(self.bank.start(initial), Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: HuberState, given: FilterInput) -> HuberState:

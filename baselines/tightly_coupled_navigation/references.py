@@ -52,7 +52,7 @@ class _KnownMode:
         self.size: int = gnss_ins.SIZE + task.satellites
 
     def start(self, initial: Initial, truth: Truth) -> KnownModeState:
-        """Start from the initial estimate given to every filter."""
+        """Start from the initial estimate."""
         mean, covariance = range_errors.start(
             initial.mean,
             initial.covariance,

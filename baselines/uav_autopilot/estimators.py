@@ -34,7 +34,7 @@ class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
         self.settled: Array = task.constant(steady.posterior)[:, :, None]
 
     def start(self, initial: Start) -> Initial:
-        """Start from the initial estimate given to every filter."""
+        """Start from the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
     def update(self, state: Initial, given: FilterInput) -> Initial:
@@ -101,7 +101,7 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         self.n: int = len(model.F)
 
     def start_filter(self, initial: Start) -> SensorAware:
-        """Return a filter at the initial estimate given to every filter, with the stated noise of sensors."""
+        """Return a filter at the initial estimate with the stated sensor noise."""
         zero = 0.0 * initial.mean[0]
         noise = tuple(self.sensor_noise.start(zero + R) for R in self.task.sensor_variances)
         return SensorAware(initial.mean, packed_covariance.pack(initial.covariance), noise)
@@ -134,7 +134,7 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         )
 
     def start(self, initial: Start) -> AdaptiveState:
-        """Start from the initial estimate given to every filter."""
+        """Start from the initial estimate."""
         unknown = Likelihood.unknown(initial.mean[0])
         return AdaptiveState(initial.mean, initial.covariance, unknown, self.first_memory(initial))
 
@@ -219,7 +219,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         self.transition = task.constant([[stay if i == j else change for j in range(3)] for i in range(3)])
 
     def first_memory(self, initial: Start) -> GustModels:
-        """Return all filters at the initial estimate given to every filter, with equal probabilities."""
+        """Return all filters at the initial estimate, with equal probabilities."""
         third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
         return GustModels((self.start_filter(initial),) * 3, third)
 

@@ -105,7 +105,7 @@ def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the measures of the loop, in addition to those of the estimate.
+    """Return the measures of the loop.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
     measurement, mean over the window. ``tracking_rmse``: root mean square of output minus command.

@@ -135,7 +135,7 @@ class Matched(_KnownNoise):
     )
 
     def start(self, initial: Start, truth: Truth) -> Initial:
-        """Start from the initial estimate given to every filter, with the true covariance, packed."""
+        """Start from the initial estimate, with the true covariance, packed."""
         mean = self.xp.concat([initial.mean, 0.0 * truth.disturbances["bias"]])[: self.size]
         return Initial(mean, self.start_covariance(truth))
 
