@@ -99,7 +99,7 @@ class Trust:
 
     Args:
         model: the model whose observations are passed.
-        alarm: an object with a method ``hear`` (:class:`.Alarm`), or a factory of one for the model; default: that of
+        alarm: an object with a method ``update`` (:class:`.Alarm`), or a factory of one for the model; default: that of
             the environment's baselines, or :class:`.InnovationAlarm`.
         window: decisions for which an alarm is active, including the one at which it sounds; default: the alarm's.
         envelope: range of the agent's training; without it, the agent is trusted for all observations.
@@ -137,10 +137,10 @@ class Trust:
         """
         none = 0.0 * observation[:, 0]
         alarm, envelope, active, outside = (None, None, none, none) if memory is None else memory
-        spoken, alarm = self.alarm.hear(observation, alarm, start)
+        spoken, alarm = self.alarm.update(observation, alarm, start)
         active = self._count_down(spoken, active, start)
         if self.envelope is not None:
-            left, envelope = self.envelope.hear(observation, envelope, start)
+            left, envelope = self.envelope.update(observation, envelope, start)
             outside = self._count_down(left, outside, start)
         return (active > 0.0) & (outside <= 0.0), TrustMemory(alarm, envelope, active, outside)
 

@@ -1,14 +1,14 @@
-"""Which filter is best for a recording, by how much, and with which parameters.
+"""Choice of the best filter for a recording, with its fitted parameters and its gain over the shipped filters.
 
 The recording is cut into blocks. Every family of filters is fitted to half of them by maximum likelihood. One is
 chosen by its likelihood on these and on a quarter more, less one nat for each fitted parameter (Akaike, IEEE Trans. AC
-19, 1974): the simplest that the likeliest does not beat beyond chance. It is fitted to all three quarters. So is its
-rival chosen among what is shipped, which is not fitted: the paper's algorithm, unless another is likelier beyond
-chance, and then the cheapest that is as good as the likeliest. The fitted one is advised where its gain over the rival
-is beyond chance, or where it is as good and cheaper. The last quarter judges: where the fitted one errs more there,
-beyond chance, the likelihood misleads, and the rival is advised. Who is best there in hindsight is named
-beside: the best of many looks better than it is. Intervals are of whole stretches of measurements, since neighbours are
-not independent.
+19, 1974): the simplest that the likeliest does not beat beyond chance. It is fitted to all three quarters. Its rival is
+chosen on the same measurements among the shipped filters, which are not fitted: the paper's algorithm, unless another
+is likelier beyond chance, and then the cheapest that is as good as the likeliest. The fitted one is advised where its
+gain over the rival is beyond chance, or where it is as good and cheaper. The last quarter judges: where the fitted one
+errs more there, beyond chance, the likelihood misleads, and the rival is advised. The filter that is best there in
+hindsight is reported separately: the best of many looks better than it is. Intervals come from whole stretches of
+measurements, since neighbours are not independent.
 """
 
 import dataclasses
@@ -44,7 +44,16 @@ from .fitting import (
     with_noise_scale,
     with_outliers,
 )
-from .judgement import AS_GOOD, FEWEST, JudgedFilter, Judgement, Share, likeliest_of, roles_of, share_out
+from .judgement import (
+    AS_GOOD,
+    FEWEST,
+    JudgedFilter,
+    Judgement,
+    Share,
+    likeliest_of,
+    roles_of,
+    split_recording,
+)
 from .log_scores import replay_log, score_log
 from .onboard import OnboardJudgement
 from .problem import Problem
@@ -55,40 +64,40 @@ FITTED, RUN, REFITTED = 0.35, 0.7, 0.97
 """Share of an advice that is done when all families are fitted, all competitors have run over the log, and the chosen
 one is fitted again; of logs of some ten thousand measurements."""
 APART = 10.0
-"""s between the measurements to which anchored filters are fitted: within less, fixes are what the receiver's own
-filter makes of them, and one-step predictions say much of that and little of errors that last."""
+"""Time between the measurements to which anchored filters are fitted, s. Over shorter times the fixes reflect the
+receiver's own filter: one-step predictions then contain much of it and little of errors that last."""
 COARSE = 4096
-"""Measurements, of stretches of all blocks, to which families are fitted first where the blocks hold twice as many: a
-parameter is known to 2 % by then, and who is far behind need not be fitted to the rest."""
+"""Measurements, of stretches of all blocks, to which families are fitted first where the blocks contain twice as many:
+a parameter is estimated to 2 % by then, and families that are far behind need not be fitted to the rest."""
 MEMORY = 8
 """Part of a recording by which the windows of anchored filters begin earlier: an eighth."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FittedLog:
-    """A recording as filters are fitted to it."""
+    """A recording to which filters are fitted, and the options of the fits."""
 
     problem: Problem
     recording: Recording
-    """With truth or without."""
+    """Recording, with truth or without."""
     noise: bool = True
-    """Fit the scale of the measurement noise, too, where measurements state one."""
+    """Whether to fit the scale of the measurement noise, too, where measurements state one."""
     seed: int = 0
-    """Of the starts of the fits."""
+    """Seed of the starts of the fits."""
     keywords: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Parameters of the task."""
 
     @cached_property
     def task(self) -> Task:
-        """With the parameters of the recording, without it."""
+        """Task with the parameters of the recording, but without the recording."""
         scenario = self.recording.scenario(self.problem.task, self.keywords)
         scenario = dataclasses.replace(scenario, recording=None)
         return make_task(self.problem.task, scenario, **{**self.keywords, "horizon": 1})
 
     @cached_property
     def share(self) -> Share:
-        """Which blocks fit, choose and judge."""
-        return share_out(self.recording)
+        """Blocks that fit, choose and judge."""
+        return split_recording(self.recording)
 
     @cached_property
     def interval(self) -> float:
@@ -96,9 +105,9 @@ class FittedLog:
         return float(numpy.nanmedian(numpy.diff(self.recording.seconds, axis=1)))
 
     def with_noise(self, family: Tunable, own: bool = False, robust: bool = False) -> Tunable:
-        """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it. Where
-        it is to be ``robust``, fit the share of outliers, too, but not to what is a user's ``own``, whose answer may
-        be less.
+        """Return a tunable with the scale of the measurement noise, where that is wanted and possible. An anchored one
+        is returned unchanged: measurements ``APART`` contain little information on the scale. With ``robust`` the share
+        of outliers is added, except to a user's ``own`` family, whose records may be incomplete.
         """
         log_format = find_companion(self.problem.task, LogFormat)
         if family.anchored or log_format is None or log_format.scale_noise is None:
@@ -109,7 +118,7 @@ class FittedLog:
 
     @cached_property
     def stretches(self) -> list[Span] | None:
-        """Beginnings of the blocks that fit, of ``COARSE`` measurements in all; None of a recording that is short."""
+        """Beginnings of the blocks that fit, ``COARSE`` measurements in all; None for a short recording."""
         total = sum(span.last - span.first for span in self.share.fitted)
         if total < 2 * COARSE:
             return None
@@ -120,11 +129,11 @@ class FittedLog:
 
     @cached_property
     def _cut(self) -> dict[Any, Windows]:
-        """Windows that were cut, by what they are of: filters share them."""
+        """Windows cut so far, by their spans: filters share them."""
         return {}
 
     def windows(self, spans: Sequence[Span], anchored: bool = False) -> Windows:
-        """Cut the recording into windows; where they are for ``anchored`` filters, of measurements ``APART``."""
+        """Cut the recording into windows, with measurements ``APART`` for ``anchored`` filters."""
         every, warm_up = 1, self.share.warm_up
         if anchored:
             warm_up = max(warm_up, int(self.recording.rows.sum()) // MEMORY)
@@ -135,15 +144,15 @@ class FittedLog:
         return self._cut[key]
 
     def likelihood(self, spans: Sequence[Span], tunable: Tunable, thinned: bool = False) -> WindowLikelihood:
-        """Likelihood of a tunable's parameters on spans of the recording; of an anchored one, or where that is asked
-        for, of measurements that are ``APART``.
+        """Return the likelihood of a tunable's parameters on spans of the recording; for an anchored one, or on
+        request, of measurements that are ``APART``.
         """
         windows = self.windows(spans, tunable.anchored or thinned)
         return WindowLikelihood(self.task, windows, tunable.start, tunable.apply, tunable.in_lanes)
 
     def fit(self, tunable: Tunable) -> tuple[Fit, WindowLikelihood]:
-        """Fit a tunable to the blocks that fit, and return their likelihood; of a long recording to stretches of them
-        alone.
+        """Fit a tunable to the blocks that fit, and return their likelihood. Of a long recording only stretches are
+        used.
         """
         if self.stretches is None or tunable.anchored:
             likelihood = self.likelihood(self.share.fitted, tunable)
@@ -154,7 +163,7 @@ class FittedLog:
 
 
 class Fits(NamedTuple):
-    """Families that were fitted to a log, by name."""
+    """Families fitted to a log, by name."""
 
     found: dict[str, Fit]
     tunables: dict[str, Tunable]
@@ -162,16 +171,18 @@ class Fits(NamedTuple):
 
     @property
     def anchored(self) -> list[str]:
-        """Names of those with a second sensor."""
+        """Names of the families with a second sensor."""
         return [name for name, tunable in self.tunables.items() if tunable.anchored]
 
     def make(self, name: str) -> Any:
-        """Return what makes the fitted filter."""
+        """Return the maker of the fitted filter."""
         return make_tuned_policy(f"fitted {name}", self.tunables[name], self.found[name].values)
 
 
 class Anchor(NamedTuple):
-    """How a filter with a second sensor predicts measurements some time apart, and the best without one."""
+    """Comparison of a filter with a second sensor and the best without one, on predictions of measurements some time
+    apart.
+    """
 
     name: str
     other: str
@@ -181,11 +192,11 @@ class Anchor(NamedTuple):
 
 
 class Prices(Mapping[str, Mapping[str, int] | None]):
-    """What an update of each competitor costs, found out when it is asked for; None where that cannot be said.
+    """Costs of an update of each competitor, computed at first use; None where the cost is unknown.
 
     Args:
         makers: competitors by name.
-        price_of: says what one of them costs: ``operations`` of an update and whatever else counts.
+        price_of: returns the costs of one: ``operations`` of an update and further measures.
     """
 
     def __init__(
@@ -207,13 +218,13 @@ class Prices(Mapping[str, Mapping[str, int] | None]):
         return len(self.makers)
 
     def operations(self, name: str) -> float:
-        """Of an update; infinite where it is not known."""
+        """Return the operations of an update; infinite where they are unknown."""
         price = self[name]
         return math.inf if price is None else float(price["operations"])
 
 
 class Advice(NamedTuple):
-    """What :func:`advise` has found."""
+    """Result of :func:`advise`."""
 
     recording: Recording
     share: Share
@@ -222,13 +233,13 @@ class Advice(NamedTuple):
     fitted: JudgedFilter
     """The simplest of the fitted ones that the likeliest of them does not beat beyond chance."""
     rival: str
-    """Shipped filter that one would take without the judged measurements."""
+    """Shipped filter chosen without the judged measurements."""
     best_shipped: str
-    """Of smallest judged error, or prediction error where there is no truth: in hindsight."""
+    """Shipped filter of smallest judged error in hindsight; of smallest prediction error where there is no truth."""
     hindsight: IntervalEstimate
-    """Judged error of the advised one over that of ``best_shipped``, less one."""
+    """Ratio of the judged errors of the advised filter and ``best_shipped``, less one."""
     diverging: tuple[str, ...]
-    """Fitted filters that lose the track in the whole recording: no competitors."""
+    """Fitted filters that lose the track in the whole recording; they do not compete."""
     replay: Callable[[], xarray.Dataset]
     """Runs the fitted one, its rival and the best in hindsight over the whole recording, with tracks."""
     fits: dict[str, Fit]
@@ -238,27 +249,27 @@ class Advice(NamedTuple):
     anchor: Anchor | None
     """None where the recording has no second sensor."""
     outliers: numpy.ndarray
-    """Which measurements ``fitted`` takes for outliers, ``(E, T)``."""
-    dearer: tuple[str, IntervalEstimate] | None
-    """Likeliest of all, and what it brings where filters were chosen, nats per measurement, its parameters paid for;
-    None where it is the advised one."""
+    """Whether ``fitted`` treats each measurement as an outlier, ``(E, T)``."""
+    likeliest: tuple[str, IntervalEstimate] | None
+    """Likeliest filter of all, and its gain on the measurements of the choice, nats per measurement, less one nat in
+    all for each parameter; None where it is the advised one."""
     prices: "Prices"
-    """What an update of each costs."""
+    """Costs of an update of each filter."""
     onboard: OnboardJudgement | None = None
-    """Of a log of an autopilot, what its own filter did on withheld fixes."""
+    """Results of the vehicle's own filter on withheld fixes, for a log of an autopilot."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
-        """Of the parameters of ``fitted``."""
+        """Intervals of the parameters of ``fitted``."""
         return {name: each.interval for name, each in self.profiles[self.fitted.name].items()}
 
     def make_fitted(self) -> dict[str, Any]:
-        """Return what makes each fitted filter, by name."""
+        """Return the maker of each fitted filter, by name."""
         return {name: Fits(self.fits, self.tunables, {}).make(name) for name in self.fits}
 
     @property
     def advised(self) -> JudgedFilter:
-        """Who is advised."""
+        """Return the name of the advised filter."""
         return self.competitors[0]
 
 
@@ -269,18 +280,18 @@ def advise(
     progress: Callable[[str, float], None] = lambda what, share: None,
     price_of: Callable[[str, Any], Mapping[str, int] | None] = lambda name, maker: None,
 ) -> Advice:
-    """Fit every family of filters to a recording, choose one, and judge it against what is shipped.
+    """Fit every family of filters to a recording, choose one, and judge it against the shipped filters.
 
     Args:
         log: the recording, and how filters are fitted to it.
         shipped: competitors that are not fitted, by name.
-        own: further families, such as an estimator of a user's with limits of its parameters.
-        progress: told what is done, or nothing new, and which share of all.
-        price_of: says what an update of a competitor costs, of its name and what makes it: ``operations`` and
-            whatever else counts; None where that is not known, and then it is taken for dearer than all others.
+        own: further families, such as a user's estimator with limits of its parameters.
+        progress: called with a description of the work done, or an empty text, and the share of all work.
+        price_of: returns the costs of an update of a competitor, from its name and its maker: ``operations`` and
+            further measures; None where they are unknown, which ranks it as the most expensive.
 
     Raises:
-        ValueError: if nothing can be fitted, or the recording is too short.
+        ValueError: if no family can be fitted, or the recording is too short.
     """
     problem, recording = log.problem, log.recording
     fits = _fit_families(log, own or {}, progress)
@@ -350,11 +361,11 @@ def advise(
 
 
 def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable[[str, float], None]) -> Fits:
-    """Fit every family, and a user's own, to the blocks that fit: first as it is, then with outliers, which are kept
-    where the likelihood says that there are some.
+    """Fit every family, and a user's own, to the blocks that fit, first without and then with outliers. The fit with
+    outliers is used where it is likelier.
     """
     families = {**families_of(log.problem, log.recording), **own}
-    if int(log.recording.rows.sum()) * log.interval < FEWEST * APART:  # too few that are apart
+    if int(log.recording.rows.sum()) * log.interval < FEWEST * APART:  # too few measurements ``APART``
         families = {name: family for name, family in families.items() if not family.anchored}
     fits = Fits({}, {}, {})
     outliers = True
@@ -369,7 +380,7 @@ def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable
                 fits.found[name], fits.tunables[name], fits.likelihoods[name] = found, tunable, likelihood
         mean = fits.found[name].log_likelihood / fits.found[name].measurements
         progress(f"fitted {name}: {mean:.3f} nats per measurement", FITTED * (i + 1) / len(families))
-        if i == 0:  # where the simplest family sees no outliers, the others have fewer reasons to
+        if i == 0:  # where the simplest family finds no outliers, the others have fewer reasons to
             outliers = OUTLIER_SHARE in fits.found[name].values
     if log.stretches is not None:
         _fit_finalists(log, fits)
@@ -377,7 +388,7 @@ def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable
 
 
 def _fit_finalists(log: FittedLog, fits: Fits) -> None:
-    """Fit those to all blocks that fit which are near the best there with the values of stretches."""
+    """Fit the families that are near the best with the values of stretches to all blocks that fit."""
     means = {name: found.log_likelihood / found.measurements for name, found in fits.found.items()}
     known = {name: mean for name, mean in means.items() if name not in fits.anchored}
     for name, mean in known.items():
@@ -393,8 +404,8 @@ def _fit_finalists(log: FittedLog, fits: Fits) -> None:
 def _choose(
     log: FittedLog, fits: Fits, judgement: Judgement, competitors: Sequence[JudgedFilter]
 ) -> tuple[JudgedFilter, Anchor | None]:
-    """Return the simplest fitted filter that the likeliest does not beat, or an anchored one that beats that, and how
-    the anchored one compares.
+    """Return the simplest fitted filter that the likeliest does not beat, or an anchored one that beats that, and the
+    comparison of the anchored one.
     """
     anchored, anchor = fits.anchored, None
     chosen = judgement.simplest([c for c in competitors if c.fitted and c.name not in anchored])
@@ -409,9 +420,7 @@ def _choose(
 def _fit_again(
     log: FittedLog, fits: Fits, name: str, tick: Callable[[float], None] = lambda share: None
 ) -> dict[str, Profile]:
-    """Fit the chosen family to all that does not judge, where there is such, and return the profiles of its likelihood
-    there.
-    """
+    """Fit the chosen family to all measurements that do not judge, and return the profiles of its likelihood there."""
     tunable, found = fits.tunables[name], fits.found[name]
     if log.share.apart:
         begin = dataclasses.replace(tunable, start=found.values)
@@ -422,7 +431,7 @@ def _fit_again(
 
 
 def _first_verdict(fits: Fits, shipped: int) -> str:
-    """Say which family is likeliest on what it was fitted to, one nat less for each parameter."""
+    """Describe the family that is likeliest on the measurements of its fit, one nat less for each parameter."""
     known = {
         name: (found.log_likelihood - len(found.values)) / found.measurements
         for name, found in fits.found.items()
@@ -440,10 +449,10 @@ def _first_verdict(fits: Fits, shipped: int) -> str:
 
 
 def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, Interval]]:
-    """Fit one filter to all of a recording; nothing is left to judge it.
+    """Fit one filter to all of a recording, so that no measurements remain to judge it.
 
     Returns:
-        The family with the scale of the noise, what was found, and the intervals of the parameters.
+        The family with the scale of the noise, the fit, and the intervals of the parameters.
     """
     share, rows = log.share, log.recording.rows
     spans = [Span(i, min(share.warm_up, int(each) - 1), int(each)) for i, each in enumerate(rows)]
@@ -464,8 +473,8 @@ def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, In
 
 
 def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit) -> numpy.ndarray:
-    """Return which measurements of a recording a fitted filter takes for outliers, ``(E, T)``; none where it knows no
-    outliers.
+    """Return whether a fitted filter treats each measurement of a recording as an outlier, ``(E, T)``; all false where
+    its model has no outliers.
     """
     is_outlier: numpy.ndarray = numpy.zeros(recording.seconds.shape, dtype=bool)
     if OUTLIER_SHARE not in found.values:
@@ -491,8 +500,8 @@ def _compare_anchored(log: FittedLog, tunables: Mapping[str, Tunable], fitted: F
     """Compare an anchored filter with the best other one on measurements that are ``APART``, both fitted to such; the
     former, which is ``fitted``, is the first of the two ``tunables``.
 
-    That is the likelihood that both have in common: of the same measurements, given the same earlier ones. From one
-    measurement to the next the other follows errors that last, and so predicts them well.
+    This likelihood is comparable: it is of the same measurements, given the same earlier ones. From one measurement to
+    the next the other filter follows errors that last, and so predicts them well.
     """
     (name, anchored), (other, best) = tunables.items()
     rival = fit(log.likelihood(log.share.fitted, best, thinned=True), best, log.seed)

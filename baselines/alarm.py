@@ -1,16 +1,15 @@
-"""Alarms: what says from observations alone that something is wrong.
+"""Alarms, which detect faults from observations alone.
 
-An alarm weighs at every decision how much better what is shown is explained by something wrong than by filters and
-sensors that are as modelled: a log-likelihood ratio for each kind of wrong. Each is summed as long as the sum is
-positive (Page's cumulative sum, 1954); the alarm speaks where a sum reaches its limit. Where nothing is wrong a sum
-with limit h reaches it once in exp(h) decisions or less (Lorden, 1971), so the limit follows from how many false alarms
-one may cost.
+An alarm computes at every decision the log-likelihood ratio of each kind of fault to filters and sensors that are as
+modelled. Each ratio is summed as long as the sum is positive (Page's cumulative sum, 1954); the alarm sounds where a
+sum reaches its limit. Without a fault a sum with limit h reaches it once in exp(h) decisions or less (Lorden, 1971), so
+the limit follows from the tolerated number of false alarms.
 
-What is wrong may be innovations that are larger than a filter expects, smaller, or to one side; a reading that repeats
-itself. A measurement that is missing is wrong where the filter is not made for it, as one of fixed gains; a Kalman
-filter is told of it and knows what to do.
+Signs of a fault are innovations that are larger than a filter expects, smaller, or to one side, and a reading that
+repeats itself. A missing measurement counts as a sign where the filter does not model it, as with fixed gains; a Kalman
+filter only predicts then.
 
-An environment says in ``Baselines.alarm`` what it looks at; for others there is :class:`InnovationAlarm`.
+An environment names its alarm in ``Baselines.alarm``; the default is :class:`InnovationAlarm`.
 """
 
 import math
@@ -22,68 +21,68 @@ from ..envs.contract.model import Model
 from ..envs.contract.observation import Reader
 
 LARGER = 3.0
-"""Factor on the variance of innovations that an alarm looks for; others are found too, some decisions later."""
+"""Factor on the variance of innovations that an alarm tests for; other factors are detected some decisions later."""
 SMALLER = 1.0 / 3.0
-"""Likewise for innovations that are smaller than expected."""
+"""Factor on the variance of innovations that are smaller than expected."""
 SHIFT = 0.5
-"""Likewise mean of normalised innovations, to either side."""
+"""Mean of normalised innovations that an alarm tests for, to either side."""
 CERTAIN = math.inf
-"""Log-likelihood ratio of what nothing but a fault explains."""
+"""Log-likelihood ratio of an observation that only a fault explains."""
 
 
 def scale_ratio(squares: Any, degrees: Any, factor: float) -> Any:
-    """Log-likelihood ratio of innovations whose variance is ``factor`` times the expected one.
+    """Return the log-likelihood ratio of innovations whose variance is ``factor`` times the expected one.
 
     Args:
-        squares: normalised innovation squared, chi-square if nothing is wrong.
-        degrees: of freedom.
-        factor: on the variance.
+        squares: normalised innovation squared, chi-square without a fault.
+        degrees: degrees of freedom.
+        factor: factor on the variance.
     """
     return 0.5 * squares * (1.0 - 1.0 / factor) - 0.5 * degrees * math.log(factor)
 
 
 def shift_ratio(normalised: Any, mean: float) -> Any:
-    """Log-likelihood ratio of normalised innovations with that mean in place of zero."""
+    """Return the log-likelihood ratio of normalised innovations with that mean in place of zero."""
     return mean * (normalised - 0.5 * mean)
 
 
 def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
-    """Log-likelihood ratios of innovations that are larger, smaller, or to one side, ``(N, 4 C)``.
+    """Return the log-likelihood ratios of innovations that are larger, smaller, or to one side, ``(N, 4 C)``.
 
     Args:
         normalised: innovations over their predicted deviation, ``(N, C)``.
-        there: whether each is one; what stands for a missing one says nothing.
+        there: whether each exists; the value of a missing one is ignored.
     """
     ratios = [scale_ratio(normalised**2, 1.0, factor) for factor in (LARGER, SMALLER)]
     ratios += [shift_ratio(normalised, mean) for mean in (SHIFT, -SHIFT)]
     return numpy.where(numpy.tile(there, 4), numpy.concatenate(ratios, axis=1), 0.0)
 
 
-def certain(wrong: numpy.ndarray) -> numpy.ndarray:
-    """Evidence of what nothing but a fault explains, ``(N, 1)``; ``wrong`` is ``(N,)``."""
+def fault_evidence(wrong: numpy.ndarray) -> numpy.ndarray:
+    """Return the evidence of an observation that only a fault explains, ``(N, 1)``; ``wrong`` is ``(N,)``."""
     return numpy.where(wrong, CERTAIN, 0.0)[:, None]
 
 
 class Sums(NamedTuple):
-    """What an alarm remembers."""
+    """Memory of an alarm."""
 
     sums: numpy.ndarray
-    """Of each log-likelihood ratio, ``(N, kinds)``."""
-    shown: numpy.ndarray
+    """Sums of each log-likelihood ratio, ``(N, kinds)``."""
+    observation: numpy.ndarray
     """Last observation, ``(N, fields)``."""
 
 
 class Alarm:
-    """Base of the alarms: subclasses say how likely something is wrong.
+    """Base of the alarms: subclasses compute the evidence of a fault.
 
     Args:
-        model: whose observations it is shown.
+        model: model whose observations it receives.
     """
 
     window: ClassVar[int] = 30
-    """Decisions for which an alarm is worth heeding: the memory of the filters that it disturbs."""
+    """Decisions for which an alarm remains relevant: the memory of the disturbed filters."""
     false_alarms: ClassVar[float] = 0.02
-    """Most false alarms in an episode, where filters and sensors are as modelled."""
+    """Largest mean number of false alarms in an episode, where filters and sensors are as modelled."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -91,7 +90,8 @@ class Alarm:
         self.decisions: int = max(self.task.horizon // self.task.decision_interval, 1)
 
     def measurements(self, before: numpy.ndarray) -> numpy.ndarray:
-        """Measurements that an observation tells of, ``(N, 1)``: since the last one, or at an episode's start, one.
+        """Return the number of measurements that an observation covers, ``(N, 1)``: those since the last one; one at an
+        episode's start.
 
         Args:
             before: the last observation; NaN where an episode begins.
@@ -99,7 +99,7 @@ class Alarm:
         return numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood ratios of something wrong to nothing wrong, a column for each kind, ``(N, kinds)``.
+        """Return the log-likelihood ratios of a fault to no fault, a column for each kind, ``(N, kinds)``.
 
         Args:
             observation: ``(N, fields)``.
@@ -107,36 +107,36 @@ class Alarm:
         """
         raise NotImplementedError
 
-    def hear(
+    def update(
         self, observation: numpy.ndarray, memory: Sums | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, Sums]:
-        """Say where something is wrong.
+        """Update the sums with an observation and detect faults.
 
         Args:
             observation: ``(N, fields)``.
-            memory: what the last call returned; None at the first.
+            memory: memory that the last call returned; None at the first.
             start: true where an episode begins, ``(N,)``.
 
         Returns:
-            Booleans ``(N,)``, and memory.
+            Whether there is a fault, booleans ``(N,)``, and memory.
         """
-        before = numpy.full_like(observation, math.nan) if memory is None else memory.shown
+        before = numpy.full_like(observation, math.nan) if memory is None else memory.observation
         evidence = self.evidence(observation, numpy.where(start[:, None], math.nan, before))
         sums = numpy.zeros_like(evidence) if memory is None else memory.sums
         limit = math.log(self.decisions * evidence.shape[1] / self.false_alarms)
-        # Never beyond the limit: what is over is forgotten as fast as it was found.
+        # Never beyond the limit, so that a fault that ended is forgotten as fast as it was found.
         sums = numpy.clip(numpy.where(start[:, None], 0.0, sums) + evidence, 0.0, limit)
         wrong: Any = (sums >= limit).any(axis=1)  # NumPy's declaration allows for a scalar
         return wrong, Sums(sums, observation)
 
 
 class InnovationAlarm(Alarm):
-    """For any task that shows a block or quantity ``innovation``, each component over its predicted deviation: one that
-    is too large, or for a while too large, too small, or to one side. Where ``available`` is shown as zero there is
-    none, which is not held against the filter.
+    """Alarm of any task whose observation has a block or quantity ``innovation``, each component over its predicted
+    deviation: it detects one that is too large, or for a while too large, too small, or to one side. Where
+    ``available`` is zero there is no innovation, which is no evidence.
 
     Raises:
-        ValueError: if the task shows no ``innovation``.
+        ValueError: if the observation has no ``innovation``.
     """
 
     def __init__(self, model: Model) -> None:
@@ -145,8 +145,8 @@ class InnovationAlarm(Alarm):
             self.innovation: Reader = model.reader("innovation")
         except ValueError as error:
             raise ValueError(
-                f"{self.task.id} shows no 'innovation' under control {model.control!r} that tells whether something is "
-                "wrong: give an alarm, in its baselines or to the gate"
+                f"{self.task.id} has no 'innovation' in its observation under control {model.control!r}, from which to "
+                "detect faults: give an alarm, in its baselines or to the gate"
             ) from error
         try:
             self.available: Any = model.reader("available")
@@ -154,7 +154,7 @@ class InnovationAlarm(Alarm):
             self.available = lambda observation: numpy.ones((len(observation), 1))
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Weigh every component for itself."""
+        """Return the log-likelihood ratios of each component."""
         innovation, available = self.innovation(observation), self.available(observation)
         there = numpy.broadcast_to(available > 0.0, innovation.shape)
         return innovation_evidence(innovation, there)

@@ -1,7 +1,7 @@
-"""Which baselines an environment has.
+"""Catalogue of the baselines of the environments.
 
-Every folder beside this file holds those of the environment whose folder has the same name, and exports them as
-``BASELINES``; a user's environment brings its own, or none.
+Every folder beside this file contains those of the environment whose folder has the same name, and exports them as
+``BASELINES``; a user's environment may register its own.
 """
 
 import importlib
@@ -20,7 +20,7 @@ USER_BASELINES: dict[str, Baselines] = {}
 
 @cache
 def package_of(id: str) -> ModuleType | None:
-    """Return the package that holds the baselines of a Gymnasium id; None where there is none."""
+    """Return the package with the baselines of a Gymnasium id; None where there is none."""
     folder = folders().get(id)
     if folder is None or importlib.util.find_spec(f"{__package__}.{folder}") is None:
         return None
@@ -28,9 +28,9 @@ def package_of(id: str) -> ModuleType | None:
 
 
 def baselines_of(id: str) -> Baselines:
-    """Return what the environment of a Gymnasium id is compared with.
+    """Return the baselines of the environment of a Gymnasium id.
 
-    Where it brings nothing: the paper's algorithm that its class declares, and random actions.
+    Without registered ones: the paper's algorithm that its class declares, and random actions.
     """
     package = package_of(id)
     if package is not None:
@@ -40,7 +40,7 @@ def baselines_of(id: str) -> Baselines:
 
 @cache
 def _declared_baselines(task: type[Task]) -> Baselines:
-    """Return what the class of a task declares itself; an action that is no vector is no constant policy."""
+    """Return the baselines that the class of a task declares; an action that is no vector is no constant policy."""
     if not isinstance(task.paper_policy.action, tuple):
         return Baselines(task.id, {"random": RandomPolicy})
     paper = type("DeclaredPaper", (PaperAction,), {"control": task.paper_policy.control})
@@ -48,14 +48,14 @@ def _declared_baselines(task: type[Task]) -> Baselines:
 
 
 def add_baselines(task: type[Task], table: Baselines) -> None:
-    """Keep what a user's environment is compared with.
+    """Register the baselines of a user's environment.
 
     Args:
-        task: class of the environment's.
-        table: what it is compared with.
+        task: class of the environment's task.
+        table: its baselines.
 
     Raises:
-        ValueError: if the table names what is not there.
+        ValueError: if the table refers to an unknown name.
     """
     reference = {**table.references, **table.bounds}
     for field in ("score_paper", "stronger_paper"):
@@ -83,5 +83,7 @@ def add_baselines(task: type[Task], table: Baselines) -> None:
                     f"{name!r} stands in the table as {kind}, but its kind is {kind_of(maker)!r}"
                 )
             if kind in INFORMED_KINDS and not getattr(maker, "knows", ""):
-                raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
+                raise ValueError(
+                    f"{kind} {name!r} does not state what it knows: set the class attribute knows"
+                )
     USER_BASELINES[task.id] = table

@@ -1,4 +1,4 @@
-"""Files of advised filters: what to run on logs like the one that was advised on, and how to read them."""
+"""Files of advised filters, which contain a filter and how to read the logs that it runs on."""
 
 import importlib.metadata
 import json
@@ -22,17 +22,17 @@ from .table import Tunable, tunable
 from .tuned_values import TunedPolicy, check_values, make_tuned_policy, round_value
 
 SUFFIX = ".filter.json"
-"""Of the names of such files."""
+"""Suffix of the names of such files."""
 MOST_MEASUREMENTS = 100_000
-"""Of a track, of which a file tells how many there were; an export simulates as many."""
+"""Largest number of measurements of a track that a file may state; an export simulates as many."""
 
 
 def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
     """Return the filters of a problem that can be fitted to a recording, by name.
 
     Args:
-        problem: whose they are.
-        recording: that sets the limits; None: any.
+        problem: problem of the filters.
+        recording: recording that sets the limits; None: any.
     """
     known = problem.baselines
     if known.log_families is not None:
@@ -41,16 +41,16 @@ def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
 
 
 def own_family(name: str, cls: Any) -> Tunable:
-    """Return what can be fitted in an estimator of a user's own.
+    """Return the tunable parameters of a user's estimator.
 
     Args:
-        name: of it, in errors.
+        name: name of the estimator in errors.
         cls: its class, with an attribute ``parameters``: by the name of each keyword lower limit, value in force and
-            upper limit. What is named ``log10_...`` is the logarithm of the keyword. Where ``lane_parameters`` is true,
-            values may be arrays ``(N,)``, and candidates run side by side.
+            upper limit. A parameter named ``log10_...`` is the logarithm of the keyword. Where ``lane_parameters`` is
+            true, values may be arrays ``(N,)``, and candidates run side by side.
 
     Raises:
-        ValueError: if it has none, or values that are no limits.
+        ValueError: if it has no parameters, or values that are no limits.
     """
     declared = getattr(cls, "parameters", None)
     if not (isinstance(cls, type) and isinstance(declared, Mapping) and declared):
@@ -67,18 +67,18 @@ def own_family(name: str, cls: Any) -> Tunable:
 
 
 class Artefact(NamedTuple):
-    """What a file of an advised filter holds."""
+    """Content of the file of an advised filter."""
 
     filter: str
     """Name of the family, or of the shipped filter."""
     fitted: TunedPolicy | None
-    """What makes it; None for a shipped one."""
+    """Maker of the filter; None for a shipped one."""
     log: LogSetup | None
-    """None in files that do not say it."""
+    """How its log was read; None in files without it."""
 
 
-def setup_of(problem: Problem, recording: Any) -> LogSetup:
-    """Return how a recording was read."""
+def log_setup(problem: Problem, recording: Any) -> LogSetup:
+    """Return the options with which a recording was read."""
     parameters = recording.scenario(problem.task, {}).parameters
     left_out = "horizon", "decision_interval"
     deviations, source = dict(recording.deviations), recording.deviations_from
@@ -111,16 +111,16 @@ def write_advised(
     """Write an advised filter, fitted or shipped, with how its log was read.
 
     Args:
-        path: of the file, whose name ends in ``SUFFIX``.
-        problem: of the filter.
-        name: of its family, or of the shipped filter.
-        recording: that it was fitted to, or judged on.
-        found: of the fit; None for a shipped filter.
-        intervals: of its parameters.
-        command: that made it.
-        **further: what else is to be known of it, such as its held-out numbers.
+        path: path of the file, whose name ends in ``SUFFIX``.
+        problem: problem of the filter.
+        name: name of its family, or of the shipped filter.
+        recording: recording on which it was fitted or judged.
+        found: result of the fit; None for a shipped filter.
+        intervals: intervals of its parameters.
+        command: command that wrote it.
+        **further: further entries of the file, such as its held-out numbers.
     """
-    log = setup_of(problem, recording)
+    log = log_setup(problem, recording)
     log_format = find_companion(problem.task, LogFormat)
     known = log_format.columns if log_format else {}
     seconds = recording.seconds
@@ -163,8 +163,8 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
     """Read the file of an advised filter.
 
     Args:
-        path: of a file of :func:`write_advised`.
-        problem: in which it is to run.
+        path: path of a file of :func:`write_advised`.
+        problem: problem in which it is to run.
 
     Raises:
         ValueError: if the file cannot be read, or is of another environment or no filter of it.
@@ -175,7 +175,7 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
         raise ValueError(f"there is no file {path}") from None
     known = {"environment": str, "filter": str, "values": dict[str, float]}
     if not isinstance(table, dict) or not all(fits(table.get(key), kind) for key, kind in known.items()):
-        raise ValueError(f"{path} is no fitted filter: filtergym advise writes one")
+        raise ValueError(f"{path} is not the file of an advised filter: filtergym advise writes one")
     if table["environment"] != problem.id:
         raise ValueError(f"{path} is fitted to {quote_shortened(table['environment'])}, not to {problem.id}")
     fitted = table.get("fitted", True)
@@ -186,7 +186,7 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
 
 
 def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
-    """Check what a file says of its log as if it were typed."""
+    """Validate a file's entry on its log."""
     if log is None:
         return None
     kinds = {
@@ -199,7 +199,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         "horizon": int,
     }
     if isinstance(log, dict):
-        log = {"origin": {}, "horizon": 0, **log}  # files of older versions say nothing of them
+        log = {"origin": {}, "horizon": 0, **log}  # files of older versions lack them
     log_format = find_companion(problem.task, LogFormat)
     names = {
         "time",
@@ -218,7 +218,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         or not 0 <= log["horizon"] <= MOST_MEASUREMENTS
         or not (not log["origin"] or _is_place(log["origin"]))
     ):
-        raise ValueError(f"{path}: what it says of its log is none: filtergym advise writes it anew")
+        raise ValueError(f"{path}: its entry on the log is invalid: write it again with filtergym advise")
     try:
         problem.task.Parameters(**log["parameters"])
     except (TypeError, ValueError) as error:
@@ -227,13 +227,12 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
 
 
 def _is_place(origin: Mapping[str, float]) -> bool:
-    """Whether it is one on the Earth, or near it."""
+    """Return whether an origin is on the Earth or near it."""
     largest = {"latitude": 90.0, "longitude": 360.0, "altitude": 1e6}
     return origin.keys() == largest.keys() and all(abs(origin[key]) <= most for key, most in largest.items())
 
 
 def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, float]) -> TunedPolicy:
-    """Return what makes a filter of a family with values of a file."""
     families = families_of(problem)
     if name not in families:
         raise ValueError(f"{path}: {problem.id} has no filter {name!r} that can be fitted")

@@ -1,4 +1,4 @@
-"""Parameters of a filter, fitted to a recording by maximum likelihood of the measurements as they were predicted.
+"""Maximum-likelihood fits of the parameters of a filter to a recording.
 
 The likelihood of a filter's one-step predictions is that of the recording under its model (Schweppe, IEEE Trans. IT 11,
 1965). It is maximised by L-BFGS-B within the limits of the parameters from several starts. The intervals are profile
@@ -7,7 +7,7 @@ quantile below its maximum (Venzon and Moolgavkar, Applied Statistics 37, 1988).
 higher likelihood, the fit starts again from there.
 
 Measurements may come from a mixture: most have the stated deviations, a fitted share has ``WIDE`` times as large ones
-(Huber, Annals of Mathematical Statistics 35, 1964). Two updates are made, and the likelier one is kept.
+(Huber, Annals of Mathematical Statistics 35, 1964). The filter computes both updates and uses the likelier one.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from ..filters.array_namespace import select_nested
 from .table import Tunable
 
 STARTS = 3
-"""From which a fit begins: the values in force without it, and points inside the limits."""
+"""Number of starts of a fit: the values in force without it, and points inside the limits."""
 DROP = 1.9207
 """Half the 95 % quantile of chi-square with one degree of freedom."""
 NOISE_SCALE = "log10_noise_scale"
@@ -36,41 +36,43 @@ OUTLIER_SHARE = "log10_outlier_share"
 """Name of the parameter that is the share of outliers among the measurements, as its decimal logarithm."""
 SHARE_LIMITS = (-4.0, -1.7, -0.5)
 WIDE = 20.0
-"""Times that the deviations of an outlier are those of the other measurements."""
+"""Ratio of the deviation of an outlier to that of the other measurements."""
 SCREENED = 24
-"""Points inside the limits of which the likeliest ones begin a fit."""
+"""Number of random points inside the limits, of which the likeliest are starts of a fit."""
 HIGHER = 0.1
 """Nats by which a point of a profile must be likelier than the fit for the fit to start again from there."""
 MOST_RESTARTS = 6
 STEPS = 0.5, 1.0, 1.5, 2.0, 2.5, 3.5, 6.0, 12.0
 """Distances from the maximum at which a profile is computed, in units of the parameter's deviation at the maximum."""
 NEWTON_STEPS = 8
-"""Of a search for the other parameters at a step of a profile, at most."""
+"""Largest number of Newton steps of a search for the other parameters at a step of a profile."""
 LEAST_GAIN = 1e-4
-"""Nats that are worth another step of it."""
+"""Smallest gain, nats, for another step of it."""
 STEEP = 1.5
-"""Times that a likelihood may fall as a quadratic one would; where it falls more a second search begins elsewhere."""
+"""Largest ratio of the fall of a likelihood to that of a quadratic one; where it falls more a second search starts
+elsewhere."""
 IDENTIFIABLE = 100.0
-"""Largest ratio of the ends of an interval of a size; what is wider says nothing."""
+"""Largest ratio of the ends of an interval of a positive parameter; a wider interval carries no information."""
 
 
 class Interval(NamedTuple):
-    """Where a parameter lies with 95 % confidence, as it is searched."""
+    """95 % confidence interval of a parameter, in the units of the search."""
 
     low: float
     high: float
     open_low: bool
-    """Whether the likelihood is still high at the lower limit of the search; likewise the upper one."""
+    """Whether the likelihood is still high at the lower limit of the search."""
     open_high: bool
+    """Whether the likelihood is still high at the upper limit of the search."""
 
 
 class Profile(NamedTuple):
-    """Likelihood of one parameter, the others adapted to each of its values."""
+    """Profile likelihood of one parameter: the others are adapted to each of its values."""
 
     values: numpy.ndarray
-    """As they are searched, in ascending order."""
+    """Values of the parameter in the units of the search, in ascending order."""
     drops: numpy.ndarray
-    """Nats below the maximum at each."""
+    """Distance of the log-likelihood from its maximum at each, nats."""
     interval: Interval
 
 
@@ -78,19 +80,20 @@ class Fit(NamedTuple):
     """A filter fitted to a recording."""
 
     values: dict[str, float]
-    """Of the parameters, as they are searched."""
+    """Values of the parameters in the units of the search."""
     log_likelihood: float
-    """Of all measurements that counted, nats."""
+    """Log-likelihood of the measurements of the fit, nats."""
     measurements: int
-    """That counted."""
+    """Number of measurements of the fit."""
     spread: float
-    """Nats between the best and the worst of the starts' ends."""
+    """Difference between the best and the worst maximum found from the starts, nats."""
     at_limit: tuple[str, ...]
     """Parameters that ended at a limit of the search."""
 
 
 class ScaledNoise(Filter[Task, Any, Any]):
-    """A filter that takes stated deviations of measurements for larger or smaller by a factor; its state is that one's.
+    """A filter that multiplies the stated deviations of measurements by a factor; its state is that of the scaled
+    filter.
 
     Args:
         own: the filter.
@@ -106,27 +109,29 @@ class ScaledNoise(Filter[Task, Any, Any]):
         self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> Any:
-        """Start where everyone starts, as much less sure of it: a track starts from measurements."""
+        """Start from the initial estimate, its covariance times the factor's square: a track
+        starts from measurements.
+        """
         return self.own.start(initial._replace(covariance=initial.covariance * self.factor**2))
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Predict to the measurement as it is taken."""
+        """Predict to the scaled measurement."""
         return self.own.predict(state, self.scaled(measurement, self.factor))
 
     def update(self, state: Any, given: FilterInput) -> Any:
-        """Update with the measurement as it is taken."""
+        """Update with the scaled measurement."""
         return self.own.update(state, FilterInput(self.scaled(given.measurement, self.factor)))
 
     def mean(self, state: Any) -> Array:
-        """That of the filter."""
+        """Return the mean of the filter."""
         return self.own.mean(state)
 
     def covariance(self, state: Any) -> Array:
-        """That of the filter."""
+        """Return the covariance of the filter."""
         return self.own.covariance(state)
 
     def records(self, state: Any, measurement: Any) -> dict[str, Array]:
-        """Those of the filter."""
+        """Return the records of the filter."""
         return self.own.records(state, self.scaled(measurement, self.factor))
 
 
@@ -151,21 +156,21 @@ def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tun
 
 
 class RobustState(NamedTuple):
-    """State of a filter that knows of outliers."""
+    """State of a filter that models outliers."""
 
     own: Any
-    """Of the filter."""
+    """State of the filter."""
     likelihood: Likelihood
-    """Of the mixture."""
+    """Likelihood of the mixture."""
 
 
 class RobustEstimator(Filter[Task, Any, RobustState]):
-    """A filter that takes every measurement either as stated or as an outlier, whichever is likelier.
+    """A filter that treats every measurement either as stated or as an outlier, whichever is likelier.
 
     Args:
-        own: the filter, which tells the log-likelihood.
+        own: the filter, which reports the log-likelihood.
         scaled: multiplies the deviations stated in a measurement by a factor.
-        share: of outliers, a number, or ``(N,)``.
+        share: share of outliers, a number, or ``(N,)``.
     """
 
     def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], share: Any) -> None:
@@ -176,25 +181,25 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> RobustState:
-        """Start as the filter does."""
+        """Start the filter, with unknown likelihood."""
         return RobustState(self.own.start(initial), Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: RobustState, given: FilterInput) -> RobustState:
-        """Update as stated and with wide deviations, and keep the likelier result; say the mixture's likelihood."""
+        """Update as stated and with wide deviations, select the likelier result, and compute the mixture likelihood."""
         (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(given.measurement, state.own)
         nis = None if own.nis is None else self.xp.where(is_outlier, other.nis, own.nis)
         likelihood = Likelihood(log_likelihood, nis, own.nis_degrees).fill_unknown(log_likelihood)
         return RobustState(select_nested(is_outlier, wide, usual), likelihood)
 
     def compare(self, measurement: Any, state: Any) -> tuple[Any, Any, Any, Any]:
-        """Return both updates, state and likelihood, whether the second is likelier, and the log-likelihood of the
+        """Return both updates (state and likelihood), whether the second is likelier, and the log-likelihood of the
         mixture, ``(N,)``.
         """
         xp = self.xp
         usual, wide = (self._step(state, z) for z in (measurement, self.scaled(measurement, WIDE)))
         one = usual[1].log_likelihood + xp.log(1.0 - self.share)
         other = wide[1].log_likelihood + xp.log(self.share)
-        # Of a measurement that was not received both are NaN: the first update is kept.
+        # For a measurement that was not received both are NaN: the first update is used.
         is_outlier = other > one
         top = xp.where(is_outlier, other, one)
         return usual, wide, is_outlier, top + xp.log(xp.exp(one - top) + xp.exp(other - top))
@@ -204,16 +209,16 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         return after, Likelihood.of_records(self.own.records(after, measurement))
 
     def mean(self, state: RobustState) -> Array:
-        """That of the filter."""
+        """Return the mean of the filter."""
         return self.own.mean(state.own)
 
     def covariance(self, state: RobustState) -> Array:
-        """That of the filter."""
+        """Return the covariance of the filter."""
         return self.own.covariance(state.own)
 
 
 def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunable:
-    """Return a tunable estimator with the share of outliers as one more parameter; arguments as of
+    """Return a tunable estimator with the share of outliers as one more parameter; arguments of
     :func:`with_noise_scale`.
     """
     low, start, high = SHARE_LIMITS
@@ -234,10 +239,10 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
     """Maximise the likelihood of a recording's measurements.
 
     Args:
-        likelihood: of the tunable's parameters.
+        likelihood: likelihood of the tunable's parameters.
         tunable: the estimator, with limits.
-        seed: of the starts.
-        starts: how many.
+        seed: seed of the starts.
+        starts: number of starts.
     """
     ends = _find_maxima(likelihood, tunable, seed, starts)
     values = [-likelihood.count * float(end.fun) for end in ends]
@@ -248,26 +253,26 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
 def fit_stretches(
     likelihood: WindowLikelihood, tunable: Tunable, whole: WindowLikelihood, seed: int = 0
 ) -> Fit:
-    """Maximise the likelihood of stretches of a long recording, and return the likeliest end of the whole of it, which
-    is no maximum there yet.
+    """Maximise the likelihood of stretches of a long recording, and return the end that is likeliest on the whole
+    recording, where it is not yet a maximum.
 
     Args:
-        likelihood: of stretches.
+        likelihood: likelihood of the stretches.
         tunable: the estimator, with limits.
         whole: the likelihood of the whole.
-        seed: of the starts.
+        seed: seed of the starts.
     """
     ends = _find_maxima(likelihood, tunable, seed, STARTS)
     values = whole(numpy.array([end.x for end in ends]).T).tolist()
     losses = [float(end.fun) for end in ends]
-    # Ends that stretches hold for one maximum may be some nats apart on the whole, where the search has not been yet.
+    # Ends that are one maximum on the stretches may be some nats apart on the whole recording.
     spread = whole.count * (max(losses) - min(losses))
     best = int(numpy.argmax(values))
     return _as_fit(tunable, ends[best].x, whole.count, values)._replace(spread=spread)
 
 
 def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[float]) -> Fit:
-    """Return a fit at one of several ends, whose log-likelihoods are given: the best."""
+    """Return the fit at the best of several ends, whose log-likelihoods are given."""
     low, high = numpy.array(list(tunable.limits.values())).T
     edge = 1e-3 * (high - low)
     at_limit = tuple(
@@ -280,7 +285,7 @@ def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[
 
 
 def _find_maxima(likelihood: WindowLikelihood, tunable: Tunable, seed: int, starts: int) -> list[Any]:
-    """Return where searches from several starts end, SciPy's results of least mean loss, nats per measurement."""
+    """Return SciPy's results of searches from several starts for the least mean loss, nats per measurement."""
     from scipy.optimize import minimize
 
     limits = list(tunable.limits.values())
@@ -312,7 +317,6 @@ def _find_maxima(likelihood: WindowLikelihood, tunable: Tunable, seed: int, star
 
 
 def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarray) -> numpy.ndarray:
-    """Second derivatives of the log-likelihood by central differences, ``(P, P)``."""
     P, moves = len(at), numpy.diag(step)
     pairs = [(i, j) for i in range(P) for j in range(i, P)]
     signs = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
@@ -325,12 +329,12 @@ def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarra
 
 
 class _Way(NamedTuple):
-    """Values of one parameter from the best one towards a limit, at which its profile was computed."""
+    """Values of one parameter from the best one towards a limit, with its profile."""
 
     distances: list[float]
-    """From the best value."""
+    """Distances from the best value."""
     drops: list[float]
-    """Nats below the maximum at each."""
+    """Distance of the log-likelihood from its maximum at each, nats."""
 
 
 def fit_profiles(
@@ -339,15 +343,16 @@ def fit_profiles(
     found: Fit,
     tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Fit, dict[str, Profile]]:
-    """Profile likelihood of all parameters, the others searched anew at every step; and the fit at its maximum.
+    """Compute the profile likelihood of all parameters, the others searched anew at every step, and the fit at its
+    maximum.
 
-    Where a step of a profile is likelier than the fit, the fit was none: it starts again from there.
+    Where a step of a profile is likelier than the fit, the fit starts again from there.
 
     Args:
-        likelihood: of the tunable's parameters.
+        likelihood: likelihood of the tunable's parameters.
         tunable: the estimator, with limits.
-        found: of :func:`fit`.
-        tick: called with the share that is done, less where the fit starts again.
+        found: result of :func:`fit`.
+        tick: called with the share of the work done, which falls where the fit starts again.
     """
     for _ in range(MOST_RESTARTS):
         profiles, higher = _search_profiles(likelihood, tunable, found, tick)
@@ -366,7 +371,7 @@ def _search_profiles(
     tick: Callable[[float], None],
     stop: bool = True,
 ) -> tuple[dict[str, Profile], numpy.ndarray | None]:
-    """Profiles, and a point that is likelier than the fit, at which the search ends if it is to ``stop``."""
+    """Return the profiles, and a point that is likelier than the fit or None; with ``stop`` the search ends there."""
     limits = numpy.array(list(tunable.limits.values())).T
     best = numpy.array([found.values[name] for name in tunable.limits])
     information = _information(likelihood, best, limits)
@@ -386,7 +391,7 @@ def _search_profiles(
 
 
 def _profile(best: float, below: _Way, above: _Way) -> Profile:
-    """Put the values at which a parameter was held in order, with the best one, and find its interval."""
+    """Sort the values of a profile with the best one among them, and compute its interval."""
     (low, open_low), (high, open_high) = _profile_end(below), _profile_end(above)
     values = numpy.array([*(best - d for d in below.distances), *(best + d for d in above.distances), best])
     drops, order = numpy.array([*below.drops, *above.drops, 0.0]), numpy.argsort(values)
@@ -395,22 +400,22 @@ def _profile(best: float, below: _Way, above: _Way) -> Profile:
 
 
 class _Maximum(NamedTuple):
-    """Maximum of a likelihood, and what is known of its surroundings."""
+    """Maximum of a likelihood, and its curvature."""
 
     at: numpy.ndarray
     log_likelihood: float
     information: numpy.ndarray
-    """Of :func:`_information`."""
+    """Information matrix of :func:`_information`."""
     limits: numpy.ndarray
-    """Lower and upper ones, ``(2, P)``."""
+    """Lower and upper limits, ``(2, P)``."""
 
 
 def _walk_profile(
     likelihood: WindowLikelihood, maximum: _Maximum, first: tuple[int, float], stop: bool
 ) -> tuple[_Way, numpy.ndarray]:
-    """The way to a limit, up to where the likelihood has fallen far enough, and its last point; with ``stop`` no
-    further than a point that is likelier than the fit. It goes past ``first``, the number of the parameter and a
-    standard deviation of it up or down.
+    """Compute a profile towards a limit, up to where the likelihood has fallen far enough, and its last point; with
+    ``stop`` only up to a point that is likelier than the fit. ``first`` is the number of the parameter and a standard
+    deviation of it up or down.
     """
     parameter, deviation = first
     best, (low, high) = maximum.at, maximum.limits
@@ -429,7 +434,7 @@ def _walk_profile(
         after, log_likelihood = _maximise_others(likelihood, maximum, start, others)
         expected = 0.5 * (distance / deviation) ** 2
         if maximum.log_likelihood - log_likelihood > STEEP * expected:
-            # Not quadratic: the others may have stayed behind.
+            # Not quadratic: the search for the others may have stopped early.
             other, value = _maximise_others(likelihood, maximum, before, others)
             if value > log_likelihood:
                 after, log_likelihood = other, value
@@ -446,9 +451,9 @@ def _walk_profile(
 def _maximise_others(
     likelihood: WindowLikelihood, maximum: _Maximum, point: numpy.ndarray, others: numpy.ndarray
 ) -> tuple[numpy.ndarray, float]:
-    """Maximise the likelihood over all parameters but one, and return where and how large it is.
+    """Maximise the likelihood over all parameters but one, and return the maximum and its place.
 
-    Steps are Newton's with the curvature at the maximum as long as each gains; where one does not, L-BFGS-B goes on.
+    Steps are Newton's with the curvature at the maximum as long as each gains; where one does not, L-BFGS-B continues.
     """
     from scipy.optimize import minimize
 
@@ -484,8 +489,8 @@ def _maximise_others(
 def _newton_step(
     curvature: numpy.ndarray, gradient: numpy.ndarray, low: numpy.ndarray, high: numpy.ndarray
 ) -> tuple[numpy.ndarray, float]:
-    """Step to the minimum of a quadratic loss within limits of the step, and what it gains; what would go beyond a
-    limit goes as far, and the others adapt.
+    """Return the step to the minimum of a quadratic loss within limits, and its gain. Components beyond a limit stop
+    there, and the others adapt.
     """
     step, free = numpy.zeros(len(gradient)), numpy.ones(len(gradient), dtype=bool)
     while free.any():
@@ -500,7 +505,9 @@ def _newton_step(
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:
-    """Curvature of the likelihood at its maximum; a direction without one is taken for a flat one."""
+    """Return the information matrix, the curvature of the likelihood at its maximum; a direction without a maximum
+    counts as flat.
+    """
     low, high = limits
     step = numpy.minimum(0.02, 0.01 * (high - low))
     H = _hessian(likelihood, numpy.clip(best, low + 2.0 * step, high - 2.0 * step), step)
@@ -511,7 +518,7 @@ def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: nump
 
 
 def _profile_end(way: _Way) -> tuple[float, bool]:
-    """Distance at which the likelihood has fallen far enough, and whether it has not done so at the limit."""
+    """Return the distance at which the likelihood has fallen far enough, and whether it is still high at the limit."""
     distances = [0.0, *way.distances]
     # A drop grows with the square of the distance: it is interpolated in its root.
     roots = [0.0, *numpy.sqrt(numpy.clip(way.drops, 0.0, None)).tolist()]

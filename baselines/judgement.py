@@ -1,6 +1,6 @@
-"""What competitors did on the parts of a recording that chose among them and that judge them.
+"""Comparison of competitors on the parts of a recording for the choice among them and for the judgement.
 
-A recording is cut into blocks: what filters are fitted to, chosen on and judged on.
+A recording is cut into blocks on which filters are fitted, chosen and judged.
 """
 
 import itertools
@@ -18,22 +18,23 @@ from .fitting import Fit
 from .log_scores import LogScores, PairSums, Roles
 
 LEAST = 5
-"""Measurements after the start of the track that anything can be fitted to."""
+"""Smallest number of measurements after the start of the track for a fit."""
 FEWEST = 40
-"""Measurements of a recording from which on it is cut into blocks; of fewer everything is fitted to all of it."""
+"""Smallest number of measurements of a recording that is cut into blocks; a shorter one is used as a whole for every
+purpose."""
 LARGEST_LOSS = 0.5
-"""Nats per measurement by which a fit may be worse over the whole recording than in its windows, which begin anew:
-what loses more has lost the track."""
+"""Nats per measurement by which a fit may be worse over the whole recording than in its windows, each of which starts
+anew: a filter that loses more has lost the track."""
 AS_GOOD = 0.1
 """Nats per measurement that a cheaper filter may lose, at the end of the interval: innovations of the plane are then
-5 % larger. That a difference may be chance is not enough: on a short log all differences may."""
+5 % larger. A difference within chance is not enough: on a short log all differences are."""
 BLOCK_MEASUREMENTS = 40
 MOST_BLOCKS = 24
 LONGEST_WARM_UP = 20
 
 
 class Share(NamedTuple):
-    """Measurements of a recording that serve one purpose."""
+    """Spans of a recording on which filters are fitted, chosen and judged."""
 
     fitted: list[Span]
     chosen: list[Span]
@@ -43,17 +44,17 @@ class Share(NamedTuple):
     """Whether the three are different measurements."""
 
 
-def share_out(recording: Recording) -> Share:
-    """Cut a recording into what filters are fitted to, chosen on and judged on: a half and two quarters of it.
+def split_recording(recording: Recording) -> Share:
+    """Cut a recording into spans on which filters are fitted, chosen and judged: a half and two quarters of it.
 
     Raises:
-        ValueError: if it has too few measurements for anything.
+        ValueError: if it has fewer than ``LEAST`` measurements.
     """
     total = int(recording.rows.sum())
     if total < LEAST:
         raise ValueError(
-            f"recording {recording.name!r} has {total} measurements after the start of its track: to fit anything "
-            f"takes {LEAST}"
+            f"recording {recording.name!r} has {total} measurements after the start of its track: a fit needs at "
+            f"least {LEAST}"
         )
     blocks = min(MOST_BLOCKS, max(8, total // BLOCK_MEASUREMENTS)) // 4 * 4
     warm_up = max(2, min(LONGEST_WARM_UP, total // 20))
@@ -67,7 +68,7 @@ def share_out(recording: Recording) -> Share:
         for episode, offset in enumerate(first_of_episode[:-1]):
             first, last = max(begin, offset), min(end, first_of_episode[episode + 1])
             if block == 0:
-                first = max(first, offset + warm_up)  # the start of the track is no motion
+                first = max(first, offset + warm_up)  # the start of the track contains no motion
             if last > first:
                 found[block % 4].append(Span(episode, int(first - offset), int(last - offset)))
     return Share([*found[0], *found[2]], found[1], found[3], warm_up, True)
@@ -80,12 +81,12 @@ class JudgedFilter(NamedTuple):
     fitted: bool
     """Whether its parameters were fitted to this recording."""
     parameters: int
-    """How many were."""
+    """Number of fitted parameters."""
     log_likelihood: float
-    """Mean of the measurements that chose, less one nat in all for each fitted parameter, nats; NaN where it says
-    none."""
+    """Mean over the measurements of the choice, less one nat in all for each fitted parameter, nats; NaN where the
+    filter reports none."""
     gain: IntervalEstimate
-    """The same less that of the rival, paired."""
+    """Mean log-likelihood of the filter less that of the rival, paired, nats."""
     difference: IntervalEstimate
     """Judged log-likelihood per measurement less that of the rival, nats."""
     prediction: float
@@ -93,13 +94,14 @@ class JudgedFilter(NamedTuple):
     error: float
     """Root mean square of the judged errors of the main components; NaN without truth."""
     relative_error: IntervalEstimate
-    """Judged error over that of the rival, less one; without truth of the prediction errors."""
+    """Judged error over that of the rival, less one; without truth the prediction error is used."""
     nis: float
     """Mean normalised innovation squared of judged measurements over its dimension."""
     correlation: IntervalEstimate
-    """Of successive judged prediction errors; zero where they are white."""
+    """Correlation of successive judged prediction errors; zero where they are white."""
     correlations: Mapping[str, IntervalEstimate]
-    """Likewise of each number that is measured, by its name; empty where all are of one kind."""
+    """Correlation of successive prediction errors of each measured number, by its name; empty where all are of one
+    kind."""
 
 
 def roles_of(share: Share, shape: tuple[int, int]) -> Roles:
@@ -115,14 +117,14 @@ def roles_of(share: Share, shape: tuple[int, int]) -> Roles:
 
 
 class Judgement:
-    """What all competitors did on the measurements that chose and on those that judge.
+    """Comparison of all competitors on the measurements of the choice and of the judgement.
 
     Args:
-        scores: of all.
-        share: which measurements they are.
-        parameters: how many were fitted, by the name of who was fitted; all others are shipped.
+        scores: sums of all competitors.
+        share: spans of these measurements.
+        parameters: number of fitted parameters, by the name of each fitted filter; all others are shipped.
         default: shipped filter that stands unless another is likelier beyond chance; empty: none.
-        anchored: names of filters with a second sensor, of which an estimate alone does not say what they predict.
+        anchored: names of filters with a second sensor, whose estimate alone does not determine their prediction.
     """
 
     def __init__(
@@ -142,8 +144,8 @@ class Judgement:
         self._predicting = [n for n in scores.names if scores.predicted is not None and n not in anchored]
         self._chosen, self._judged = scores.log_likelihood
 
-    def _least(self, squares: PairSums | None, log_likelihood: PairSums) -> str:
-        """Shipped filter of smallest mean square; by log-likelihood where there are no squares."""
+    def _least_error(self, squares: PairSums | None, log_likelihood: PairSums) -> str:
+        """Return the shipped filter of smallest mean square; by log-likelihood where there are no squares."""
         numbers = self._numbers
         means = {
             name: -log_likelihood.mean(numbers[name]) if squares is None else squares.mean(numbers[name])
@@ -152,18 +154,18 @@ class Judgement:
         return min(means, key=lambda name: (math.isnan(means[name]), means[name]))
 
     def rival(self, operations: Callable[[str], float]) -> str:
-        """Shipped filter that one would take by the measurements that chose: the default where the likeliest does not
-        beat it beyond chance, else the cheapest that is ``AS_GOOD`` as the likeliest.
+        """Return the shipped filter chosen by likelihood: the default where the likeliest does not beat it beyond
+        chance, else the cheapest that is ``AS_GOOD`` as the likeliest.
 
         Args:
-            operations: of an update of a competitor.
+            operations: returns the operations of an update of a competitor by name.
         """
         chosen, default, numbers = self._chosen, self.default, self._numbers
         means = {name: chosen.mean(numbers[name]) for name in self.shipped}
         known = [name for name, mean in means.items() if not math.isnan(mean)]
         if not known:
             predicted = self.scores.predicted
-            return self._least(None if predicted is None else predicted[0], chosen)
+            return self._least_error(None if predicted is None else predicted[0], chosen)
         likeliest = max(known, key=means.__getitem__)
         gains = {name: chosen.difference(numbers[likeliest], numbers[name]) for name in known}
         if default in known and not gains[default].low > 0.0:
@@ -172,49 +174,51 @@ class Judgement:
         return min(as_good, key=lambda name: (operations(name), -means[name]))
 
     def simplest(self, fitted: Sequence[JudgedFilter]) -> JudgedFilter:
-        """Return the first of the fitted ones that the likeliest of them does not beat beyond chance: the simplest come
-        first.
+        """Return the simplest fitted filter that the likeliest does not beat beyond chance; ``fitted`` lists the
+        simplest first.
         """
         likeliest = likeliest_of(fitted)
         as_good = (c for c in fitted if self.difference(likeliest.name, c.name).low <= 0.0)
         return next(as_good, likeliest)
 
     def is_worth(self, fitted: JudgedFilter, rival: str, operations: Callable[[str], float]) -> bool:
-        """Whether a fitted filter gains beyond chance over the rival, or is cheaper and ``AS_GOOD``."""
+        """Return whether a fitted filter gains beyond chance over the rival, or is cheaper and ``AS_GOOD``."""
         low = fitted.gain.low
         return low > 0.0 or (low > -AS_GOOD and operations(fitted.name) < operations(rival))
 
     def _judged_squares(self) -> PairSums | None:
-        """Squares of judged errors; without truth of the prediction errors."""
+        """Return the squares of judged errors, or of prediction errors without truth."""
         predicted = self.scores.predicted
         return self.scores.squared or (None if predicted is None else predicted[1])
 
     def best_shipped(self) -> str:
-        """Shipped filter that is best on the measurements that judge."""
-        return self._least(self._judged_squares(), self._judged)
+        """Return the shipped filter that is best on the measurements that judge."""
+        return self._least_error(self._judged_squares(), self._judged)
 
     def relative_error(self, name: str, other: str) -> IntervalEstimate:
-        """Judged error over that of another, less one; without truth of the prediction errors."""
+        """Return the judged error over that of another, less one; without truth the prediction error is used."""
         squares, known = self._judged_squares(), self._numbers if self.scores.squared else self._predicting
         if squares is None or name not in known or other not in known:
             return UNKNOWN
         return squares.relative_root(self._numbers[name], self._numbers[other])
 
     def difference(self, name: str, other: str) -> IntervalEstimate:
-        """Chosen log-likelihood of a filter less that of another, their fitted parameters paid for, nats."""
+        """Return the log-likelihood of a filter on the measurements of the choice less that of another, each less one
+        nat in all for each fitted parameter, nats.
+        """
         found = self._chosen.difference(self._numbers[name], self._numbers[other])
         penalty = self._penalty(name) - self._penalty(other)
         return IntervalEstimate(*(value - penalty for value in found))
 
     def _penalty(self, name: str) -> float:
-        """One nat for each fitted parameter, shared by the measurements that chose."""
+        """Return one nat for each fitted parameter over the number of measurements of the choice."""
         return self.parameters.get(name, 0) / self.scores.chosen_measurements
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
-        """Return who loses the track in the whole recording; nobody where all do.
+        """Return the filters that lose the track in the whole recording; none where all do.
 
         Args:
-            fits: what their likelihood is in windows.
+            fits: fits with their likelihood in windows.
         """
         parts = self.scores.log_likelihood if self._share.apart else [self._chosen]
         totals = {name: [part.total(self._numbers[name]) for part in parts] for name in fits}
@@ -230,7 +234,7 @@ class Judgement:
         return tuple(diverging) if len(diverging) < len(fits) else ()
 
     def competitor(self, name: str, rival: str) -> JudgedFilter:
-        """Judge somebody, paired with another."""
+        """Judge a competitor, paired with a rival."""
         scores, i, other = self.scores, self._numbers[name], self._numbers[rival]
         penalty, predicts = self._penalty(name), name in self._predicting
         gain = self._chosen.difference(i, other)
@@ -251,7 +255,7 @@ class Judgement:
 
 
 def likeliest_of(competitors: Sequence[JudgedFilter]) -> JudgedFilter:
-    """The one of largest log-likelihood; where nobody says any, the one of smallest error."""
+    """Return the competitor of largest log-likelihood; where no competitor reports one, that of smallest error."""
     known = [c for c in competitors if not math.isnan(c.log_likelihood)]
     if not known:
         return min(competitors, key=lambda c: (math.isnan(c.error), c.error))

@@ -1,8 +1,8 @@
-"""What competitors did on a log, summed over stretches of its measurements.
+"""Sums over stretches of a log of the likelihoods and errors of competitors.
 
-All competitors go through the log side by side, some measurements after the others. Of each measurement only its part
-of sums over a stretch is kept: of one competitor, and of each pair over what both have. So memory grows neither with
-the log nor with how many they are. Intervals are those of :mod:`.evaluation.statistics.predictions`.
+All competitors process the log side by side, in chunks of measurements. Only sums over stretches are stored: of one
+competitor, and of each pair over the measurements for which both have values. So memory grows neither with the log nor
+with the number of competitors. Intervals are those of :mod:`.evaluation.statistics.predictions`.
 """
 
 import math
@@ -27,33 +27,34 @@ if TYPE_CHECKING:
     import xarray
 
 ROWS = 1 << 13
-"""Measurements of all episodes together that a competitor is run over at once."""
+"""Measurements of a chunk, over all episodes together."""
 
 
 def report_scores(model: Model, episode: Episode) -> dict[str, Any]:
-    """Report what sums are made of, arrays ``(..., N)``: nothing that the log itself holds."""
+    """Report the terms of the sums, arrays ``(..., N)``, without those that the log itself contains."""
     records = model.records(episode)
     found = {name: records[name] for name in LIKELIHOOD if name in records}
     return {**found, "estimate": model.mean(episode)}
 
 
 def report_picture(model: Model, episode: Episode) -> dict[str, Any]:
-    """Report what pictures of a log show, arrays ``(..., N)``."""
+    """Report the quantities of figures of a log, arrays ``(..., N)``."""
     found = {**model.records(episode), **model.track(episode)}
     shown = ("estimate", "truth", *LIKELIHOOD)
     return {name: found[name] for name in found if name in shown or name.startswith("measurement_")}
 
 
 class PairSums:
-    """Sums over stretches of what competitors have at a measurement, of each over what it shares with each other.
+    """Sums over stretches of values of competitors, for each pair over the measurements for which both are finite.
 
     Args:
-        competitors: how many, n.
-        stretch: number of the stretch of each measurement, ``(E, T)``; -1: it does not count.
+        competitors: number of competitors, n.
+        stretch: number of the stretch of each measurement, ``(E, T)``; -1 for an excluded one.
 
     Attributes:
-        sums: of stretch, competitor and other: sum of the competitor where both are finite, ``(S, n, n)``.
-        counts: measurements at which both are, likewise.
+        sums: sum of a competitor where both it and another are finite, for stretch, competitor and other, ``(S, n,
+            n)``.
+        counts: number of measurements at which both are finite, ``(S, n, n)``.
     """
 
     def __init__(self, competitors: int, stretch: numpy.ndarray) -> None:
@@ -73,22 +74,22 @@ class PairSums:
             self.counts[number] += there @ there.T
 
     def total(self, i: int) -> tuple[float, int]:
-        """Sum of a competitor over all stretches, and how many measurements it is of."""
+        """Return the sum of a competitor over all stretches, and its number of measurements."""
         return float(self.sums[:, i, i].sum()), int(self.counts[:, i, i].sum())
 
     def mean(self, i: int) -> float:
-        """Mean of a competitor; NaN where nothing is finite."""
+        """Return the mean of a competitor; NaN where no value is finite."""
         total, count = self.total(i)
         return total / count if count else math.nan
 
     def difference(self, i: int, j: int) -> IntervalEstimate:
-        """Mean of competitor i less that of j, paired."""
+        """Return the mean of competitor i less that of j, paired."""
         counts = self.counts[:, i, j]
         sums = numpy.stack([self.sums[:, i, j] - self.sums[:, j, i], counts], axis=1)
         return interval_of_sums(sums, counts, ratio)
 
     def relative_root(self, i: int, j: int) -> IntervalEstimate:
-        """Root mean square of competitor i over that of j, less one, paired; of values that are squares."""
+        """Return the ratio of root mean squares of competitors i and j, less one, paired; the values are squares."""
         sums = numpy.stack([self.sums[:, i, j], self.sums[:, j, i]], axis=1)
         return interval_of_sums(sums, self.counts[:, i, j], lambda means: numpy.sqrt(ratio(means)) - 1.0)
 
@@ -97,8 +98,8 @@ class _Whiteness:
     """Products of the successive prediction errors of a competitor, summed over stretches.
 
     Args:
-        stretch: as of :class:`PairSums`.
-        main: which of the numbers that are measured belong to the first group, ``(m,)``.
+        stretch: number of the stretch of each measurement, ``(E, T)``; -1 for an excluded one.
+        main: whether each measured number belongs to the first group, ``(m,)``.
     """
 
     def __init__(self, stretch: numpy.ndarray, main: numpy.ndarray) -> None:
@@ -127,7 +128,7 @@ class _Whiteness:
                 self._sums[i, :, j] += numpy.bincount(stretch[there], pair[j][there], count)
 
     def correlations(self) -> list[IntervalEstimate]:
-        """Correlation of successive errors of the first group together, and of each number that is measured: of each
+        """Return the correlation of successive errors of the first group together, and of each measured number: of each
         received one with the last received before.
         """
         pairs = zip(self._sums, self._counts, strict=True)
@@ -135,30 +136,30 @@ class _Whiteness:
 
 
 def _products(errors: numpy.ndarray, before: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Of errors and those before: what their correlation is the ratio of."""
+    """Return the products of successive errors, and mean squares, whose ratio of sums is the correlation."""
     return errors * before, 0.5 * (errors**2 + before**2)
 
 
 class Roles(NamedTuple):
-    """Which measurements choose among competitors, and which judge them, booleans ``(E, T)``."""
+    """Masks of the measurements for the choice among competitors, and for the judgement, booleans ``(E, T)``."""
 
     chosen: numpy.ndarray
     judged: numpy.ndarray
 
 
 class LogScores:
-    """Sums of what competitors did on the measurements of a log that choose, and on those that judge.
+    """Sums of competitors over the measurements of a log for the choice, and over those for the judgement.
 
     Args:
-        plan: of their evaluation on the log.
-        roles: of its measurements.
+        plan: plan of their evaluation on the log.
+        roles: roles of its measurements.
 
     Attributes:
-        names: of the competitors, whose numbers in the sums are their places here.
-        log_likelihood: of the measurements that choose, and of those that judge; likewise ``predicted``.
-        predicted: of squared prediction errors, the first group of what is measured added up; None where no log format
-            says what an estimate predicts.
-        squared: of squared errors of the main components, judged; None without truth.
+        names: names of the competitors, in the order of the sums.
+        log_likelihood: sums over the measurements of the choice, and over those of the judgement.
+        predicted: sums of squared prediction errors over the same two sets, summed over the first group of measured
+            numbers; None where no log format gives the prediction of an estimate.
+        squared: sums of judged squared errors of the main components; None without truth.
     """
 
     def __init__(self, plan: Plan, roles: Roles) -> None:
@@ -180,14 +181,14 @@ class LogScores:
         self.predicted: tuple[PairSums, PairSums] | None = None
         self._whiteness: list[_Whiteness] = []
         self._estimates: list[numpy.ndarray] = []
-        """Last of each competitor, ``(C, E, 1)``."""
+        """Last estimate of each competitor, ``(C, E, 1)``."""
         if self._format is not None and self._format.predict is not None:
             self.predicted = PairSums(n, chosen), PairSums(n, self._judged)
             nothing = numpy.full((len(task.components), len(chosen), 1), math.nan)
             self._estimates = [nothing] * n
 
     def add(self, first: int, reports: Sequence[Mapping[str, numpy.ndarray]]) -> None:
-        """Add what :func:`report_scores` of each competitor reports from a measurement on, ``(rows, ..., E)``."""
+        """Add the reports of :func:`report_scores` of each competitor from a measurement on, ``(rows, ..., E)``."""
         rows = len(reports[0]["estimate"])
         there = self._there[:, first : first + rows]
         found = [
@@ -205,13 +206,13 @@ class LogScores:
             self._nis[:, i] += numpy.where(known, each, 0.0).sum(axis=(1, 2))
         estimates = [each["estimate"] for each in found]
         if self.squared is not None:
-            truth = self._of_log(self._recording.truth, first, rows)
+            truth = self._log_values(self._recording.truth, first, rows)
             errors = [self._task.subtract(each, truth)[self._components] for each in estimates]
             self.squared.add(numpy.stack([(each**2).sum(axis=0) for each in errors]), first)
             estimates = [unwrap(each, truth, self._task.periods) for each in estimates]
         if self.predicted is not None:
             names = self._recording.measurements
-            measured = {name: self._of_log(values, first, rows) for name, values in names.items()}
+            measured = {name: self._log_values(values, first, rows) for name, values in names.items()}
             squares = numpy.stack(
                 [
                     self._predict(i, each, SimpleNamespace(**measured), first)
@@ -222,9 +223,7 @@ class LogScores:
                 sums.add(squares, first)
 
     def _predict(self, i: int, estimate: numpy.ndarray, measurement: Any, first: int) -> numpy.ndarray:
-        """Squared prediction error of the first group, ``(E, rows)``, of what competitor i estimates, ``(C, E, rows)``;
-        its products are added up.
-        """
+        """Return the squared prediction errors of the first group, and add the products of successive errors."""
         before = numpy.concatenate([self._estimates[i], estimate[..., :-1]], axis=2)
         self._estimates[i] = estimate[..., -1:].copy()
         assert self._format is not None
@@ -239,8 +238,8 @@ class LogScores:
         squares: numpy.ndarray = (errors[main] ** 2).sum(axis=0)
         return squares
 
-    def _of_log(self, values: Any, first: int, rows: int) -> numpy.ndarray:
-        """What the log holds from a measurement on, ``(..., E, rows)``; NaN beyond the end of an episode."""
+    def _log_values(self, values: Any, first: int, rows: int) -> numpy.ndarray:
+        """Return the log's values from a measurement on, ``(..., E, rows)``; NaN beyond the end of an episode."""
         some = values[self._plan.flown, first : first + rows].astype(float)
         return numpy.where(
             self._there[:, first : first + rows],
@@ -249,16 +248,20 @@ class LogScores:
         )
 
     def nis(self, i: int) -> float:
-        """Mean judged normalised innovation squared over its dimension; NaN where it is not known."""
+        """Return the mean judged normalised innovation squared over its dimension; NaN where it is unknown."""
         squares, degrees = self._nis[i].tolist()
         return squares / degrees if degrees else math.nan
 
     def correlation(self, i: int) -> IntervalEstimate:
-        """Correlation of the successive judged prediction errors of competitor i; zero where they are white."""
+        """Return the correlation of the successive judged prediction errors of competitor i; zero where they are
+        white.
+        """
         return self._whiteness[i].correlations()[0]
 
     def correlations(self, i: int) -> dict[str, IntervalEstimate]:
-        """The same of each number that is measured, by name; empty where all are of one group."""
+        """Return the correlation of successive errors of each measured number, by name; empty where all are of one
+        group.
+        """
         assert self._format is not None
         found = self._whiteness[i].correlations()[1:]
         quantities = self._format.predicted[: len(found)]
@@ -267,7 +270,7 @@ class LogScores:
 
 
 def _start_runs(plan: Plan, report: Report) -> list[Iterator[dict[str, numpy.ndarray]]]:
-    """Return a run of each competitor over a log, some measurements after the others."""
+    """Return a run of each competitor over a log, in chunks of measurements."""
     rows, models = max(ROWS // len(plan.seeds), 1), plan.models
     return [
         run_stretches(models[name], maker, plan.kinds[name], plan.seeds, report, rows, name)
@@ -282,15 +285,15 @@ def score_log(
     roles: Roles,
     tick: Callable[[float], None] = lambda share: None,
 ) -> LogScores:
-    """Run competitors over a log, and return the sums of what they did.
+    """Run competitors over a log, and return the sums of their likelihoods and errors.
 
     Args:
-        experiment: on the recording.
-        competitors: what makes them, by name.
-        roles: of the measurements of the recording.
-        tick: called with the share that is done.
+        experiment: experiment on the recording.
+        competitors: makers by name.
+        roles: roles of the measurements of the recording.
+        tick: called with the share of the work done.
     """
-    with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
+    with numpy.errstate(all="ignore"):  # a diverging filter is judged by its numbers
         plan = plan_of(experiment, competitors)
         scores, runs = LogScores(plan, roles), _start_runs(plan, report_scores)
         done, horizon = 0, plan.models[scores.names[0]].task.horizon
@@ -307,7 +310,9 @@ def score_log(
 
 @one_thread()
 def replay_log(experiment: Experiment, competitors: Mapping[str, Any]) -> "xarray.Dataset":
-    """Run competitors over a log, and return what pictures show of every measurement, as of an evaluation."""
+    """Run competitors over a log, and return the quantities of figures for every measurement, in the form of an
+    evaluation.
+    """
     plan = plan_of(experiment, competitors)
     task = plan.models[next(iter(competitors))].task
     kept = plan.arrays(len(plan.seeds), len(plan.seeds))

@@ -1,6 +1,6 @@
-"""How an estimator comes to know the noise of a sensor: as stated, or from the innovations.
+"""Models of the noise of a sensor: as stated, or estimated from the innovations.
 
-What several environments' competitors share; equation numbers are those of ``filters/noise_adaptation.py``.
+Competitors of several environments use them. Equation numbers are those of ``filters/noise_adaptation.py``.
 """
 
 from collections.abc import Mapping
@@ -10,20 +10,20 @@ from ..filters import noise_adaptation as adaptation
 from ..filters.array_namespace import Array
 
 LEAST = 0.1
-"""Smallest estimate over the stated variance; ours: a third of the stated deviation, below which nothing is gained."""
+"""Smallest estimate over the stated variance; ours: a third of the stated deviation, below which there is no gain."""
 
 
 class MeasurementNoise:
     """Noise as stated, by the sensor or its data sheet; subclasses estimate it."""
 
     def start(self, stated: Array) -> Any:
-        """Memory where nothing but the stated variance is known, ``(N,)``."""
+        """Return the memory at the start, where only the stated variance is known, ``(N,)``."""
         return ()
 
     def update(
         self, memory: Any, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, Any]:
-        """Variance of a measurement and memory, in the sensor's unit.
+        """Return the variance of a measurement and memory, in the sensor's unit.
 
         Args:
             memory: after the measurement before.
@@ -37,7 +37,7 @@ class MeasurementNoise:
 
 
 class Mehra(MeasurementNoise):
-    """By the mean square of the last innovations.
+    """Noise estimated by the mean square of the last innovations.
 
     Args:
         window: measurements in it.
@@ -47,22 +47,22 @@ class Mehra(MeasurementNoise):
         self.window: int = max(round(window), 1)
 
     def start(self, stated: Array) -> Array:
-        """Window full of the stated variance."""
+        """Return a window full of the stated variance."""
         return adaptation.start_window(stated, self.window)
 
     def update(
         self, memory: Array, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, Array]:
-        """Equation (5) of ``filters/noise_adaptation.py``."""
+        """Apply equation (5) of ``filters/noise_adaptation.py``."""
         return adaptation.mehra(memory, innovation, P, LEAST * stated, available)
 
 
 class FadingNoise(MeasurementNoise):
-    """Estimated with a memory that fades.
+    """Noise estimated with a fading memory.
 
     Args:
-        memory: measurements that count, ``1 / (1 - b)``.
-        trust: measurements that the statement counts for; default: as many as the memory.
+        memory: effective number of measurements, ``1 / (1 - b)``.
+        trust: number of measurements to which the stated variance is equivalent; default: that of the memory.
     """
 
     def __init__(self, memory: float, trust: float | None = None) -> None:
@@ -71,34 +71,34 @@ class FadingNoise(MeasurementNoise):
 
 
 class SageHusaMeasurementNoise(FadingNoise):
-    """By the fading mean square of the innovations; arguments as of :class:`FadingNoise`."""
+    """Noise estimated by the fading mean square of the innovations; arguments of :class:`FadingNoise`."""
 
     def start(self, stated: Array) -> adaptation.Level:
-        """Level at the stated variance."""
+        """Return the level at the stated variance."""
         return adaptation.Level(stated, self.trust + 0.0 * stated)
 
     def update(
         self, memory: adaptation.Level, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, adaptation.Level]:
-        """Equation (1) of ``filters/noise_adaptation.py``."""
+        """Apply equation (1) of ``filters/noise_adaptation.py``."""
         level = adaptation.sage_husa(memory, innovation, P, self.forgetting, LEAST * stated, available)
         return level.value, level
 
 
 class VariationalBayesMeasurementNoise(FadingNoise):
-    """By an inverse-gamma distribution; arguments as of :class:`FadingNoise`, with ``rho`` for ``b``."""
+    """Noise estimated by an inverse-gamma distribution; arguments of :class:`FadingNoise`, with ``rho`` for ``b``."""
 
     iterations = 2
 
     def start(self, stated: Array) -> adaptation.InverseGamma:
-        """Distribution about the stated variance."""
+        """Return the distribution about the stated variance."""
         shape = 0.5 * self.trust + 0.0 * stated
         return adaptation.InverseGamma(shape, shape * stated)
 
     def update(
         self, memory: adaptation.InverseGamma, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, adaptation.InverseGamma]:
-        """Equations (6) and (7) of ``filters/noise_adaptation.py``."""
+        """Apply equations (6) and (7) of ``filters/noise_adaptation.py``."""
 
         def update(R: Array) -> tuple[Array, Array, Array]:
             rest = R / (P + R)
@@ -120,4 +120,4 @@ RULES: Mapping[str, tuple[type[MeasurementNoise], str]] = {
         "by variational Bayes (Särkkä and Nummenmaa 2009)",
     ),
 }
-"""Rules by their names in tables, and how they estimate the noise."""
+"""Rules by their names in tables, with descriptions."""

@@ -1,11 +1,11 @@
-"""A vehicle's own filter beside the filters of an advice, judged by fixes that are withheld from these.
+"""Comparison of a vehicle's own filter with the filters of an advice, by fixes that are withheld from these.
 
-Every fifth fix of a log is withheld. Filters run over the others, and predict the withheld ones. What the vehicle's own
-filter estimated comes from the log; there is no truth. A fix is logged some time after it was true, so its estimate is
-read that much earlier: where it agrees best with the fixes that are not withheld.
+Every fifth fix of a log is withheld. Filters run over the others, and predict the withheld ones. The estimates of the
+vehicle's own filter come from the log; there is no truth. A fix is logged with a delay, so the estimate is read that
+much earlier: at the delay with the best agreement on the fixes that are not withheld.
 
-What leaks: in flight that filter had every earlier fix, the withheld ones too, and an inertial sensor. So its error is
-an optimistic bound of what it would be without the withheld fixes.
+Leak: in flight that filter had every earlier fix, the withheld ones too, and an inertial sensor. So its error is an
+optimistic bound of its error without the withheld fixes.
 """
 
 import dataclasses
@@ -26,25 +26,25 @@ from .problem import Problem
 ONBOARD = "on-board"
 """Name of the vehicle's own filter in tables."""
 ONE_IN = 5
-"""Fixes, of which one is withheld."""
+"""Number of fixes of which one is withheld."""
 DELAYS = numpy.arange(0.0, 1.0, 0.02)
-"""s, that are tried."""
+"""Delays that are tried, s."""
 
 
 class OnboardJudgement(NamedTuple):
-    """What the vehicle's own filter and some others did on the withheld fixes that judge."""
+    """Errors of the vehicle's own filter and of others on the withheld fixes that judge."""
 
     source: str
-    """Filter, autopilot and topic."""
+    """Name of the filter, autopilot and topic."""
     delay: float
-    """Of the fixes, s."""
+    """Delay of the fixes, s."""
     fixes: int
     errors: Mapping[str, float]
     """Root mean square of the distance from the fixes, m, by name."""
     relative: IntervalEstimate
     """Error of the advised filter over that of the vehicle's own, less one, paired."""
     positions: numpy.ndarray
-    """That the vehicle's own filter estimated at the fixes, m, ``(E, T, 2)``."""
+    """Positions estimated by the vehicle's own filter at the fixes, m, ``(E, T, 2)``."""
 
 
 def judge_onboard(
@@ -58,10 +58,10 @@ def judge_onboard(
     """Judge a vehicle's own filter and others by withheld fixes; None where the log has no estimate at any of them.
 
     Args:
-        problem: of the recording.
+        problem: problem of the recording.
         recording: positions in metres around its origin.
         keywords: parameters of the task.
-        share: which of its measurements judge.
+        share: spans of its measurements, with those that judge.
         makers: competitors by name, the advised one first.
         track: estimates of the vehicle's own filter.
     """
@@ -88,7 +88,7 @@ def judge_onboard(
     mask = withheld & judged & numpy.isfinite(own)
     if not mask.any():
         return None
-    replay = replay_log(problem.experiment(_without(recording, withheld), keywords=keywords), makers)
+    replay = replay_log(problem.experiment(_withhold(recording, withheld), keywords=keywords), makers)
     found = replay["estimate"].sel(policy=list(makers), component=["position_x", "position_y"])
     estimates = found.transpose("policy", "episode", "time", "component").values
     stretches = stretches_of(mask)[:, : estimates.shape[2]]
@@ -100,7 +100,7 @@ def judge_onboard(
     return OnboardJudgement(track.source, delay, int((stretches >= 0).sum()), root_means, relative, positions)
 
 
-def _without(recording: Recording, withheld: numpy.ndarray) -> Recording:
+def _withhold(recording: Recording, withheld: numpy.ndarray) -> Recording:
     """Return a recording in which some fixes are missed measurements."""
     measured = dict(recording.measurements)
     measured["available"] = numpy.where(withheld, 0.0, measured["available"])

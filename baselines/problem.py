@@ -1,4 +1,4 @@
-"""What belongs to an environment, found once where its id is given and handed down as one object."""
+"""An environment's task, baselines and tuned values as one object, looked up once by its id."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Problem:
-    """An environment's task, and what it is compared with; to another process it goes by its name."""
+    """An environment's task and its baselines; it is pickled by name."""
 
     task: type[Task]
     baselines: Baselines
@@ -43,17 +43,17 @@ class Problem:
 
     @property
     def name(self) -> str:
-        """Id by which another process finds it, see :func:`.envs.catalogue.importable_name`."""
+        """Id by which another process imports it, see :func:`.envs.catalogue.importable_name`."""
         return importable_name(self.task)
 
     @property
     def is_shipped(self) -> bool:
-        """Whether it is of this package, so that its digest covers the code."""
+        """Whether this package contains it, so that its digest covers the code."""
         return self.name == self.id
 
     @property
     def short_name(self) -> str:
-        """Name for its files, and where an id is too long."""
+        """Short name, for files and tables."""
         return short_name(self.id)
 
     @property
@@ -61,7 +61,7 @@ class Problem:
         """Name of the policy that is the paper's algorithm.
 
         Raises:
-            ValueError: if the baselines name none, so that nothing can be measured against it.
+            ValueError: if the baselines name none.
         """
         if not self.baselines.score_paper:
             raise ValueError(
@@ -71,11 +71,11 @@ class Problem:
         return self.baselines.score_paper
 
     def paper_among(self, competitors: Mapping[str, Any]) -> str:
-        """Return the name of the paper's algorithm that some competitors are compared with; empty: of none.
+        """Return the name of the paper's algorithm that some competitors are compared with; empty without one.
 
         Args:
-            competitors: what makes them, by their names: the stronger reading of the paper where it is among them,
-                whatever it is called there.
+            competitors: makers by name. The stronger reading of the paper is returned where it is among them, under its
+                name there.
         """
         known = self.baselines
         for reading in filter(None, (known.stronger_paper, known.score_paper)):
@@ -87,13 +87,13 @@ class Problem:
 
     @property
     def knows(self) -> dict[str, str]:
-        """What its references and bounds are told beyond the measurements, by their names."""
+        """Description of what its references and bounds know beyond the measurements, by name."""
         makers = {**self.baselines.references, **self.baselines.bounds}
         return {name: maker.knows for name, maker in makers.items()}
 
     @property
     def tuned_values(self) -> TunedValues:
-        """What is stored of its policies and estimators that were tuned."""
+        """Stored values of its tuned policies and estimators."""
         shipped = [] if self.shipped is None else [files(self.shipped) / "tuned.json"]
         return TunedValues(self.id, self.baselines.tunable, [table_path(self.id), *shipped])
 
@@ -108,8 +108,8 @@ class Problem:
         return [*self.baselines.names, *self.tuned_policies]
 
     def find(self, name: str) -> Any:
-        """Return what makes one of its own policies or estimators, tuned or not, smoothers, references or bounds; None
-        where there is no such name. Tuned values are read only for a name that ends so.
+        """Return the maker of one of its policies, estimators (tuned or not), smoothers, references or bounds; None for
+        an unknown name. Tuned values are read only for a name that ends with ``-tuned``.
         """
         known = self.baselines
         for table in (known.policies, known.estimators, known.smoothers, known.references, known.bounds):
@@ -120,14 +120,14 @@ class Problem:
         return None
 
     def competitor(self, name: str) -> Any:
-        """Return the same.
+        """Return the maker of a competitor of this name, see :meth:`find`.
 
         Raises:
             ValueError: if there is no such name.
         """
         found = self.find(name)
         if found is None and name.endswith("-tuned"):
-            return self.tuned_values.competitor(name.removesuffix("-tuned"))  # says why there is none
+            return self.tuned_values.competitor(name.removesuffix("-tuned"))  # raises with the reason
         if found is None:
             raise nearest("policy", name, self.names)
         return found
@@ -136,8 +136,8 @@ class Problem:
         """Return an experiment on it, with the paper's algorithm and the reference of its baselines.
 
         Args:
-            *arguments: what follows the task in :class:`.evaluate.Experiment`.
-            **fields: likewise.
+            *arguments: arguments of :class:`.evaluate.Experiment` after the task.
+            **fields: fields of :class:`.evaluate.Experiment`.
         """
         known = self.baselines
         experiment = Experiment(self.task, *arguments, **fields)
@@ -154,11 +154,11 @@ class Problem:
         """Run competitors over the same episodes, with the paper's algorithm and the reference of its baselines.
 
         Args:
-            competitors: by their names, as of :func:`.evaluate.run_experiment`.
+            competitors: makers by name, as of :func:`.evaluate.run_experiment`.
             *arguments: of :meth:`experiment`.
             progress: as of :func:`.evaluate.run_experiment`.
-            workers: likewise.
-            **keywords: of :meth:`experiment` what :data:`.evaluate.OPTIONS` names; parameters of the task.
+            workers: as of :func:`.evaluate.run_experiment`.
+            **keywords: fields of :meth:`experiment` that :data:`.evaluate.OPTIONS` names, and parameters of the task.
         """
         options = {name: keywords.pop(name) for name in OPTIONS if name in keywords}
         experiment = self.experiment(*arguments, **options, keywords=keywords)
@@ -167,7 +167,7 @@ class Problem:
 
 
 def problem_of(id: str) -> Problem:
-    """Return the problem of an environment id, and import nothing.
+    """Return the problem of an environment id without importing a module.
 
     Raises:
         ValueError: for an unknown environment.

@@ -1,5 +1,5 @@
-"""What a task of state-space models is compared with: the filter as written, other filters of the same model, and the
-filter that is told the true model.
+"""Baselines of a task of state-space models: the filter as written, other filters of the same model, and the filter
+that is given the true model.
 """
 
 import math
@@ -23,9 +23,9 @@ from ..filters.ordered_sums import ordered_sum
 from .table import Baselines, tunable
 
 NOISE = "_noise"
-"""Ends the name of a factor on R of a sensor, or on a source of Q."""
+"""Ending of the name of a factor on R of a sensor, or on a source of Q."""
 UNCERTAIN = 1e-9
-"""Of Q, added to the initial covariance of sigma points: they need a positive definite one."""
+"""Share of Q that is added to the initial covariance of sigma points, which must be positive definite."""
 
 
 class StateSpaceKalman(ConstantPolicy):
@@ -47,7 +47,7 @@ class CovarianceMatching(Policy):
         self.nis, self.last, self.available = (model.reader(n) for n in ("nis", "last_action", "available"))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Take a step from the last action."""
+        """Change the last action by a step."""
         degrees = numpy.sum(self.available(observation), axis=1)
         excess = numpy.minimum(self.nis(observation)[:, 0], 5.0 * degrees) - degrees
         process = numpy.clip(self.last(observation)[:, 0] + self.step * excess, -1.0, 1.0)
@@ -65,7 +65,6 @@ class StateSpaceInteractingMultipleModel(ConstantPolicy):
 
 
 def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
-    """How well a measurement was predicted; NaN where nothing was received."""
     degrees = ordered_sum(available)
     there = degrees > 0.0
     return Likelihood(
@@ -75,52 +74,52 @@ def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
     )
 
 
-def _numbers(measurement: StateSpaceMeasurement, xp: Any) -> Array:
-    """Values with zero in place of what was not received."""
+def _zero_missing(measurement: StateSpaceMeasurement, xp: Any) -> Array:
+    """Return the values with zero in place of missing ones."""
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
 
 class Past(NamedTuple):
-    """A measurement that something may still come for."""
+    """A measurement in the buffer, for which late values may still arrive."""
 
     measurement: StateSpaceMeasurement
     truth: Any
-    """What a reference was told with it; None for everyone else."""
+    """Truth given to a reference with it; None for other filters."""
     happened: Array
-    """Whether there was one, and not only the start, ``(N,)``."""
+    """Whether it is a measurement, not a place before the start, ``(N,)``."""
 
 
 class Buffered(NamedTuple):
-    """A filter with the last measurements, which are taken in again when one of them is supplied late."""
+    """A filter with its last measurements, which are processed again when one of them arrives late."""
 
     now: Any
-    """State of the filter after all that has come."""
+    """State of the filter after all received measurements."""
     settled: Any
-    """State before the oldest measurement that is kept."""
+    """State before the oldest measurement in the buffer."""
     past: tuple[Past, ...]
-    """The measurements since, the oldest first, as many as one may come late."""
+    """Measurements since, the oldest first, as many as the largest lateness."""
 
     @property
     def mean(self) -> Array:
-        """Of the filter."""
+        """Mean of the filter."""
         mean: Array = self.now.mean
         return mean
 
     @property
     def covariance(self) -> Array:
-        """Of its error."""
+        """Covariance of its error."""
         covariance: Array = self.now.covariance
         return covariance
 
     @property
     def likelihood(self) -> Likelihood:
-        """Of the last measurement, as it was predicted with all that had come."""
+        """Likelihood of the last measurement, predicted with all measurements received before it."""
         likelihood: Likelihood = self.now.likelihood
         return likelihood
 
 
 def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
-    """The start of a filter, with an empty buffer where something may come late."""
+    """Return the start of a filter, with an empty buffer where measurements may arrive late."""
     if not task.parameters.late:
         return begun
     own, none = task.definition, 0.0 * begun.mean[0]
@@ -139,13 +138,14 @@ def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
 def _in_order(
     state: Any, measurement: StateSpaceMeasurement, step: Callable[..., Any], truth: Any = None
 ) -> Any:
-    """Take a measurement in; where something comes late with it, that first, where it belongs, and again what followed.
+    """Update with a measurement. Where a late one arrives with it, update with that first, in its place, and again with
+    those after it.
 
     Args:
-        state: of the filter, or a :class:`Buffered` one.
-        measurement: that has come.
-        step: from the filter's state and a :class:`Past` to the state after it.
-        truth: what else a step is told of it.
+        state: state of the filter, or a :class:`Buffered` one.
+        measurement: the received one.
+        step: function of the filter's state and a :class:`Past` that returns the state after it.
+        truth: truth given to the step of a reference.
     """
     if not isinstance(state, Buffered):
         return step(state, Past(measurement, truth, None))
@@ -153,7 +153,7 @@ def _in_order(
     (oldest, *others), late = state.past, measurement.late_available
     assert late is not None
     first = oldest.measurement
-    both = xp.where(late > 0.0, measurement.late, _numbers(first, xp)), xp.maximum(first.available, late)
+    both = xp.where(late > 0.0, measurement.late, _zero_missing(first, xp)), xp.maximum(first.available, late)
     oldest = oldest._replace(measurement=first._replace(values=both[0], available=both[1]))
     alone = measurement._replace(late=None, late_available=None)
     past = (*others, Past(alone, truth, late[0] >= 0.0))
@@ -167,7 +167,7 @@ def _in_order(
 class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
     """The Kalman filter as written, extended where the model is not linear, as an estimator.
 
-    A late measurement is taken in where it belongs.
+    A late measurement is processed in its place.
 
     Args:
         task: the problem.
@@ -186,15 +186,15 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         self.sensor_factors: tuple[Any, dict[str, Any]] = measurement_noise, of_sensors
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
-        """Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
+        """Return Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.factor * self.equations.process_noise(mean, measurement, self.of_sources)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
-        """R with its factors at a predicted mean ``(n, N)``, ``(m, m, N)`` or ``(m, m, 1)``."""
+        """Return R with its factors at a predicted mean ``(n, N)``, ``(m, m, N)`` or ``(m, m, 1)``."""
         return self.equations.sensor_noise(mean, measurement, *self.sensor_factors)
 
     def start(self, initial: Initial) -> Any:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun)
 
@@ -203,7 +203,7 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         return _in_order(state, given.measurement, self.take)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
-        """Predict to a measurement and take it in."""
+        """Predict to a measurement and update with it."""
         measurement = one.measurement
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         Q = self.process_noise(mean, measurement)
@@ -217,7 +217,7 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
 def _update(
     equations: Equations, mean: Array, P: Array, R: Array, measurement: StateSpaceMeasurement, xp: Any
 ) -> kalman.Update:
-    received = equations.receive(measurement._replace(values=_numbers(measurement, xp)), mean, R)
+    received = equations.receive(measurement._replace(values=_zero_missing(measurement, xp)), mean, R)
     return update_with_gain(mean, P, received, equations.gain(P, received))
 
 
@@ -229,7 +229,7 @@ class ExtendedSmoother(Extended):
         task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
-        lag: how many later measurements each estimate uses; default: all of them.
+        lag: number of later measurements that each estimate uses; default: all of them.
         **noises: as of :class:`Extended`.
     """
 
@@ -249,7 +249,7 @@ class ExtendedSmoother(Extended):
     def smooth(
         self, measurements: Sequence[StateSpaceMeasurement], states: Sequence[Any]
     ) -> tuple[Array, Array]:
-        """Smooth the whole track, or with the lag."""
+        """Smooth the whole track, or with the fixed lag."""
         measured, memories = scans.stack_scans(measurements), scans.stack_scans(states)
         if isinstance(memories, Buffered):
             measured = _put_in_order(measured, self.task.parameters.lateness, self.xp)
@@ -260,12 +260,12 @@ class ExtendedSmoother(Extended):
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
 
     def _filter_in_order(self, settled: EstimateState, measured: StateSpaceMeasurement) -> EstimateState:
-        """Estimates at the start and at K measurements with what came late.
+        """Return the estimates at the start and at K measurements, with late measurements in their places.
 
         Args:
-            settled: what they were ``lateness`` measurements before the start and before each measurement, at least
-                those at the start, ``(..., K + 1, N)``.
-            measured: in order, ``(..., K, N)``.
+            settled: estimates ``lateness`` measurements before the start and before each measurement, at least those at
+                the start, ``(..., K + 1, N)``.
+            measured: measurements in order, ``(..., K, N)``.
         """
         K = measured.available.shape[-2]
         known = max(K - self.task.parameters.lateness, 0)
@@ -279,7 +279,6 @@ class ExtendedSmoother(Extended):
         return scans.join(found)
 
     def _motion(self, mean: Array, measurement: StateSpaceMeasurement) -> smoothing.Motion:
-        """How the state moves from a mean ``(n, N)`` to a measurement."""
         equations, each = self.equations, 0.0 * mean[0]
         predicted = equations.move(mean, measurement)
         noise = equations.input_noise(mean, measurement) + self.process_noise(predicted, measurement)
@@ -289,8 +288,8 @@ class ExtendedSmoother(Extended):
 
 
 def _put_in_order(measured: StateSpaceMeasurement, lateness: int, xp: Any) -> StateSpaceMeasurement:
-    """Measurements ``(..., K, N)`` with what came late among those that it belongs to."""
-    plain = measured._replace(values=_numbers(measured, xp), late=None, late_available=None)
+    """Return the measurements ``(..., K, N)`` with late values in their places."""
+    plain = measured._replace(values=_zero_missing(measured, xp), late=None, late_available=None)
     assert measured.late is not None
     assert measured.late_available is not None
     late, late_available = (values[:, lateness:] for values in (measured.late, measured.late_available))
@@ -319,11 +318,11 @@ class Unscented(Extended):
         self.uncertain: Array = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Any:
-        """Start where everyone starts, nowhere certain."""
+        """Start from the initial estimate, with a positive definite covariance."""
         return super().start(initial._replace(covariance=initial.covariance + self.uncertain))
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
-        """Predict to a measurement and take it in by sigma points."""
+        """Predict to a measurement and update with it by sigma points."""
         measurement = one.measurement
         own = self.equations
         motion, points = own.continuous_motion(state.mean, state.covariance, measurement)
@@ -333,7 +332,7 @@ class Unscented(Extended):
         result = unscented_update(
             mean,
             P,
-            _numbers(measurement, self.xp),
+            _zero_missing(measurement, self.xp),
             h,
             own.measured_noise(self.sensor_noise(mean, measurement), mean, measurement),
             measurement.available,
@@ -357,28 +356,28 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
         self.bank: MultipleModelBank = MultipleModelBank(task, "evidence", *factors, *_split(task, noises))
 
     def start(self, initial: Initial) -> Any:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         return _buffer(self.task, self.bank.start(initial))
 
     def update(self, state: Any, given: FilterInput) -> Any:
-        """Predict and update, without evidence."""
+        """Predict and update, without evidence of an action."""
         return _in_order(state, given.measurement, self.take)
 
     def take(self, state: Mixture, one: Past) -> Mixture:
-        """Predict to a measurement and take it in."""
-        measurement = one.measurement._replace(values=_numbers(one.measurement, self.xp))
+        """Predict to a measurement and update with it."""
+        measurement = one.measurement._replace(values=_zero_missing(one.measurement, self.xp))
         predicted = self.bank.predict(state, measurement)
         return self.bank.act(predicted, measurement, 0.0 * predicted.action)
 
     def records(self, state: Any, measurement: StateSpaceMeasurement) -> dict[str, Array]:
-        """How likely the measurement was."""
+        """Return the likelihood of the measurement."""
         own = state.now if isinstance(state, Buffered) else state
         return {"log_likelihood": self.bank.records(own, measurement)["log_likelihood"]}
 
 
 class KnownModel:
-    """The Kalman filter, extended where the model is not linear, that is told the true model: functions, Q and R of
-    this episode, and which hypothesis holds.
+    """The Kalman filter, extended where the model is not linear, that is given the true model: functions, Q and R of
+    this episode, and the true hypothesis.
     """
 
     kind = "reference"
@@ -390,24 +389,23 @@ class KnownModel:
         self.xp: ModuleType = task.xp
 
     def start(self, initial: Initial, truth: StateSpaceTruth) -> Any:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
-        return _buffer(self.task, begun, self._told(truth))
+        return _buffer(self.task, begun, self._model_truth(truth))
 
     def update(
         self, memory: Any, measurement: StateSpaceMeasurement, truth: StateSpaceTruth
     ) -> tuple[Array, Array, Any, Likelihood]:
         """Predict and update with the model in force."""
-        after = _in_order(memory, measurement, self.take, self._told(truth))
+        after = _in_order(memory, measurement, self.take, self._model_truth(truth))
         return after.mean, after.covariance, after, after.likelihood
 
     @staticmethod
-    def _told(truth: StateSpaceTruth) -> StateSpaceTruth:
-        """What is needed of it."""
+    def _model_truth(truth: StateSpaceTruth) -> StateSpaceTruth:
         return truth._replace(state=None, inputs=None, sensors=None, waiting=None)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
-        """Predict to a measurement and take it in."""
+        """Predict to a measurement and update with it."""
         (measurement, truth, _), xp, chosen = one, self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.is_switching else world.equations[:1]):
@@ -426,10 +424,10 @@ class KnownModel:
 
 
 def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Factors by the names of the sources of Q, and by those of the sensors.
+    """Return the factors by the names of the sources of Q, and by those of the sensors.
 
     Raises:
-        ValueError: for what is neither.
+        ValueError: for a name that is neither.
     """
     named = {name.removesuffix(NOISE): factor for name, factor in noises.items()}
     sources = task.definition.filters[0].sources
@@ -442,7 +440,7 @@ def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any],
 
 
 def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
-    """What is tuned: lower limit, value without tuning, upper limit."""
+    """Return the tuned factors: lower limit, value without tuning, upper limit."""
 
     def names(of: Iterable[str], else_all: str) -> list[str]:
         several = [name + NOISE for name in of]
@@ -457,10 +455,10 @@ def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
 
 
 def state_space_baselines(task: type[StateSpace]) -> Baselines:
-    """What a task is compared with.
+    """Return the baselines of a task.
 
     Args:
-        task: its class.
+        task: class of the task.
     """
     several = len(task.definition.filters) > 1
     linear = all(model.is_linear for model in task.definition.filters)

@@ -1,4 +1,4 @@
-"""What stands in an environment's table of baselines."""
+"""Table of baselines of an environment."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # it takes xarray, and `import filtergym` does not
 
 @dataclass(frozen=True)
 class Tunable:
-    """What can be tuned in a policy or an estimator, and what a choice of values means."""
+    """The tunable values of a policy or an estimator, and how to apply them."""
 
     control: str | None
     """The control of the policy; None for an estimator."""
@@ -29,19 +29,20 @@ class Tunable:
     start: Mapping[str, float]
     """The values in force without tuning."""
     apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Any]]]
-    """From values to keywords of the task and what makes the policy or estimator for it."""
+    """Function from values to keywords of the task and the maker of the policy or estimator for it."""
     in_lanes: bool = True
     """Whether values may be arrays ``(N,)``, one for each episode: candidates are then tried side by side."""
     beyond: Mapping[str, float] = field(default_factory=dict)
-    """How far beyond its limits a value of a file may lie: where a recording sets the limits, those of another one."""
+    """How far beyond its limits a value of a file may lie, since the limits of another recording may have been
+    wider."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Of the values, without their logarithm; what is not named is a pure number."""
+    """Units of the values, without their logarithm; a value without an entry is a pure number."""
     likelihood: bool = False
-    """Whether a search weighs the density of the truth beside the cost: a filter with few hypotheses costs least where
-    it claims more than it knows."""
+    """Whether a search weighs the density of the truth in addition to the cost: a filter with few hypotheses costs
+    least where its covariance is too small."""
     anchored: bool = False
-    """Whether a second sensor tells it the motion, so that it can tell errors that last from motion. It is fitted to
-    measurements some time apart, and compared with others on these (:mod:`.advice`)."""
+    """Whether it uses a second sensor of the motion, with which it distinguishes lasting errors from motion. Advice
+    fits it to measurements some time apart, and compares it with other filters on these (:mod:`.advice`)."""
 
 
 def tunable(
@@ -55,7 +56,7 @@ def tunable(
     Args:
         make: its class, or a :class:`Variant`.
         apply: as in :class:`Tunable`; default: every value is a keyword of ``make``. A value whose name begins with
-            ``log10_`` is the logarithm of the keyword: its size is not known beforehand.
+            ``log10_`` is the logarithm of the keyword, for a keyword of unknown order of magnitude.
         **values: lower limit, value in force without tuning, upper limit.
     """
 
@@ -82,11 +83,11 @@ def without_logarithms(values: Mapping[str, float]) -> dict[str, float]:
 class Variant(functools.partial[Any]):
     """A competitor's class with some of its arguments given, and a description of its own.
 
-    It shows the attributes of the class, such as ``control`` and ``kind``.
+    It has the attributes of the class, such as ``control`` and ``kind``.
     """
 
     def __new__(cls, make: Callable[..., Any], description: str = "", /, **arguments: Any) -> "Variant":
-        """Give arguments to a class.
+        """Bind arguments of a class.
 
         Args:
             make: the class.
@@ -102,7 +103,7 @@ class Variant(functools.partial[Any]):
 
 
 class PaperAction(ConstantPolicy):
-    """The paper's algorithm as an action that never changes; subclasses name its control."""
+    """The paper's algorithm as a constant action; subclasses name its control."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -110,11 +111,11 @@ class PaperAction(ConstantPolicy):
 
 
 class ConstantMode(Policy):
-    """One of the modes, never changed.
+    """A policy that always chooses the same mode.
 
     Args:
-        model: in which it acts.
-        mode: its number; a negative one counts from the last.
+        model: the environment's model for the policy.
+        mode: number of the mode; a negative one counts from the last.
     """
 
     control = "mode"
@@ -125,68 +126,68 @@ class ConstantMode(Policy):
         self.mode: int = mode if mode >= 0 else len(model.task.modes) + mode
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Name the mode for every episode."""
+        """Return the mode for every episode."""
         return numpy.full(len(observation), self.mode), None
 
 
 @dataclass(frozen=True)
 class Baselines:
-    """What an environment is compared with: the table at the end of each module ``policies``."""
+    """Baselines of an environment: the table at the end of each module ``policies``."""
 
     environment: str
     """Gymnasium id."""
     policies: Mapping[str, Callable[[Any], Policy]]
     references: Mapping[str, Any] = field(default_factory=dict)
-    """Classes that keep the protocol :class:`.Reference`."""
+    """Classes that implement the protocol :class:`.Reference`."""
     bounds: Mapping[str, Any] = field(default_factory=dict)
-    """Classes that keep the protocol :class:`.Bound`."""
+    """Classes that implement the protocol :class:`.Bound`."""
     estimators: Mapping[str, Any] = field(default_factory=dict)
-    """Classes that keep the protocol :class:`.Estimator`."""
+    """Classes that implement the protocol :class:`.Estimator`."""
     smoothers: Mapping[str, Any] = field(default_factory=dict)
-    """Classes that keep the protocol :class:`.Smoother`: estimators that use later measurements."""
+    """Classes that implement the protocol :class:`.Smoother`: estimators that use later measurements."""
     score_paper: str = ""
     """The policy whose score is 0."""
     stronger_paper: str = ""
-    """Another reading of the paper's algorithm, of less cost: where it takes part, costs are compared with it, and its
-    score is 0."""
+    """Another reading of the paper's algorithm, of less cost: where it takes part, it replaces the paper's as the base
+    of costs and has score 0."""
     score_reference: str = ""
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()
-    """Names that the quick benchmark runs, in the order of the table."""
+    """Names in the quick benchmark, in the order of the table."""
     compared: tuple[str, ...] = ()
-    """Untuned policies that learned agents are compared with, beside the paper's and the tuned ones."""
+    """Untuned policies that learned agents are compared with, in addition to the paper's and the tuned ones."""
     physical: tuple[str, str] = ("rmse", "position")
-    """Metric and component that the comparison shows beside the cost."""
+    """Metric and component that the comparison shows in addition to the cost."""
     measurement_seconds: float = 5e-6
-    """Time that a policy takes for one measurement, on one core; dear environments get fewer episodes in the
-    full benchmark."""
+    """Time that a policy takes for one measurement, on one core; slow environments get fewer episodes in the full
+    benchmark."""
     headline_episodes: int = 0
-    """Episodes of the training distribution at least where a benchmark is asked for narrow intervals; of costs whose
-    tails are heavy many."""
+    """Smallest number of episodes of the training distribution in a benchmark with narrow intervals; costs with heavy
+    tails need many."""
     tunable: Mapping[str, Tunable] = field(default_factory=dict)
     """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
     log_families: "Callable[[Recording | None], Mapping[str, Tunable]] | None" = None
-    """Estimators that are fitted to a recording, with limits that suit it (None: any recording); without this function
+    """Function of a recording (None: any) that returns the estimators to fit to it, with limits that suit it; default:
     those of ``tunable``."""
     best_constant: str = ""
-    """The tunable policy that stands for the best constant action in the room table."""
+    """Tunable policy that represents the best constant action in the table of the room for improvement."""
     metrics: "OwnMetrics | None" = None
-    """The environment's own."""
+    """Metrics of the environment, in addition to the general ones."""
 
     fallback: str = ""
-    """Policy or estimator that answers where an agent behind a gate is not trusted. Of the classical filters that are
-    neither tuned on the training distribution nor given it as a prior, since they answer where training does not reach,
-    the one of least cost on its validation split; of those within 1 % of the paper's cost the quickest. Empty: the
-    paper's algorithm."""
+    """Policy or estimator that replaces an agent behind a gate while the agent is not trusted. It is a classical filter
+    that is neither tuned on the training distribution nor given it as a prior, since it acts outside the training
+    distribution: the one of least cost on the validation split; of those within 1 % of the paper's cost the quickest.
+    Empty: the paper's algorithm."""
     alarm: Callable[[Any], Alarm] | None = None
-    """Class that says from observations that something is wrong, for any control; None: the general one."""
+    """Class of the alarm that detects faults from observations, for any control; None: :class:`.InnovationAlarm`."""
 
     @property
     def compared_paper(self) -> str:
-        """The reading of the paper's algorithm that costs are compared with where all of them take part."""
+        """Reading of the paper's algorithm that is the base of costs where all readings take part."""
         return self.stronger_paper or self.score_paper
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every name, policies first."""
+        """All names, policies first."""
         return (*self.policies, *self.estimators, *self.smoothers, *self.references, *self.bounds)

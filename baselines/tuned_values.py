@@ -1,4 +1,4 @@
-"""Tuned values of policies and estimators as they are stored: one's own in ``tuned/``, and those that are shipped."""
+"""Stored tuned values of policies and estimators: the user's in ``tuned/``, and the shipped ones."""
 
 import json
 import math
@@ -15,9 +15,9 @@ from ..evaluation.storage.stored import fits, read_json
 from .table import Tunable
 
 FOLDER = Path("tuned")
-"""Where tuned values of one's own are kept, below the working directory."""
+"""Folder of the user's tuned values, below the working directory."""
 PATIENCE = 60.0
-"""s for which a search waits to put its values beside those of another one that ends at the same time."""
+"""Time for which a search waits for another one that writes the same file, s."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Tuned:
     scenario: str
     values: dict[str, float]
     cost: float
-    """Geometric mean of the costs of episodes of the validation split; where likelihood counts, see
+    """Geometric mean of the costs of episodes of the validation split; where the search weighs the likelihood, see
     :mod:`.tuning`, divided by that of the densities."""
     untuned_cost: float
     environment_steps: int
@@ -44,11 +44,11 @@ class TunedPolicy:
     control: str | None
     make: Callable[[Any], Any]
     content: str
-    """All that it is made of, in words: what is equal in these is compiled once."""
+    """Text that identifies the code and values; competitors with equal text are compiled once."""
     anchored: bool = False
-    """As of :class:`.Tunable`: it takes what only recordings hold."""
+    """As of :class:`.Tunable`: it uses a second sensor, which only recordings contain."""
     tunable: Tunable | None = None
-    """What takes the values, where it is known."""
+    """Declaration of the tuned values, where it is known."""
     values: Mapping[str, float] = field(default_factory=dict)
 
     def __eq__(self, other: object) -> bool:
@@ -59,7 +59,7 @@ class TunedPolicy:
 
     @property
     def kind(self) -> Kind:
-        """What it makes."""
+        """Kind of the competitor that it makes."""
         return "policy" if self.control else "estimator"
 
     def __call__(self, problem: Any) -> Any:
@@ -69,16 +69,15 @@ class TunedPolicy:
 
 @dataclass(frozen=True)
 class TunedValues:
-    """What is stored of an environment's policies and estimators; files are read when they are asked for."""
+    """Stored values of an environment's policies and estimators; files are read on first use."""
 
     environment: str
     """Gymnasium id."""
     tunable: Mapping[str, Tunable]
     places: Sequence[Any]
-    """Files of tuned values, one's own first."""
+    """Files of tuned values, the user's first."""
 
     def _tables(self) -> Iterator[tuple[Any, dict[str, dict[str, Any]]]]:
-        """Files and what they say."""
         for place in self.places:
             yield place, read_table(place)
 
@@ -87,21 +86,21 @@ class TunedValues:
         tables = [table for _, table in self._tables()]
         return [f"{policy}-tuned" for policy in self.tunable if any(policy in table for table in tables)]
 
-    def has_won(self, policy: str) -> bool:
-        """Whether the stored values of a policy are others than those in force without tuning, which a search keeps
-        where nothing beats them.
+    def is_improved(self, policy: str) -> bool:
+        """Return whether the stored values of a policy differ from those without tuning: a search stores the latter
+        where it finds no better ones.
         """
         start = {name: round_value(value) for name, value in self.tunable[policy].start.items()}
         return self.values(policy)[0] != start
 
     def best_policy(self, control: str | None = None) -> str | None:
-        """Return ``NAME-tuned`` of the policy that cost least on the validation split; None if none was tuned.
+        """Return ``NAME-tuned`` of the policy of least cost on the validation split; None if none was tuned.
 
         Args:
-            control: only policies of this control; estimators have none and are left out anyway.
+            control: only policies of this control; estimators have no control and are excluded.
         """
         entries: dict[str, dict[str, Any]] = {}
-        for _, table in reversed(list(self._tables())):  # one's own go before those that are shipped
+        for _, table in reversed(list(self._tables())):  # the user's take precedence over the shipped ones
             entries |= table
         found = {
             f"{policy}-tuned": entries[policy].get("validation_cost", math.inf)
@@ -111,10 +110,10 @@ class TunedValues:
         return min(found, key=lambda name: found[name], default=None)
 
     def values(self, policy: str) -> tuple[dict[str, float], str]:
-        """Return tuned values and the file in which they stand.
+        """Return tuned values and their file.
 
         Raises:
-            ValueError: if the policy was never tuned, or the file that should say so is broken.
+            ValueError: if the policy was never tuned, or its file is broken.
         """
         for place, table in self._tables():
             if policy in table:
@@ -133,7 +132,7 @@ class TunedValues:
             ) from error
 
     def competitor(self, policy: str) -> TunedPolicy:
-        """Return what makes a policy or estimator with its stored values.
+        """Return the maker of a policy or estimator with its stored values.
 
         Raises:
             ValueError: if it cannot be tuned, or never was.
@@ -146,14 +145,14 @@ class TunedValues:
 
 
 def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
-    """Check what a file says of a policy or estimator as if it were typed.
+    """Validate the values of a policy or estimator that were read from a file.
 
     Args:
-        values: from the file.
-        tunable: what takes them.
+        values: values from the file.
+        tunable: declaration of the values.
 
     Returns:
-        The same, by the names of the parameters.
+        The values by the names of the parameters.
 
     Raises:
         ValueError: if they are not a number for each parameter, within its limits.
@@ -164,7 +163,7 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
             f"it must give a number for each of {', '.join(limits)}, got {quote_shortened(values)}"
         )
     for name, (low, high) in limits.items():
-        # Values are stored rounded, so that one at a limit can lie just beyond it.
+        # Stored values are rounded, so that one at a limit can lie just beyond it.
         beyond = tunable.beyond.get(name, 0.0)
         if not min(low, round_value(low)) - beyond <= values[name] <= max(high, round_value(high)) + beyond:
             raise ValueError(
@@ -175,12 +174,12 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
 
 
 def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) -> TunedPolicy:
-    """Return what makes a policy or estimator with these values.
+    """Return the maker of a policy or estimator with these values.
 
     Args:
-        name: of environment and policy; the same name means the same code.
-        tunable: what takes the values.
-        values: by name.
+        name: name of environment and policy; the same name means the same code.
+        tunable: declaration of the values.
+        values: values by name.
     """
     keywords, make = tunable.apply(values)
     content = f"{name} {sorted(values.items())!r}"
@@ -188,12 +187,12 @@ def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) 
 
 
 def round_value(value: float) -> float:
-    """Six digits, as tuned values are stored."""
+    """Round a value to six digits, as in stored tuned values."""
     return float(f"{value:.6g}")
 
 
 def read_table(place: Any) -> dict[str, dict[str, Any]]:
-    """Return what a file says of tuned policies; nothing if there is none.
+    """Return the table of tuned policies in a file; empty if there is no file.
 
     Raises:
         ValueError: if it is not such a file.
@@ -208,15 +207,15 @@ def read_table(place: Any) -> dict[str, dict[str, Any]]:
 
 
 def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
-    """Put tuned values into the environment's file in a folder, which is returned.
+    """Write tuned values to the environment's file in a folder, and return its path.
 
     Args:
-        outcome: of a search.
-        command: that made it.
-        folder: of such files.
+        outcome: outcome of a search.
+        command: command of the search.
+        folder: folder of such files.
 
     Raises:
-        ValueError: if the file cannot be written, or holds something else.
+        ValueError: if the file cannot be written, or is not a table of tuned policies.
     """
     path = table_path(outcome.environment, folder)
     found = {
@@ -235,5 +234,5 @@ def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
 
 
 def table_path(id: str, folder: Path = FOLDER) -> Path:
-    """File of an environment's tuned values in a folder."""
+    """Return the file of an environment's tuned values in a folder."""
     return folder / f"{short_name(id)}.json"

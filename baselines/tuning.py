@@ -1,14 +1,14 @@
-"""Tuning of classical competitors on training episodes, so that nothing learned is compared with a straw man.
+"""Tuning of classical competitors on training episodes, so that learned agents are compared with tuned ones.
 
 The search is SciPy's differential evolution over the limits that a policy declares, started from its untuned
-values; every candidate meets the same episodes of the training split, so differences are not noise. Costs are geometric
-means over the episodes, so that no lost track decides. Where the declaration says so (:attr:`.Tunable.likelihood`), the
-cost of an episode is divided by the density of the truth: with mean cost c and mean log-density l of n components
+values; every candidate runs on the same episodes of the training split, so differences are not noise. Costs are
+geometric means over the episodes, so that a lost track does not dominate. With :attr:`.Tunable.likelihood`, the cost of
+an episode is divided by the density of the truth: with mean cost c and mean log-density l of n components
 
     log c - l / n                                                                                                  (1)
 
-is least, averaged over episodes, for what is accurate and says how accurate. The best candidate is kept only if it
-beats the untuned values significantly on episodes of the validation split.
+is least, averaged over episodes, for an accurate estimate with an honest covariance. The best candidate replaces the
+untuned values only if it beats them significantly on episodes of the validation split.
 """
 
 import json
@@ -36,7 +36,7 @@ from .table import Tunable
 from .tuned_values import Tuned, round_value
 
 FEWEST = 16
-"""Episodes that a process is given at once: of fewer the work is less than what sending it takes."""
+"""Smallest number of episodes of a chunk for another process: fewer cost less than their transfer."""
 
 
 def _report_cost(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
@@ -59,13 +59,13 @@ class Candidate(NamedTuple):
 
 
 def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
-    """What the search weighs of every episode, ``(episodes,)``: its mean cost, or where likelihood counts (1), as a
+    """Return the cost of every episode for the search, ``(episodes,)``: its mean cost, or with likelihood (1) as a
     factor.
     """
     keywords, make = candidate.tunable.apply(candidate.values)
     cls, control = candidate.problem.task, candidate.tunable.control
     model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
-    # Made already, so that no filter is compiled for a candidate that is tried once.
+    # An instance, not a maker: no filter is compiled for a candidate that runs once.
     competitor = make(model if control else model.task)
     report = _report_cost_and_likelihood if candidate.tunable.likelihood else _report_cost
     found = run_competitor(model, competitor, kind_of(competitor), candidate.seeds, report)
@@ -76,7 +76,7 @@ def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
 
 
 def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy.ndarray:
-    """What the search weighs of a candidate in each of its episodes, ``(episodes,)``; the workers share them."""
+    """Return the cost of a candidate in each of its episodes, ``(episodes,)``, computed by the workers."""
     workers, seeds = check_workers(workers), candidate.seeds
     share = max(FEWEST, -(-len(seeds) // workers.width))
     pieces = [candidate._replace(seeds=seeds[i : i + share]) for i in range(0, len(seeds), share)]
@@ -85,40 +85,42 @@ def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy
 
 
 def geometric_cost(costs: numpy.ndarray) -> float:
-    """Geometric mean of the costs of episodes."""
+    """Return the geometric mean of the costs of episodes."""
     return float(numpy.exp(numpy.log(costs).mean()))
 
 
 def is_better(costs: numpy.ndarray, others: numpy.ndarray) -> bool:
-    """Whether costs are significantly lower than others on the same episodes, by the geometric mean of their ratios."""
+    """Return whether costs are significantly lower than others on the same episodes, by the geometric mean of their
+    ratios.
+    """
     return Bootstrap(len(costs)).estimate(numpy.log(costs / others)).high < 0.0
 
 
 @dataclass(frozen=True)
 class Search:
-    """How the values of a policy are searched."""
+    """Options of a search for the values of a policy."""
 
     budget: int
     """Environment steps (decisions, as in training) to spend on candidates."""
     scenario: str | None = None
     """A training scenario; None: the environment's own."""
     seed: int = 0
-    """Of the training episodes and of the search."""
+    """Seed of the training episodes and of the search."""
     episodes: int = 256
-    """Training episodes that every candidate meets."""
+    """Number of training episodes of every candidate."""
     confirming: int = 2048
-    """Validation episodes on which the best candidate has to beat the untuned values."""
+    """Number of validation episodes on which the best candidate has to beat the untuned values."""
     backend: str = "auto"
-    """What computes the steps, see :func:`~.envs.backend.task_on`."""
+    """Backend of the steps, see :func:`~.envs.backend.task_on`."""
 
 
 class _Generations:
     """Candidates of a search, and the best of them so far.
 
     Args:
-        tunable: what is searched.
-        allowed: candidates that the budget is enough for.
-        measure: cost of a candidate's values.
+        tunable: declaration of the searched values.
+        allowed: number of candidates within the budget.
+        measure: returns the cost of a candidate's values.
     """
 
     def __init__(
@@ -129,7 +131,7 @@ class _Generations:
         self.best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
 
     def cost(self, vector: numpy.ndarray) -> float:
-        """Cost of a candidate; infinite when the budget is spent."""
+        """Return the cost of a candidate; infinite when the budget is spent."""
         if self.spent >= self.allowed:
             return math.inf
         values = dict(zip(self.tunable.limits, map(float, vector), strict=True))
@@ -139,7 +141,7 @@ class _Generations:
         return cost
 
     def run(self, population: int, generator: numpy.random.Generator) -> dict[str, float]:
-        """Let generations follow each other until the budget is spent; return the best values."""
+        """Run generations until the budget is spent; return the best values."""
         from scipy.optimize import differential_evolution
 
         limits = list(self.tunable.limits.values())
@@ -185,15 +187,15 @@ def tune(
     """Search a policy's values.
 
     Args:
-        problem: whose policy it is.
+        problem: problem of the policy.
         policy: name of a tunable one.
-        search: how its values are searched.
-        progress: told of environment steps done.
-        workers: who shares the episodes of a candidate; candidates follow each other, since the search learns from
-            each. Default: this process.
-        store: keeps the costs of candidates until the search has ended, from which a second call goes on: begun again,
-            a search asks for the same candidates. Nothing is kept of an environment of one's own, whose code may have
-            changed meanwhile. Default: nothing is kept.
+        search: options of the search.
+        progress: called with the number of environment steps done.
+        workers: processes that share the episodes of a candidate; candidates run one after another, since the search
+            uses the results of each. Default: this process.
+        store: stores the costs of candidates until the search has ended, so that a second call continues an interrupted
+            search: it evaluates the same candidates. Costs of a user's environment are not stored, since its code may
+            have changed. Default: no costs are stored.
 
     Raises:
         ValueError: for a policy that cannot be tuned, a held-out scenario, a budget too small for one generation, or a
@@ -213,7 +215,7 @@ def tune(
             f"the search needs at least {2 * population}: give {2 * population * steps} steps"
         )
     store = store or Store()
-    asked = _search_content(problem, search, tunable, chosen)
+    content = _search_content(problem, search, tunable, chosen)
 
     def candidate(values: Mapping[str, float], seeds: Sequence[int]) -> Candidate:
         return Candidate(problem, chosen.name, tunable, values, seeds, search.backend)
@@ -222,7 +224,7 @@ def tune(
 
     def measure(values: Mapping[str, float]) -> float:
         name = f"{short_name(problem.id)}.{policy}"
-        work = Work(name, json.dumps([*asked, values])) if problem.shipped else None
+        work = Work(name, json.dumps([*content, values])) if problem.shipped else None
         cost = store.result(
             work, float, lambda: geometric_cost(episode_costs(candidate(values, train), workers))
         )
@@ -231,7 +233,7 @@ def tune(
 
     generations = _Generations(tunable, evaluations, measure)
     values = generations.run(population, numpy.random.default_rng(search.seed))
-    # A winner among many candidates on the training episodes is flattered by them: ask fresh episodes.
+    # The cost of the best of many candidates is optimistic on the training episodes: evaluate it on fresh ones.
     fresh = episode_seeds("validation", search.seed, search.confirming)
     before = episode_costs(candidate(tunable.start, fresh), workers)
     after = episode_costs(candidate(values, fresh), workers)
@@ -244,7 +246,7 @@ def tune(
 
 
 def _search_content(problem: Problem, search: Search, tunable: Tunable, scenario: Scenario) -> list[Any]:
-    """All that the cost of a candidate depends on beside its values and the code."""
+    """Return everything that determines the cost of a candidate in addition to its values and the code."""
     limited = {name: list(limit) for name, limit in tunable.limits.items()}
     how = [search.seed, search.episodes, search.backend, tunable.likelihood]
     return [problem.id, scenario.name, limited, dict(tunable.start), *how]

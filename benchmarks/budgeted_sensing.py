@@ -1,12 +1,12 @@
-"""Whom to look at: baselines of docs/examples/budgeted_sensing.py on the same noise, what knows more, and a bound.
+"""Choice of the next target: baselines of docs/examples/budgeted_sensing.py on the same noise, references, and a bound.
 
     python benchmarks/budgeted_sensing.py > build/budgeted_sensing.txt
     python benchmarks/budgeted_sensing.py --agent runs/sensing-0 --agent runs/sensing-1
 
-Two tables in Markdown. The first is of episodes. The second takes the semi-Markov bank out of the question: covariances
-alone, of the Gauss-Markov course with the moments of the semi-Markov one, where nothing is random. There no schedule
-costs less than the best evenly spaced looks at each target by itself, at rates whose sum is one look a second (P.
-Whittle, Restless bandits, J. Applied Probability 25A (1988), 287-298: the relaxed problem and its multiplier).
+Two tables in Markdown. The first is of episodes. The second excludes the semi-Markov bank: it uses covariances alone,
+of the Gauss-Markov course with the moments of the semi-Markov one, without random quantities. There no schedule costs
+less than the best evenly spaced looks at each target by itself, at rates whose sum is one look a second (P. Whittle,
+Restless bandits, J. Applied Probability 25A (1988), 287-298: the relaxed problem and its multiplier).
 """
 
 import argparse
@@ -25,7 +25,7 @@ from filtergym.papers.grid import markdown_table
 sys.path.insert(0, str(Path(__file__).parent.parent / "docs" / "examples"))
 sensing = importlib.import_module("budgeted_sensing")
 EPISODES = {"random": 500, "alike": 500, "narrow": 2000}
-"""In the narrow beam few lost targets rule the mean."""
+"""Number of episodes. In the narrow beam few lost targets dominate the mean."""
 RIVAL = "greedy"
 GAPS, SETTLED, COUNTED = 40, 200, 200
 """Longest time between two looks at a target, s; seconds until covariances have settled, and those that count."""
@@ -36,7 +36,7 @@ def interval(values: Any, digits: int = 3) -> str:
 
 
 def episode_rows(scenario: str, competitors: dict[str, Any]) -> list[list[str]]:
-    """Costs of everybody in a scenario, over those of the rival on the same noise."""
+    """Return the costs of all policies in a scenario, over those of the rival on the same noise."""
     dataset = filtergym.evaluate(
         sensing.BudgetedSensing.id, competitors, scenario=scenario, episodes=EPISODES[scenario]
     )
@@ -55,7 +55,7 @@ def episode_rows(scenario: str, competitors: dict[str, Any]) -> list[list[str]]:
 
 
 def spaced_costs(R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
-    """Settled mean squared error of a target that is looked at every 1, 2, ... seconds, ``(GAPS, ...)``."""
+    """Return the settled mean squared error of a target that is looked at every 1, 2, ... seconds, ``(GAPS, ...)``."""
     found = []
     for gap in range(1, GAPS + 1):
         P, total, seconds = _begun(R), 0.0, 0
@@ -70,10 +70,10 @@ def spaced_costs(R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
 
 
 def relaxed_bound(costs: numpy.ndarray) -> numpy.ndarray:
-    """Least mean cost of targets whose looks are one a second in all, ``(N,)``: the largest over the multiplier.
+    """Return the least mean cost of targets that share one look a second, ``(N,)``: the largest over the multiplier.
 
     Args:
-        costs: of each target by the seconds between its looks, ``(GAPS, 4, N)``.
+        costs: costs of each target by the seconds between its looks, ``(GAPS, 4, N)``.
     """
     rates = 1.0 / numpy.arange(1.0, GAPS + 1.0)[:, None, None]
     prices = numpy.geomspace(1e-2, 1e6, 400)
@@ -82,7 +82,7 @@ def relaxed_bound(costs: numpy.ndarray) -> numpy.ndarray:
 
 
 def scheduled_costs(policy: Any, R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
-    """Mean cost of a policy on covariances alone, ``(N,)``."""
+    """Return the mean cost of a policy on covariances alone, ``(N,)``."""
     P, total, waited = _begun(R), 0.0, 0.0 * R
     for second in range(SETTLED + COUNTED):
         P, waited = sensing.later(P, agility), waited + 1.0
@@ -100,7 +100,7 @@ def _begun(R: numpy.ndarray) -> numpy.ndarray:
 
 
 def schedule_rows(scenario: str, count: int = 500) -> list[list[str]]:
-    """Costs of policies over the bound, on covariances alone."""
+    """Return the costs of policies over the bound, on covariances alone."""
     parameters = sensing.BudgetedSensing.scenarios[scenario].parameters
     model = make_model(sensing.BudgetedSensing, "beam", backend="numpy", **parameters)
     own, rng = model.task.parameters, numpy.random.default_rng(0)
@@ -124,7 +124,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--agent", type=Path, action="append", default=[], help="folder of a run; judged, too"
+        "--agent", type=Path, action="append", default=[], help="folder of a run, which is judged too"
     )
     options = parser.parse_args()
     rows = []

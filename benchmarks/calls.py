@@ -1,25 +1,26 @@
-"""What one call costs and what many rows need, beside peers and a former version.
+"""Times of one call, and time and memory for many rows, in comparison with peers and a former version.
 
     python benchmarks/calls.py [SECTION ...] [--against PYTHON] [--rounds N] [--rows N,N,...] [--json FILE]
 
 Sections, without ``logs`` by default, which takes minutes:
 
 ``single``
-    ``step`` and ``reset`` of ``gymnasium.make(ID)`` as Gymnasium wraps it, beside Gymnasium's CartPole and Pendulum.
+    ``step`` and ``reset`` of ``gymnasium.make(ID)`` with Gymnasium's wrappers, and of Gymnasium's CartPole and
+    Pendulum.
 ``vectors``
     ``step`` of ``gymnasium.make_vec`` a lane, with one and two threads (wall seconds, for threads share the
     processor), and of ManeuveringTarget with 65,536 lanes and with 1,024.
 ``live``
-    ``update`` of ``filtergym.online``, beside filterpy's Kalman filter and interacting multiple model.
+    ``update`` of ``filtergym.online``, and of filterpy's Kalman filter and interacting multiple model.
 ``start``
     Processor seconds of a process that makes, resets and steps, and those of CartPole.
 ``logs``
     Processor seconds and peak memory of ``advise``, of ``evaluate`` with truth and of the smoother, over logs of
     ``--rows`` rows, and of ``evaluate`` of ten competitors over as many episodes.
 
-``--against`` names the Python of another checkout: both versions are measured in turn, round after round, each beside
-its own peers in one process, and the table has both. A figure is the median over rounds. Times are of the processor
-unless the row says wall.
+``--against`` names the Python of another checkout: both versions are measured in turn, round after round, each with its
+own peers in one process, and the table has both. A figure is the median over rounds. Times are of the processor unless
+the row is marked "wall".
 """
 
 import argparse
@@ -116,7 +117,7 @@ def measure_vectors() -> Figures:
 
 
 def measure_live() -> Figures:
-    """Update filters in a loop, and filterpy's."""
+    """Update filters in a loop, and those of filterpy."""
     import numpy
     from filterpy.kalman import IMMEstimator, KalmanFilter
 
@@ -213,7 +214,7 @@ TRACK = "filtergym/ManeuveringTarget-v0"
 
 
 def measure_logs(rows: Sequence[int]) -> Figures:
-    """Judge logs and evaluate episodes, more and more of them."""
+    """Judge logs and evaluate episodes, in increasing numbers."""
     policies = [word for name in COMPETITORS for word in ("--policy", name)]
     log = ["evaluate", TRACK, "--recording", "truth.csv", "--speeds", "0.0001,100000", "--policy"]
     for count in rows:
@@ -255,7 +256,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("section", nargs="*", choices=[*SECTIONS, []], help="what to measure")
+    parser.add_argument("section", nargs="*", choices=[*SECTIONS, []], help="sections to measure")
     parser.add_argument(
         "--against", metavar="PYTHON", help="of another checkout, measured in turn with this one"
     )

@@ -1,17 +1,17 @@
-"""Which libraries for reinforcement learning step the environments, and how fast.
+"""Steps per second of the environments in libraries for reinforcement learning.
 
     python benchmarks/clients.py --install [NAME ...]   # the clients that are not in this Python's environment
     python benchmarks/clients.py [--client NAME ...] [--environment ID ...]
-    python benchmarks/clients.py --recipes              # what the recipes of docs/recipes.md print
+    python benchmarks/clients.py --recipes              # output of the recipes of docs/recipes.md
 
-**Installing.** Each client gets a virtual environment ``build/clients/NAME`` that sees all that this one holds, with
-the versions of ``docs/recipes/NAME.txt`` beside or instead of it: so torch is not fetched again, and nobody's pins meet
-anybody else's. A client that is not installed there is taken from this environment, if it has it.
+**Installing.** Each client gets a virtual environment ``build/clients/NAME`` with access to the packages of this one,
+and with the versions of ``docs/recipes/NAME.txt`` in addition or instead: so torch is not downloaded again, and the
+pins of clients do not conflict. A client that is not installed there is imported from this environment, if available.
 
-**What is timed.** Random actions (with Stable-Baselines3's family: PPO or TQC that begin to learn) through the client's
-own rollouts of default environments, for about a second after a portion that is not counted; in a process for each
-client and environment, with one thread. ``native``: the native vector environment; otherwise single ones, side by side
-where the client does that.
+**Timing.** Random actions (with Stable-Baselines3's family: PPO or TQC at the start of learning) through the client's
+own rollouts of default environments, for about a second after a warm-up; in a process for each client and environment,
+with one thread. ``native``: the native vector environment; otherwise single ones, side by side where the client
+supports it.
 """
 
 import argparse
@@ -45,7 +45,7 @@ PORTION = 20
 RESULT = "result: "
 
 Portion = Callable[[], int]
-"""Steps the environments through a client and returns how many steps it were."""
+"""Function that steps the environments through a client and returns the number of steps."""
 
 
 def gymnasium_single(id: str) -> Portion:
@@ -72,8 +72,8 @@ def random_steps(env: Any) -> Portion:
     return portion
 
 
-def learnt_by(model: Any) -> Portion:
-    """Let a model of Stable-Baselines3 collect, and learn a little."""
+def make_training_portion(model: Any) -> Portion:
+    """Run a model of Stable-Baselines3, which collects steps and learns."""
 
     def portion() -> int:
         model.learn(PORTION * model.n_envs)
@@ -87,7 +87,9 @@ def sb3_single(id: str) -> Portion:
     from stable_baselines3.common.env_util import make_vec_env
 
     env = make_vec_env(id, SINGLE)
-    return learnt_by(PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * SINGLE, n_epochs=1))
+    return make_training_portion(
+        PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * SINGLE, n_epochs=1)
+    )
 
 
 def sb3_native(id: str) -> Portion:
@@ -97,14 +99,18 @@ def sb3_native(id: str) -> Portion:
     from filtergym.agents import to_sb3
 
     env = to_sb3(gymnasium.make_vec(id, num_envs=NATIVE, autoreset_mode="SameStep"))
-    return learnt_by(PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * NATIVE, n_epochs=1))
+    return make_training_portion(
+        PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * NATIVE, n_epochs=1)
+    )
 
 
 def sb3_contrib_single(id: str) -> Portion:
     from sb3_contrib import TQC
     from stable_baselines3.common.env_util import make_vec_env
 
-    return learnt_by(TQC("MlpPolicy", make_vec_env(id, SINGLE), learning_starts=10**9, buffer_size=10**4))
+    return make_training_portion(
+        TQC("MlpPolicy", make_vec_env(id, SINGLE), learning_starts=10**9, buffer_size=10**4)
+    )
 
 
 def rl_zoo3_single(id: str) -> Portion:
@@ -166,7 +172,7 @@ def tianshou_single(id: str) -> Portion:
 
     envs = DummyVectorEnv([lambda: gymnasium.make(id)] * SINGLE)
     policy = ProbabilisticActorPolicy(
-        actor=torch.nn.Identity(),  # type: ignore[arg-type]  # never asked
+        actor=torch.nn.Identity(),  # type: ignore[arg-type]  # never called
         dist_fn=torch.distributions.Normal,
         action_space=envs.action_space[0],
     )
@@ -261,10 +267,10 @@ def install(name: str) -> None:
     print(f"installing {name} into {folder.relative_to(ROOT)}", flush=True)
     venv.create(folder)  # without pip: this environment's serves both
     packages = next(folder.glob("lib/python*/site-packages"))
-    # Read at every start: this environment's packages follow the new one's own, also what is installed editably.
+    # Read at every start: this environment's packages follow the new one's own, also those installed editably.
     beneath = sysconfig.get_path("purelib")
     (packages / "beneath.pth").write_text(f"import site; site.addsitedir({beneath!r})\n", encoding="utf-8")
-    # The versions are complete, and pip would look for those that pins of a client forbid: nothing else is installed.
+    # The versions are complete: without --no-deps pip would reject versions of this environment for the client's pins.
     pip = [sys.executable, "-m", "pip", "--python", python_of(name), "--disable-pip-version-check"]
     versions = RECIPES / f"{name}.txt"
     subprocess.run([*pip, "install", "--quiet", "--no-deps", "--requirement", str(versions)], check=True)
@@ -277,7 +283,7 @@ def python_of(name: str) -> str:
 
 
 def measure(client: str, id: str) -> dict[str, Any]:
-    """Steps per second of a client in an environment, or why there is none."""
+    """Return the steps per second of a client in an environment, or the reason of a failure."""
     _, distribution, rollouts = CLIENTS[client]
     try:
         version = importlib.metadata.version(distribution)
@@ -291,13 +297,13 @@ def measure(client: str, id: str) -> dict[str, Any]:
         steps, start = 0, time.perf_counter()
         while (seconds := time.perf_counter() - start) < 1.0:
             steps += portion()
-    except Exception as error:  # whatever a client stumbles over
+    except Exception as error:  # any failure of a client
         words = str(error).strip().splitlines()
         return {"version": version, "failed": f"{type(error).__name__}: {words[0] if words else ''}"}
     return {"version": version, "rate": steps / seconds}
 
 
-def measured_elsewhere(client: str, id: str) -> dict[str, Any]:
+def measure_in_client(client: str, id: str) -> dict[str, Any]:
     """Run :func:`measure` in the client's own Python."""
     command = [python_of(CLIENTS[client][0]), __file__, "--measure", client, "--environment", id]
     try:
@@ -312,13 +318,13 @@ def measured_elsewhere(client: str, id: str) -> dict[str, Any]:
 
 
 def table(clients: list[str], ids: list[str]) -> None:
-    """Print it in Markdown, row by row."""
+    """Print the table in Markdown, row by row."""
     names = [id.partition("/")[2].rpartition("-v")[0] for id in ids]
     print("| steps/s | version |", " | ".join(names), "|")
     print("|---|---|" + "---|" * len(ids))
     notes: list[str] = []
     for client in clients:
-        found = [measured_elsewhere(client, id) for id in ids]
+        found = [measure_in_client(client, id) for id in ids]
         cells = []
         for result in found:
             if "rate" in result:
@@ -334,7 +340,7 @@ def table(clients: list[str], ids: list[str]) -> None:
 
 
 def recipes() -> None:
-    """Print what every recipe prints last, and how long it took."""
+    """Print the last line of every recipe's output, and its time."""
     print("| recipe | seconds | prints |\n|---|---|---|")
     for file in sorted(RECIPES.glob("with_*")):
         python = python_of(file.stem.removeprefix("with_"))
@@ -351,11 +357,11 @@ def recipes() -> None:
                 cwd=ROOT,
                 env={**os.environ, "PATH": path},
             )
-            said = [
+            lines = [
                 line for line in (done.stdout if done.returncode == 0 else done.stderr).splitlines() if line
             ]
             shown = next(
-                (line for line in said if re.match("cost against", line)), said[-1] if said else "nothing"
+                (line for line in lines if re.match("cost against", line)), lines[-1] if lines else "nothing"
             )
         except subprocess.TimeoutExpired:
             shown = f"more than {LIMIT} s"

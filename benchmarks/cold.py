@@ -1,15 +1,15 @@
-"""What a first use costs: commands with an empty cache of compiled code, and once more with a full one.
+"""Cost of a first use: commands with an empty cache of compiled code, and again with a full one.
 
     python benchmarks/cold.py [--quick] [--only WORD] [--record]
 
-Every command runs twice in a folder of its own that is the user's home and holds the code cache: cold, where both are
-empty, then warm. A figure is of the whole process with its children: processor seconds, and seconds that pass (wall).
-Others on the machine take some of the second and, by its caches, a little of the first: take ratios.
+Every command runs twice in a folder of its own that is the user's home and contains the code cache: cold, where both
+are empty, then warm. A figure is of the whole process with its children: processor seconds, and seconds that pass
+(wall). Other processes on the machine affect the second and, through its caches, slightly the first: use ratios.
 
 Two policies are evaluated over 500 episodes, and the benchmark is the quick one in one process. ``--quick`` leaves
 out the benchmark, which takes minutes, and all evaluations but that of ManeuveringTarget; ``--only`` runs
-those that are called by the word; ``--record`` puts what was measured into ``docs/records/cold.json``, whose table the
-documentation shows, and leaves other rows as they are.
+those whose name contains the word; ``--record`` writes the results to ``docs/records/cold.json``, whose table the
+documentation shows, and leaves other rows unchanged.
 """
 
 import argparse
@@ -49,13 +49,13 @@ POLICIES = {
 }
 """Two policies of each environment."""
 SHORT = "ManeuveringTarget"
-"""Environment of the evaluation that ``--quick`` keeps."""
+"""Environment of the evaluation with ``--quick``."""
 LIMIT_S = 1200
-"""Of one command."""
+"""Time limit of one command, s."""
 
 
 class Cost(NamedTuple):
-    """What a process has taken."""
+    """Time of a process."""
 
     processor: float
     """Seconds."""
@@ -64,7 +64,7 @@ class Cost(NamedTuple):
 
 
 def commands(quick: bool) -> dict[str, list[str]]:
-    """Return the commands by what a table calls them."""
+    """Return the commands by their names in the table."""
     front_door = [sys.executable, "-m", "filtergym"]
     found = {
         "make and first step, TightlyCoupledNavigation": [
@@ -88,7 +88,7 @@ def commands(quick: bool) -> dict[str, list[str]]:
 
 
 def measure(command: Sequence[str], home: Path) -> Cost:
-    """Run a command at home.
+    """Run a command with a folder as home.
 
     Raises:
         RuntimeError: if it fails.
@@ -119,7 +119,7 @@ def row(name: str, cold: Cost, warm: Cost) -> list[str]:
 
 
 def write_record(rows: Sequence[Sequence[str]]) -> None:
-    """Put rows into the record, in the order of :func:`commands`; see ``docs/make/records.py``."""
+    """Write rows to the record, in the order of :func:`commands`; see ``docs/make/records.py``."""
     known = json.loads(RECORD.read_text(encoding="utf-8"))["data"]["rows"] if RECORD.exists() else []
     by_name = {each[0]: list(each) for each in [*known, *rows]}
     versions = {"Python": platform.python_version()}
@@ -139,9 +139,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--quick", action="store_true", help="what takes a minute")
+    parser.add_argument("--quick", action="store_true", help="only commands that take less than a minute")
     parser.add_argument(
-        "--only", metavar="WORD", default="", help="what is called by it: benchmark, evaluate"
+        "--only", metavar="WORD", default="", help="only commands whose name contains it: benchmark, evaluate"
     )
     parser.add_argument("--record", action="store_true", help="put the rows into docs/records/cold.json")
     options = parser.parse_args()

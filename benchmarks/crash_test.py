@@ -1,9 +1,10 @@
-"""Crash test of all that is shipped for an environment, as a table in Markdown.
+"""Crash test of all shipped competitors of an environment, as a table in Markdown.
 
     python benchmarks/crash_test.py ENVIRONMENT [--policy NAME ...] [--episodes N] [--steps N]
 
-One row for each policy, estimator, tuned one and agent: how many alterations it passed, and under which it is degraded
-or failed. References and bounds, which need the truth, and smoothers, which answer afterwards, are left out.
+One row for each policy, estimator, tuned one and agent: the number of alterations that it passed, and those under which
+it degraded or failed. References and bounds, which need the truth, and smoothers, which need later measurements, are
+left out.
 """
 
 import argparse
@@ -23,7 +24,7 @@ COLUMNS = ["", "passed", "degraded", "failed", "degraded under", "failed under"]
 
 
 def row(name: str, findings: Sequence[Finding]) -> list[str]:
-    """Row of the table."""
+    """Return the row of the table."""
     by_verdict = {
         verdict: [one.alteration for one in findings if one.verdict == verdict]
         for verdict in ("passed", "degraded", "failed")
@@ -33,7 +34,7 @@ def row(name: str, findings: Sequence[Finding]) -> list[str]:
 
 
 def main() -> None:
-    """Test everybody and print the table."""
+    """Test all competitors and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,12 +1,12 @@
-"""How fast ``bptt`` learns, and whether compiled episodes give the gradients that torch gives.
+"""Time of an update of ``bptt``, and comparison of the gradients of compiled episodes with those of torch.
 
     python benchmarks/descent.py [--environment ID]
 
-**What is timed.** Processor time of an update: as many decisions as its window has, forward and back, gradient
+**Timing.** Processor time of an update: the decisions of its window, forward and back, gradient
 clipping and Adam, with the hyperparameters of the trainer in float32, and its share of a reset; no validation. Median
 over ``--repeat`` episodes of two windows (ManeuveringTarget: one), torch and compiled in turn. One thread.
 
-**What is compared.** Gradients of the mean cost of these windows with respect to all parameters of a policy in float64,
+**Comparison.** Gradients of the mean cost of these windows with respect to all parameters of a policy in float64,
 on the same episodes: the largest difference, relative to the largest gradient.
 """
 
@@ -31,11 +31,11 @@ from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 BACKENDS = ("torch", "compiled")
 FEWER = 8
-"""Episodes whose gradients are compared."""
+"""Number of episodes for the comparison of gradients."""
 
 
-def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple[Any, NetworkPolicy]:
-    """What flies an episode and calls for a descent after each window, and its policy."""
+def make_episodes(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple[Any, NetworkPolicy]:
+    """Return a function that runs an episode with a descent after each window, and its policy."""
     truncation = run.hyperparameters["truncation"]
     env = TaskVectorEnv(
         run.environment, envs, control=run.control, backend=backend, autoreset_mode="Disabled",
@@ -53,8 +53,8 @@ def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple
 
 
 def gradients(run: TrainingRun, backend: str) -> torch.Tensor:
-    """Gradients of all windows of an episode."""
-    fly, policy = made(run, backend, FEWER, torch.float64)
+    """Return the gradients of all windows of an episode."""
+    fly, policy = make_episodes(run, backend, FEWER, torch.float64)
     found = []
 
     def keep() -> None:
@@ -66,10 +66,10 @@ def gradients(run: TrainingRun, backend: str) -> torch.Tensor:
 
 
 def update_times(run: TrainingRun, repeat: int) -> list[float]:
-    """Milliseconds of an update with each backend."""
+    """Return the milliseconds of an update with each backend."""
     prepared = []
     for backend in BACKENDS:
-        fly, policy = made(run, backend, run.envs, torch.float32)
+        fly, policy = make_episodes(run, backend, run.envs, torch.float32)
         prepared.append((fly, policy, torch.optim.Adam(policy.parameters(), lr=1e-3)))
     times: list[list[float]] = [[], []]
     for _ in range(repeat + 1):
@@ -86,7 +86,7 @@ def update_times(run: TrainingRun, repeat: int) -> list[float]:
             start = time.process_time()
             fly(descend)
             kept.append(1e3 * (time.process_time() - start) / windows)
-    # The first episode also meets memory that was never touched.
+    # The first episode also allocates memory.
     return [statistics.median(kept[1:]) for kept in times]
 
 

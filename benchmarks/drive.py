@@ -1,29 +1,29 @@
-"""A real drive as recordings of LooselyCoupledNavigation: an INS let loose again and again, beside RTK.
+"""A real drive as recordings of LooselyCoupledNavigation: free-running INS in windows, with RTK as truth.
 
     git clone https://github.com/rtklibexplorer/GNSS_IMU
     pip install 'filtergym[ins]'
     python benchmarks/drive.py GNSS_IMU --out docs/data/drive.nc --figure docs/images/drive.png
 
 The log (BSD-3-Clause, see ``docs/data/drive_licence.txt``): a car with a consumer IMU at 100 Hz and an RTK receiver at
-4 Hz, 549 s. What is made of it, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
+4 Hz, 549 s. Processing, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
 
-1. **Alignment** and aiding by the positions and velocities of RTK, as ``envs/logs/strapdown.py`` has them.
-2. **Windows.** At the start of each the INS takes over velocity, attitude and biases of that filter, which has seen
-   nothing later, and the position of RTK; then it runs free. Windows do not overlap.
-3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, as it is.
-4. **Fixes** are simulated: truth plus white noise. The solution in the log is RTK only; a position of its own would
-   have to be computed from the receiver's raw observations.
+1. **Alignment** and aiding by the positions and velocities of RTK, as in ``envs/logs/strapdown.py``.
+2. **Windows.** At the start of each the INS is set to velocity, attitude and biases of that filter, which has used no
+   later data, and to the position of RTK; then it runs free. Windows do not overlap.
+3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, unchanged.
+4. **Fixes** are simulated: truth plus white noise. The solution in the log is RTK only; a receiver's own position would
+   have to be computed from its raw observations.
 
-Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repository unless it says otherwise:
+Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repository unless noted otherwise:
 
 * The IMU's milliseconds are stretched to the logger's time tags, and these are 0.125 s late. With 0.16 to 0.2 s the
   innovations here would be least, and the error of the INS after 20 s 15 m in place of 16 m.
 * The IMU is mounted at (180, -6.79, 185.35) degrees roll, pitch, yaw to the vehicle, the antenna 5 cm left of it.
-* Accelerations are in units of 9.80665 m/s^2, rates in degrees/s. Nothing is low-pass filtered: the integration does
-  that.
-* Heights are above sea level and taken for ellipsoidal ones: 16 m change the scale by 3e-6.
+* Accelerations are in units of 9.80665 m/s^2, rates in degrees/s. No low-pass filter is used: the integration acts as
+  one.
+* Heights are above sea level and used as ellipsoidal ones: 16 m change the scale by 3e-6.
 * Densities of white noise are measured here, over 1 s at the standstill with the engine running; around roll
-  and pitch that is ten times what the repository has from the data sheet.
+  and pitch that is ten times the value that the repository takes from the data sheet.
 """
 
 import argparse
@@ -46,15 +46,15 @@ INERTIAL, FIXES = "data/drive_0708/imu_1934.csv", "data/drive_0708/gnss_1934_sf.
 MOUNTING = (180.0, -6.79, 185.35)
 """Roll, pitch and yaw of the IMU's axes to forward, right, down of the vehicle, degrees."""
 LEVER = (0.0, -0.05, 0.0)
-"""From the IMU to the antenna, forward, right, down, m."""
+"""Lever arm from the IMU to the antenna, forward, right, down, m."""
 DELAY = 0.125
-"""By which the logger's time tags of the IMU are late, s; the repository's."""
+"""Delay of the logger's time tags of the IMU, s; the repository's."""
 RTK_POSITION, RTK_VELOCITY = 0.02, 0.06
-"""Standard deviations of its positions and velocities, of each axis, m and m/s; about what it reports."""
+"""Standard deviations of its positions and velocities, of each axis, m and m/s; close to the reported ones."""
 ALIGNMENT = 30.0
-"""From the end of the standstill to the first window, s: some turns, after which the heading is known."""
+"""Time from the end of the standstill to the first window, s: some turns, after which the heading is known."""
 MEASUREMENTS = 80
-"""In a window, 20 s; one more is recorded, for the last observation."""
+"""Measurements in a window, 20 s; one more is recorded, for the last observation."""
 PARAMETERS = {
     "axes": 2,
     "sampling_interval": 0.25,
@@ -64,9 +64,9 @@ PARAMETERS = {
     "correlation_time": 30.0,
     "white_intensity": 0.0,
 }
-"""Of the environment. Fixes come as often as RTK, with the deviation that the environment has by default, 1.41 m. The
-levels of the INS errors are what :func:`likeliest` finds, rounded: no constant and no white part can be seen, and of
-the coloured one ``coloured^2 / correlation_time`` is better known than each."""
+"""Parameters of the environment. Fixes come as often as RTK, with the environment's default deviation, 1.41 m. The
+levels of the INS errors are the rounded result of :func:`fit_levels`: no constant and no white part is detectable, and
+of the coloured one ``coloured^2 / correlation_time`` is better determined than each."""
 
 
 def read_inertial(file: Path) -> Any:
@@ -77,7 +77,7 @@ def read_inertial(file: Path) -> Any:
             tags in ``FILE.tag`` beside it.
 
     Raises:
-        ValueError: if either is something else.
+        ValueError: if either file has another format.
     """
     import pandas
     from pyins import transform, util
@@ -86,7 +86,7 @@ def read_inertial(file: Path) -> Any:
     # A header of 60 bytes, the tick at the start (not needed), its time in whole seconds and the rest of it; then pairs
     # of milliseconds since then and bytes of the file.
     if not tags.startswith(b"TIMETAG RTKLIB") or len(tags) < 84 or (len(tags) - 76) % 8:
-        raise ValueError(f"{file.name}.tag holds no time tags of RTKLIB")
+        raise ValueError(f"{file.name}.tag contains no time tags of RTKLIB")
     _, whole, rest = struct.unpack("<IId", tags[60:76])
     last = numpy.frombuffer(tags[76:], "<u4")[-2]
     try:
@@ -113,7 +113,7 @@ def read_fixes(file: Path) -> Any:
     time, s since 1970 of GPS time; quality 1 is fixed, 2 float.
 
     Raises:
-        ValueError: if the file holds none.
+        ValueError: if the file contains none.
     """
     import pandas
 
@@ -132,15 +132,15 @@ def read_fixes(file: Path) -> Any:
     return table
 
 
-def aligned(inertial: Any, fixes: Any) -> AidedInertial:
+def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
     """Align the INS at the standstill and aid it by RTK from there.
 
     Args:
-        inertial: of :func:`read_inertial`.
-        fixes: of :func:`read_fixes`.
+        inertial: result of :func:`read_inertial`.
+        fixes: result of :func:`read_fixes`.
 
     Raises:
-        ValueError: if the recording does not begin with a standstill of 5 s, or nothing moves after it.
+        ValueError: if the recording does not begin with a standstill of 5 s, or the vehicle does not move after it.
     """
     sigma = numpy.full(len(fixes), RTK_POSITION)
     return aid(align(inertial, fixes), fixes, sigma, RTK_VELOCITY, LEVER)
@@ -150,9 +150,9 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     """Cut a drive into recordings of the environment.
 
     Args:
-        inertial: of :func:`read_inertial`.
-        fixes: of :func:`read_fixes`, without gaps.
-        seed: of the simulated fixes.
+        inertial: result of :func:`read_inertial`.
+        fixes: result of :func:`read_fixes`, without gaps.
+        seed: seed of the simulated fixes.
 
     Raises:
         ValueError: if positions are missing, or none is left after the alignment.
@@ -161,7 +161,7 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     steps = numpy.diff(fixes.index)
     if abs(steps - T).max() > 0.01:
         raise ValueError(f"positions come every {T} s, but two are {abs(steps).max():.2f} s apart")
-    navigation = aligned(inertial, fixes)
+    navigation = align_ins(inertial, fixes)
     clock = fixes.index.to_numpy() - fixes.index[0]
     first = int(numpy.searchsorted(fixes.index, navigation.trajectory.index[0] + ALIGNMENT))
     last = int(numpy.searchsorted(fixes.index, navigation.trajectory.index[-1], side="right"))
@@ -181,14 +181,14 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
 def dataset(
     truth: numpy.ndarray, ins: numpy.ndarray, fix: numpy.ndarray, deviation: float, starts: numpy.ndarray
 ) -> xarray.Dataset:
-    """Recordings in the form of files.
+    """Return the recordings in the form of files.
 
     Args:
         truth: positions from the start of each window on, m, ``(episode, 1 + time, axis)``.
-        ins: likewise, by the INS.
-        fix: likewise from the first measurement on, by the receiver.
-        deviation: of the fixes, m.
-        starts: of the windows, s since the start of the drive.
+        ins: positions by the INS, same shape, m.
+        fix: positions by the receiver from the first measurement on, m, ``(episode, time, axis)``.
+        deviation: standard deviation of the fixes, m.
+        starts: starts of the windows, s since the start of the drive.
     """
     episodes, measured, axes = fix.shape
     T = PARAMETERS["sampling_interval"]
@@ -227,14 +227,14 @@ def dataset(
 
 
 def errors(recorded: xarray.Dataset) -> numpy.ndarray:
-    """INS position less truth, m, a row for each recording and axis, ``(n, time)``."""
+    """Return the INS position less truth, m, a row for each recording and axis, ``(n, time)``."""
     difference = (recorded["ins"].to_numpy() - recorded["truth"].to_numpy()).transpose(0, 2, 1)
     return difference.reshape(-1, difference.shape[-1])
 
 
-def modelled(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
-    """Covariance of the environment's INS error at times, s, ``(n, n)``, m^2: the integral of a constant, of an
-    exponentially correlated and of a white rate error.
+def ins_error_covariance(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
+    """Return the covariance of the environment's INS error at times, s, ``(n, n)``, m^2: the integral of a
+    constant, of an exponentially correlated and of a white rate error.
     """
     s, t, tau = time[:, None], time, levels["correlation_time"]
     coloured = 2.0 * tau * numpy.minimum(s, t) - tau**2 * (
@@ -247,17 +247,17 @@ def modelled(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
     )
 
 
-def likeliest(
+def fit_levels(
     recorded: xarray.Dataset, correlation_time: float | None = None
 ) -> tuple[dict[str, float], float]:
-    """Levels of the INS errors under which fixes less INS positions are likeliest, and their log-likelihood for each
-    of them.
+    """Return the levels of the INS errors under which fixes less INS positions are likeliest, and their log-likelihood
+    for each of them.
 
-    The receiver's noise is part of it: what matters is what a filter can see through that.
+    The receiver's noise is included: relevant are the errors that a filter can detect through it.
 
     Args:
-        recorded: of :func:`recordings`.
-        correlation_time: s; None looks for the likeliest.
+        recorded: result of :func:`recordings`.
+        correlation_time: correlation time, s; None searches the likeliest.
     """
     from scipy.optimize import minimize
 
@@ -267,7 +267,7 @@ def likeliest(
     seen = (recorded["fix"] - recorded["ins"]).to_numpy().transpose(0, 2, 1).reshape(-1, len(time))
 
     def unlikely(logarithms: numpy.ndarray) -> float:
-        covariance = modelled(time, dict(zip(names, numpy.exp(logarithms), strict=True)))
+        covariance = ins_error_covariance(time, dict(zip(names, numpy.exp(logarithms), strict=True)))
         factor = numpy.linalg.cholesky(covariance + numpy.diag(deviation**2))
         white = numpy.linalg.solve(factor, seen.T)
         density = numpy.log(numpy.diag(factor)).sum() + 0.5 * len(time) * numpy.log(2.0 * numpy.pi)
@@ -284,10 +284,10 @@ def likeliest(
 
 
 def report(recorded: xarray.Dataset) -> None:
-    """Print how large the INS error grows, and what the environment's model makes of it."""
+    """Print the growth of the INS error, and that of the environment's model."""
     found = abs(errors(recorded))
     time = recorded["seconds"].to_numpy()[0]
-    covariance = modelled(time, PARAMETERS)
+    covariance = ins_error_covariance(time, PARAMETERS)
     print("| after, s | median, m | root mean square, m | largest, m | by the model, m |")
     print("|---:|---:|---:|---:|---:|")
     for after in (1.0, 2.0, 5.0, 10.0, 15.0, 20.0):
@@ -299,13 +299,13 @@ def report(recorded: xarray.Dataset) -> None:
                 f"| {covariance[at, at] ** 0.5:.2g} |"
             )
     for correlation_time in (None, 1.0):
-        levels, likelihood = likeliest(recorded, correlation_time)
+        levels, likelihood = fit_levels(recorded, correlation_time)
         fitted = ", ".join(f"{name} {value:.3g}" for name, value in levels.items())
         print(f"likeliest levels: {fitted}; log-likelihood {likelihood:.3f} for each fix")
 
 
 def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
-    """Draw the drive with the windows of the INS, and how its error grows."""
+    """Draw the drive with the windows of the INS, and the growth of its error."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -327,7 +327,7 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
     right.plot(time, found.T, color="tab:grey", linewidth=0.6, alpha=0.6)
     rms = numpy.sqrt((found**2).mean(axis=0))
     right.plot(time, rms, color="tab:red", label="root mean square")
-    model = numpy.sqrt(numpy.diag(modelled(time, PARAMETERS)))
+    model = numpy.sqrt(numpy.diag(ins_error_covariance(time, PARAMETERS)))
     right.plot(time, model, color="tab:blue", linestyle="--", label="the model's standard deviation")
     right.set(xlabel="since the start of the window, s", ylabel="INS error of an axis, m", ylim=(-65, 65))
     right.legend(frameon=False, loc="upper left")
@@ -336,7 +336,7 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
 
 
 def main() -> None:
-    """Make the file from a checkout."""
+    """Write the file from a checkout."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -2,8 +2,8 @@
 
     python benchmarks/drive_filters.py docs/data/drive.nc
 
-Each runs on one axis by itself, as agents were trained, with the two sets of levels that ``drive.py`` finds likeliest:
-of any correlation time, and of that of the environment.
+Each runs on one axis alone, as in the training of agents, with the two sets of levels that are likeliest in
+``drive.py``: with any correlation time, and with that of the environment.
 """
 
 import argparse
@@ -43,7 +43,7 @@ COMPETITORS = (
 
 
 def one_axis(drive: Recording, axis: int) -> Recording:
-    """Keep one axis, as if the vehicle moved along it."""
+    """Return a recording of one axis, as if the vehicle moved along it."""
     if drive.truth is None:
         raise ValueError("the drive needs its truth")
     mean, covariance = drive.initial["mean"], drive.initial["covariance"]
@@ -62,7 +62,7 @@ def one_axis(drive: Recording, axis: int) -> Recording:
 def main() -> None:
     """Print the errors of the position, m, with their intervals, lowest first."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("drive", type=Path, help="file of recordings that drive.py has made")
+    parser.add_argument("drive", type=Path, help="file of recordings that drive.py wrote")
     drive = filtergym.read_recording(parser.parse_args().drive, ID)
     header = ["competitor"]
     found: dict[str, list[Record]] = {name: [] for name in COMPETITORS}

@@ -1,12 +1,12 @@
-"""Whether the environments stand random actions: every step of every environment, control and scenario is looked at.
+"""Endurance test under random actions: every step of every environment, control and scenario is checked.
 
     python benchmarks/endurance.py [--environment ID] [--steps N] [--size N] [--seed S]
 
-**What is looked at.** Observations and rewards of the vector environment and the estimator's covariance after every
+**Checks.** Observations and rewards of the vector environment and the estimator's covariance after every
 step (``decision_interval`` 1): is everything finite, and is the covariance, scaled to correlations, positive
 semidefinite to 1e-9 (every tenth step)? Half of the actions lie on the edge of the action space, where an estimator is
 steered hardest. ``--steps`` are shared evenly among the combinations of an environment. Steps that fail are counted,
-their combinations are printed, and the command ends with exit code 1.
+their combinations are printed, and the command exits with status 1.
 """
 
 import argparse
@@ -27,11 +27,11 @@ from rich.table import Table
 from filtergym.envs.engine.catalogue import catalogue
 
 CHECKED_EVERY = 10
-"""Steps between two looks at the covariances' signs."""
+"""Steps between two checks of the covariances' eigenvalues."""
 
 
 def actions(space: gymnasium.Space, generator: numpy.random.Generator, size: int) -> numpy.ndarray:
-    """Random actions, half of the continuous ones on the edge of the space."""
+    """Return the random actions, half of the continuous ones on the edge of the space."""
     if isinstance(space, gymnasium.spaces.Discrete):
         return generator.integers(space.n, size=size)
     assert isinstance(space, gymnasium.spaces.Box)
@@ -57,7 +57,7 @@ def lost_covariances(covariance: numpy.ndarray) -> int:
 def endure(
     id: str, control: str, scenario: str, steps: int, size: int, seed: int
 ) -> tuple[int, dict[str, int]]:
-    """Step one combination; returns how many steps were done, and how many of them failed in which way."""
+    """Step one combination; return the number of steps, and the numbers of failures by kind."""
     env: Any = gymnasium.make_vec(
         id, num_envs=size, control=control, scenario=scenario, decision_interval=1
     ).unwrapped
@@ -77,7 +77,7 @@ def endure(
 
 
 def main() -> None:
-    """Step everything that was asked for and print the table."""
+    """Step all selected combinations and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--environment", choices=sorted(catalogue()), help="default: all of them")
     parser.add_argument("--steps", type=int, default=1_000_000, help="of each environment")

@@ -1,4 +1,4 @@
-"""What noisy sensors cost an agent, and what a filter gives back: returns under truth, readings and estimates.
+"""Loss of an agent by noisy sensors, and gain by a filter: returns under truth, readings and estimates.
 
     python benchmarks/estimation_in_the_loop.py [fixed trained] [--only ENVIRONMENT ...] [--seeds N] [--out FILE]
 
@@ -9,7 +9,7 @@
     PPO of Stable-Baselines3 on the full observation, on readings, on a stack of four readings and on estimates,
     with its mean return over 50 fresh episodes.
 
-Results are appended to FILE, one line of JSON for each cell, and a cell that is there is not computed again. Tables
+Results are appended to FILE, one line of JSON for each cell, and an existing cell is not computed again. Tables
 are printed at the end: mean returns, and differences with 95 % intervals, paired by episode or by training seed.
 """
 
@@ -38,7 +38,7 @@ Controller = Callable[[numpy.ndarray], Any]
 
 
 def cart_pole() -> Controller:
-    """Linear-quadratic regulator of the upright pole, whose force is rounded to left or right."""
+    """Return the linear-quadratic regulator of the upright pole, whose force is rounded to left or right."""
     model, n = CLASSIC_CONTROL["CartPole"], 4
     step = 1e-6
     origin = numpy.zeros(n)
@@ -51,7 +51,9 @@ def cart_pole() -> Controller:
 
 
 def pendulum(x: numpy.ndarray) -> Any:
-    """Energy pumping (Astrom and Furuta, 2000), then proportional and derivative control near the top."""
+    """Return the force that pumps energy (Astrom and Furuta, 2000), and near the top that of proportional-derivative
+    control.
+    """
     angle = (x[0] + math.pi) % (2.0 * math.pi) - math.pi
     energy = x[1] ** 2 / 6.0 + 5.0 * math.cos(angle) - 5.0
     near = math.cos(angle) > 0.85
@@ -60,12 +62,12 @@ def pendulum(x: numpy.ndarray) -> Any:
 
 
 def mountain_car(x: numpy.ndarray) -> Any:
-    """Full force along the velocity."""
+    """Return the full force along the velocity."""
     return numpy.array([math.copysign(1.0, x[1])], dtype=numpy.float32)
 
 
 def acrobot(x: numpy.ndarray) -> Any:
-    """Torque along the rate of the second link, which pumps energy."""
+    """Return the torque along the rate of the second link, which pumps energy."""
     return 2 if x[3] > 0.0 else 0
 
 
@@ -101,7 +103,7 @@ def sensors_of(name: str, level: str) -> dict[str, Any]:
 
 
 def differences(place: list[int], n: int, interval: float, turning: numpy.ndarray, window: int) -> Any:
-    """Return what makes a state of readings: their mean over a window, and the slope between means."""
+    """Return a function from readings to a state: their mean over a window, and the slope between means."""
     past: deque[numpy.ndarray] = deque(maxlen=window + 1)
 
     def state(reading: numpy.ndarray, starts: bool) -> numpy.ndarray:
@@ -159,7 +161,7 @@ def fly(name: str, way: str, level: str) -> list[float]:
 
 
 def make(name: str, way: str, level: str) -> Any:
-    """Return an environment as an agent in training sees it."""
+    """Return an environment as an agent in training observes it."""
     env: Any = gymnasium.make(name)
     if way != "truth":
         env = NoisyObservation(env, sensors_of(name, level))
@@ -255,7 +257,7 @@ def print_fixed(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
 
 
 def print_trained(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
-    """Print the returns of trained agents, and what estimates bring them."""
+    """Print the returns of trained agents, and their gain by estimates."""
     ways = ("raw", "stack", "estimate")
     print("\n| PPO, mean return (seeds) | noise | truth | " + " | ".join(ways) + " | estimate less stack |")
     print("|---|---|" + "---|" * (len(ways) + 2))
@@ -312,7 +314,7 @@ def draw_episode(file: Path) -> None:
 
 
 def main() -> None:
-    """Compute what is missing, and print the tables."""
+    """Compute the missing cells, and print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,11 +1,11 @@
-"""Every ranked competitor as C99: compiled, run over recorded episodes, and compared with what it estimated itself.
+"""Every ranked competitor as C99: compiled, run over recorded episodes, and compared with its own estimates.
 
-A line for each: operations and bytes of state in double; bytes of the source, of code and constants as ``-Os`` makes
-them of it, and of the largest stack of a function; the largest difference to the replay in double and in float, in the
-standard deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM
-makes of the same program (a lane of 512, without a network), and in NumPy for one track. What is not written says why.
-Times are of processor time, the least of several runs. ``--cross`` names a compiler of another processor, with which
-the files are compiled only, in double and in float.
+A line for each: operations and bytes of state in double; bytes of the source, of code and constants with ``-Os``, and
+of the largest stack of a function; the largest difference to the replay in double and in float, in the standard
+deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM generates
+from the same program (a lane of 512, without a network), and in NumPy for one track. For a competitor that cannot be
+exported the line gives the reason. Times are of processor time, the least of several runs. ``--cross`` names a compiler
+of another processor, with which the files are compiled only, in double and in float.
 
 Example: python benchmarks/exported.py --environment ManeuveringTarget-v0 --episodes 100 --out exported.csv
 """
@@ -103,23 +103,23 @@ class Size(NamedTuple):
 
     source: int
     code: int
-    """With constants."""
+    """Bytes of code and constants."""
     stack: int
-    """Of the function that takes most."""
+    """Bytes of the largest stack of a function."""
     cross: int | None
-    """Of code and constants for another processor."""
+    """Bytes of code and constants for another processor."""
 
 
 class Compilers(NamedTuple):
-    """What compiles the files."""
+    """Compilers of the files."""
 
     own: str
     cross: list[str]
-    """A compiler of another processor with its options, or nothing."""
+    """A compiler of another processor with its options, or an empty list."""
 
 
 def size_of(file: Path, compilers: Compilers) -> Size:
-    """Size of an exported filter, compiled to be small by gcc."""
+    """Return the size of an exported filter, compiled to be small by gcc."""
     code = _code_bytes(file, [compilers.own, "-fstack-usage"])
     usage = file.with_suffix(".small.su").read_text(encoding="utf-8").splitlines()
     stack = max(int(line.split("\t")[1]) for line in usage)
@@ -128,19 +128,18 @@ def size_of(file: Path, compilers: Compilers) -> Size:
 
 
 def _code_bytes(file: Path, compiler: list[str]) -> int:
-    """Bytes of code and constants."""
     made = file.with_suffix(".small.o").name
     subprocess.run([*compiler, *FLAGS, "-Os", "-c", file.name, "-o", made], cwd=file.parent, check=True)
-    # The one beside it: arm-none-eabi-size of arm-none-eabi-gcc.
+    # The tool of the same toolchain: arm-none-eabi-size of arm-none-eabi-gcc.
     tool = f"{compiler[0].removesuffix('gcc')}size" if compiler[0].endswith("gcc") else "size"
-    told = subprocess.run([tool, made], cwd=file.parent, check=True, capture_output=True, text=True).stdout
-    return int(told.splitlines()[1].split()[0])
+    sizes = subprocess.run([tool, made], cwd=file.parent, check=True, capture_output=True, text=True).stdout
+    return int(sizes.splitlines()[1].split()[0])
 
 
 def run_in_c(
     name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compilers: Compilers
 ) -> tuple[float, float, Writer, Size]:
-    """Largest difference, in standard deviations, nanoseconds an update, what wrote the files, and their size."""
+    """Return the largest difference, in standard deviations, nanoseconds an update, the exporter, and the size."""
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
     batch = BATCH.format(
@@ -175,9 +174,9 @@ def run_in_c(
 
 
 def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
-    """Of the same program, one of many lanes."""
+    """Return the nanoseconds an update of the same program in LLVM's code, one of many lanes."""
     program = traced.update
-    # What is written must not be what is read: the state after an update goes elsewhere.
+    # Input and output must not be the same memory: the state after an update goes elsewhere.
     after = max(STATE, MEASUREMENT, ANSWER, ESTIMATE, SHOWN, 3) + 1
     results = [r._replace(argument=after) if r.argument == STATE else r for r in program.results]
     program = program._replace(results=results)
@@ -197,7 +196,7 @@ def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
 
 
 def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
-    """Of the competitor itself on NumPy's arrays, one track."""
+    """Return the nanoseconds an update of the competitor itself on NumPy's arrays, one track."""
     kind = kind_of(maker)
     keywords = getattr(maker, "task_keywords", {})
     plain = make_model(problem.task, control_of(maker, None, problem.task, name), **keywords)
@@ -215,7 +214,7 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
 
 
 def least_time(call: Any, count: int) -> float:
-    """Least nanoseconds of a call, over runs of some calls."""
+    """Return the least nanoseconds of a call, over runs of some calls."""
     call()
     times = []
     for _ in range(7):
@@ -229,7 +228,7 @@ def least_time(call: Any, count: int) -> float:
 def lines(
     problem: Problem, names: list[str], episodes: int, measurements: int, compilers: Compilers
 ) -> Iterator[dict[str, Any]]:
-    """A line for each competitor."""
+    """Yield a line for each competitor."""
     for name in names:
         maker = find_competitor(problem, name).maker
         line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
@@ -245,7 +244,7 @@ def lines(
         operations, state, weights, _ = writer.sizes
         line |= {"operations": operations, "state_bytes": state, "weight_bytes": weights}
         if operations > 10_000:
-            # What takes a compiler minutes is run in float by NumPy.
+            # A program that takes a compiler minutes runs in float by NumPy.
             line["float_sigmas"] = given.largest_difference(
                 run_filter(traced, given, numpy.float32)[:, mean_rows(traced)]
             )
@@ -287,7 +286,7 @@ def summary(found: list[dict[str, Any]]) -> str:
             if key != "float_ns"
         }
         ns = numbers["double_ns"]
-        # What LLVM makes of a program has no network in it.
+        # LLVM's code of a program contains no network.
         faster = (ns / numbers["llvm_ns"])[numbers["weight_bytes"] == 0.0]
         name = environment.removesuffix("-v0")
         cells = [name, f"{len(there)} of {len(own)}"]
@@ -319,24 +318,24 @@ def main() -> None:
     parser.add_argument("--compiler", default=shutil.which("cc"))
     parser.add_argument("--cross", default="", help='such as "arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb"')
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--read", type=Path, help="summarise what --out has written, and run nothing")
-    asked = parser.parse_args()
-    if asked.read is not None:
-        print(summary(list(csv.DictReader(asked.read.open(encoding="utf-8")))))
+    parser.add_argument("--read", type=Path, help="summarise the file of --out without running anything")
+    args = parser.parse_args()
+    if args.read is not None:
+        print(summary(list(csv.DictReader(args.read.open(encoding="utf-8")))))
         return
-    if asked.compiler is None:
+    if args.compiler is None:
         sys.exit("no C compiler here")
     warnings.simplefilter("ignore")
     found: list[dict[str, Any]] = []
-    for id in asked.environment or list(catalogue()):
+    for id in args.environment or list(catalogue()):
         problem = problem_of(id)
-        names = asked.policy or ranked_names(problem)
-        compilers = Compilers(asked.compiler, asked.cross.split())
-        for line in lines(problem, names, asked.episodes, asked.measurements, compilers):
+        names = args.policy or ranked_names(problem)
+        compilers = Compilers(args.compiler, args.cross.split())
+        for line in lines(problem, names, args.episodes, args.measurements, compilers):
             found.append(line)
             print(", ".join(f"{key} {_short(value)}" for key, value in line.items()), flush=True)
-    if asked.out is not None:
-        with asked.out.open("w", newline="", encoding="utf-8") as file:
+    if args.out is not None:
+        with args.out.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
             writer.writerows({key: _short(value) for key, value in line.items()} for line in found)

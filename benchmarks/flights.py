@@ -1,13 +1,13 @@
-"""Every set of real flights at hand, raw and smoothed: which competitors carry over from simulated ones.
+"""All available sets of real flights, raw and smoothed, as a test of competitors beyond simulated flights.
 
     pip install --no-deps traffic
     python benchmarks/flights.py --out docs/data/flights.csv
 
 The sets are samples of ADS-B flights in the Python package ``traffic``, which is read, not imported. A sample of at
-least ``FEWEST`` flights is a set of its own; what else lies in its folder is another one if that has as many, and the
-rest together is "others". Each sample has its radar in the median of its positions, the radar's noise is simulated,
-and scans are 6 s apart. Samples whose positions are more than ``COARSEST`` seconds apart are left out, as are those on
-the ground and those whose errors are the point of them.
+least ``FEWEST`` flights is a set of its own; the other samples of its folder are another one if they have as many
+together, and the rest together is "others". Each sample has its radar in the median of its positions, the radar's noise
+is simulated, and scans are 6 s apart. Samples whose positions are more than ``COARSEST`` seconds apart are left out, as
+are those on the ground and those that demonstrate errors.
 """
 
 import argparse
@@ -24,9 +24,9 @@ from filtergym.names import find_competitors
 ID = "filtergym/ManeuveringTarget-v0"
 FEWEST, COARSEST, INTERVAL, SMOOTHING = 20, 10.0, 6.0, 10.0
 MOST_SCANS = 90_000
-"""Of a set: of a larger one every second flight is flown, or every third, ..."""
+"""Most scans of a set: of a larger one every second flight is used, or every third, ..."""
 LEFT_OUT = ("noisy", "onground")
-"""Folders of what is no flight in the air, or wrong on purpose."""
+"""Folders of samples that are no flights in the air, or that contain deliberate errors."""
 COMPETITORS = (
     "imm",
     "semi-markov",
@@ -47,7 +47,7 @@ METRICS = {
     "win_rate": ("wins", 100.0),
     "anees": ("anees", 1.0),
 }
-"""Records that are kept, their columns and their unit in the table."""
+"""Records in the table, with their columns and units."""
 
 
 def main() -> None:
@@ -103,17 +103,16 @@ def sets(smoothing: float) -> dict[str, Flights]:
         enough = len({*map(flight_of, pieces)}) >= FEWEST
         own.setdefault(folder if enough else "others", []).extend(pieces)
     ordered = sorted(own, key=lambda name: -len(own[name]))
-    return {name: Flights(tuple(_every(own[name])), name) for name in ordered}
+    return {name: Flights(tuple(_thin_pieces(own[name])), name) for name in ordered}
 
 
-def _every(pieces: list) -> list:
-    """Pieces of a set, or every second, third, ... of a set that is too long for one scenario."""
+def _thin_pieces(pieces: list) -> list:
+    """Return the pieces of a set, or every second, third, ... of a set that is too long for one scenario."""
     scans = sum(piece.intervals(INTERVAL) for piece in pieces)
     return pieces[:: 1 + int(scans // MOST_SCANS)]
 
 
 def _rows(own: dict, records: list) -> list[dict]:
-    """Return one row for each competitor."""
     found: dict[str, dict] = {}
     for record in records:
         if record.metric in METRICS and record.window == "all" and record.component in ("", "state"):

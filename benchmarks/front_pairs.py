@@ -2,10 +2,11 @@
 
     python benchmarks/front_pairs.py
 
-Everybody meets the same episodes of the training distribution. Costs are against the quickest agent that learned, times
-in multiples of its. The opponent of a learned competitor is the classical one that costs least in at most its time, and
-the other way round; an asterisk marks who is on the front of all (:func:`~filtergym.evaluation.running.times.front`).
-Differences are geometric means of the episodes' ratios, with 95 % bootstrap intervals.
+All competitors run on the same episodes of the training distribution. Costs are relative to the quickest learned agent,
+times are multiples of its time. The opponent of a learned competitor is the classical one of least cost in at most its
+time, and the other way round; an asterisk marks the competitors on the front of all
+(:func:`~filtergym.evaluation.running.times.front`). Differences are geometric means of the episodes' ratios, with 95 %
+bootstrap intervals.
 """
 
 import argparse
@@ -46,7 +47,7 @@ CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
         ("sage-husa", "gust-imm-tuned", "level-bank-3", "level-bank-4", "level-bank"),
     ),
 }
-"""Episodes, and the classical competitors that are best in some time, by environment."""
+"""Number of episodes, and the classical competitors that are best in some time, by environment."""
 
 
 def main() -> None:

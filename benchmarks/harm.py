@@ -1,12 +1,12 @@
-"""What agents may cost where nobody has trained them: every scenario, and the stresses of ``stresses.py``.
+"""Costs of agents outside their training distribution: every scenario, and the stresses of ``stresses.py``.
 
 Example: python benchmarks/harm.py filtergym/UavAutopilot-v0 --episodes 500 --policy bptt
 
-Each agent flies alone and behind the gate (``gated:NAME``), beside the fallback of that gate, on the test split. A
+Each agent runs alone and behind the gate (``gated:NAME``), and so does the fallback of that gate, on the test split. A
 cell is a scenario or a stress. Harm is counted where the 95 % interval of the cost against the paper's algorithm,
-geometric mean of the episodes' ratios, lies above +2 % as a whole. A track counts as lost where an episode costs ten
-times what it costs the paper, and more than all but one in a hundred of the paper's episodes in that cell.
-``--cells`` prints every cell.
+geometric mean of the episodes' ratios, lies above +2 % as a whole. A track counts as lost where the cost of an episode
+is ten times that of the paper, and above the 99 % quantile of the paper's episodes in that cell. ``--cells`` prints
+every cell.
 """
 
 import argparse
@@ -25,30 +25,30 @@ from filtergym.names import find_competitor
 from filtergym.reports.tables.ranking import HARM
 
 LOST = 10.0
-"""Cost over the paper's from which on a track is lost."""
+"""Smallest ratio of the cost to the paper's of a lost track."""
 CONSISTENT = (0.5, 2.0)
-"""Limits of an ANEES that says how accurate a filter is."""
+"""Limits of the ANEES of a consistent filter."""
 
 
 class Cell(NamedTuple):
-    """What a competitor did in a scenario or under a stress."""
+    """Result of a competitor in a scenario or under a stress."""
 
     name: str
-    """Of the scenario or stress."""
+    """Name of the scenario or stress."""
     ratio: tuple[float, float, float]
-    """Cost against the paper's, and its 95 % interval."""
+    """Ratio of the cost to the paper's, and its 95 % interval."""
     anees: float
     lost: int
-    """Tracks."""
+    """Number of lost tracks."""
 
     @property
     def harms(self) -> bool:
-        """Whether it is significantly above :data:`HARM`."""
+        """Whether the ratio is significantly above :data:`HARM`."""
         return self.ratio[1] > HARM
 
     @property
     def text(self) -> str:
-        """The ratio in per cent."""
+        """Ratio as text, in per cent."""
         return "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100.0 * x for x in self.ratio))
 
 
@@ -69,7 +69,7 @@ def fly(
     split: str,
     cell: tuple[str, str, dict[str, Any]],
 ) -> dict[str, Cell]:
-    """What each competitor did in a cell."""
+    """Return the result of each competitor in a cell."""
     name, scenario, keywords = cell
     run = problem.evaluate(makers, scenario, episodes, split=split, **keywords)
     paper, bootstrap = mean_cost(run, problem.baselines.compared_paper), Bootstrap(run.sizes["episode"])
@@ -85,7 +85,7 @@ def fly(
 
 
 def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
-    """The paper's algorithm, the gate's fallback, and each agent alone and behind the gate."""
+    """Return the paper's algorithm, the gate's fallback, and each agent alone and behind the gate."""
     fallback = problem.baselines.fallback or problem.paper
     first = dict.fromkeys([problem.baselines.compared_paper, fallback])
     makers = {name: problem.competitor(name) for name in first}
@@ -97,7 +97,7 @@ def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
 
 
 def summary(problem: Problem, policy: str, cells: list[Cell]) -> str:
-    """One row of the table."""
+    """Return a row of the table."""
     worst = max(cells, key=lambda cell: cell.ratio[0])
     anees = [cell.anees for cell in cells]
     outside = sum(not CONSISTENT[0] <= value <= CONSISTENT[1] for value in anees)
@@ -115,19 +115,19 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--split", default="test")
     parser.add_argument("--cells", action="store_true", help="print every cell, too")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     table = [
         "| environment | competitor | cells harmed | worst cell | cost against the paper's there, % | ANEES | "
         "outside 0.5 to 2 | tracks lost |\n" + "|---" * 8 + "|"
     ]
-    for id in asked.environment:
+    for id in args.environment:
         problem = problem_of(id)
-        makers = competitors_of(problem, asked.policy or pretrained_agents(problem.id))
+        makers = competitors_of(problem, args.policy or pretrained_agents(problem.id))
         found: dict[str, list[Cell]] = {name: [] for name in makers}
         for cell in cells_of(problem):
-            for name, own in fly(problem, makers, asked.episodes, asked.split, cell).items():
+            for name, own in fly(problem, makers, args.episodes, args.split, cell).items():
                 found[name].append(own)
-                if asked.cells:
+                if args.cells:
                     print(
                         f"{problem.short_name} {own.name} {name} {own.text} ANEES {own.anees:.2f}", flush=True
                     )

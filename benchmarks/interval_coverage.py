@@ -1,11 +1,11 @@
-"""How often nominal 95 % intervals hold the truth, for each statistic of a comparison and several numbers of episodes.
+"""Coverage of nominal 95 % intervals, for each statistic of a comparison and several numbers of episodes.
 
     python benchmarks/interval_coverage.py
 
-The mean costs of many episodes of each competitor are taken for all there are: their own statistics are the truth.
-Episodes are then drawn from them with replacement, again and again, and intervals are made of what was drawn as an
-evaluation makes them. Printed in Markdown: the share of intervals that hold the truth, and where there are misses the
-share of them that lie below it (a half, where misses have no side).
+The mean costs of many episodes of each competitor are the population: their statistics are the truth. Episodes are
+drawn from it with replacement, repeatedly, and intervals are computed from each sample as in an evaluation. Printed in
+Markdown: the share of intervals that contain the truth, and the share of the misses that lie below it (a half for
+symmetric misses).
 """
 
 import argparse
@@ -25,44 +25,44 @@ from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.names import find_competitor
 
 NUMBERS = (100, 200, 1000, 5000)
-"""Episodes of an evaluation."""
+"""Numbers of episodes of an evaluation."""
 CASES = (
     ("ManeuveringTarget", "random", ("semi-markov", "bptt")),
     ("ManeuveringTarget", "clutter", ("semi-markov-pda",)),
     ("LooselyCoupledNavigation", "random", ("fault-bank", "kalman-net")),
     ("TightlyCoupledNavigation", "random", ("fault-hypotheses", "bptt-small")),
 )
-"""Environment, scenario and competitors, each beside the paper's algorithm."""
+"""Environment, scenario and competitors, each compared with the paper's algorithm."""
 STATISTICS = ("geometric mean of ratios", "lost tracks", "ratio of means")
 
 
 class Pool(NamedTuple):
-    """What is taken for all episodes there are."""
+    """Population of episodes."""
 
     paper: numpy.ndarray
-    """Mean cost of every episode, ``(episodes,)``."""
+    """Mean cost of the paper's algorithm in every episode, ``(episodes,)``."""
     own: numpy.ndarray
-    """Likewise."""
+    """Mean cost of the competitor in every episode, ``(episodes,)``."""
     bound: float
-    """Beyond which a track is lost."""
+    """Cost beyond which a track is lost."""
 
 
 def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> numpy.ndarray:
-    """Mean cost of every episode of the validation split, ``(episodes,)``: no table is made of it."""
+    """Return the mean cost of every episode of the validation split, ``(episodes,)``."""
     problem = problem_of(f"filtergym/{environment}-v0")
     split = "validation" if problem.task.scenarios[scenario].training else "test"
     experiment = problem.experiment(scenario, episodes, 1, split)
-    asked = EvaluationRequest(experiment, name, find_competitor(problem, name).maker)
+    request = EvaluationRequest(experiment, name, find_competitor(problem, name).maker)
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
 
-    found: numpy.ndarray = reduce_episodes(asked, declare, lambda done: None).reduction.results()["cost",]
+    found: numpy.ndarray = reduce_episodes(request, declare, lambda done: None).reduction.results()["cost",]
     return found
 
 
 def truths(pool: Pool) -> list[float]:
-    """Every statistic of all episodes, in the order of ``STATISTICS``."""
+    """Return every statistic of all episodes, in the order of ``STATISTICS``."""
     ratio = pool.own / pool.paper
     return [
         float(numpy.expm1(numpy.log(ratio).mean())),
@@ -72,7 +72,7 @@ def truths(pool: Pool) -> list[float]:
 
 
 def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
-    """Every statistic of some episodes with its interval, likewise."""
+    """Return every statistic of some episodes with its interval, in the order of ``STATISTICS``."""
     own, paper = bootstrap.means(numpy.stack([pool.own, pool.paper], axis=1)).T
     return [
         bootstrap.geometric_difference(pool.own, pool.paper),
@@ -82,7 +82,7 @@ def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
 
 
 def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
-    """Share of the intervals of so many episodes that hold the truth, of each statistic, as text."""
+    """Return the share of intervals from a number of episodes that contain the truth, for each statistic, as text."""
     generator, bootstrap = numpy.random.default_rng(number), Bootstrap(number)
     true = numpy.array(truths(pool))
     below, above = numpy.zeros(len(true)), numpy.zeros(len(true))

@@ -1,9 +1,9 @@
-"""Whether references are limits: no competitor may cost significantly less, in any scenario.
+"""Test that references are limits: no competitor may have significantly lower cost, in any scenario.
 
-``python benchmarks/limits.py [ENVIRONMENT ...]`` runs all that is ranked, each under its own control, and the reference
-over the same episodes, a block at a time, and prints for each scenario who costs least, and the mean paired difference
-of its cost to the reference's, in standard errors over the episodes. It ends with status 1 where anybody's is below
--``SIGNIFICANT``.
+``python benchmarks/limits.py [ENVIRONMENT ...]`` runs all ranked competitors, each under its own control, and the
+reference over the same episodes, a block at a time, and prints for each scenario the competitor of least cost, and the
+mean paired difference of its cost to the reference's, in standard errors over the episodes. It exits with status 1
+where a competitor's is below -``SIGNIFICANT``.
 """
 
 import argparse
@@ -30,29 +30,29 @@ SIGNIFICANT = 3.0
 
 
 class Nearest(NamedTuple):
-    """How the competitors of a scenario stand to the reference."""
+    """Comparison of the competitors of a scenario with the reference."""
 
     environment: str
     scenario: str
     reference: str
     episodes: int
     name: str
-    """Of the competitor that costs least."""
+    """Name of the competitor of least cost."""
     relative: float
-    """Its cost over the reference's, less one."""
+    """Ratio of its cost to the reference's, less one."""
     errors: float
-    """Its difference in standard errors."""
+    """Difference of its cost to the reference's, in standard errors."""
     below: list[str]
-    """Names of those that cost significantly less than the reference."""
+    """Names of the competitors of significantly lower cost than the reference."""
 
     @property
     def verdict(self) -> str:
-        """Whether the reference is a limit, in words."""
+        """Verdict on the reference, as text."""
         return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
 
 
-def asked_names(problem: Problem) -> list[str]:
-    """Names of all that is ranked, each under its own control, but random actions."""
+def names_without_random(problem: Problem) -> list[str]:
+    """Return the names of all ranked competitors, each under its own control, without random actions."""
     policies = problem.baselines.policies
     return [name for name in ranked_names(problem) if policies.get(name) is not RandomPolicy]
 
@@ -60,16 +60,16 @@ def asked_names(problem: Problem) -> list[str]:
 def episode_costs(
     problem: Problem, scenario: str, names: Sequence[str], episodes: int, seed: int
 ) -> dict[str, numpy.ndarray]:
-    """Return the mean cost of every episode by name, of the same episodes."""
+    """Return the mean cost of every episode by name, over the same episodes."""
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
 
     experiment = problem.experiment(scenario, episodes, seed)
-    asked = requests_of(problem, experiment, find_competitors(problem, names))
+    requests = requests_of(problem, experiment, find_competitors(problem, names))
     return {
         one.name: reduce_episodes(one, declare, lambda done: None).reduction.results()["cost",]
-        for one in asked
+        for one in requests
     }
 
 
@@ -80,23 +80,25 @@ def nearest(
 
     Args:
         problem: the environment.
-        scenario: its name.
-        episodes: of each competitor.
+        scenario: name of the scenario.
+        episodes: number of episodes of each competitor.
         seed: number of the experiment.
-        names: of competitors; none: all that is ranked.
+        names: names of competitors; none: all ranked ones.
     """
     reference = problem.baselines.score_reference
-    costs = episode_costs(problem, scenario, [*(names or asked_names(problem)), reference], episodes, seed)
-    told = costs.pop(reference)
-    differences = {name: own - told for name, own in costs.items()}
+    costs = episode_costs(
+        problem, scenario, [*(names or names_without_random(problem)), reference], episodes, seed
+    )
+    limit = costs.pop(reference)
+    differences = {name: own - limit for name, own in costs.items()}
     errors = {
-        # Where every episode is the same as the reference's, there is no difference in units of anything.
-        name: float(d.mean() / max(d.std(ddof=1) / numpy.sqrt(episodes), 1e-12 * told.mean()))
+        # Where every episode equals the reference's, the standard error is zero.
+        name: float(d.mean() / max(d.std(ddof=1) / numpy.sqrt(episodes), 1e-12 * limit.mean()))
         for name, d in differences.items()
     }
     name = min(costs, key=lambda each: costs[each].mean())
     below = [name for name, value in errors.items() if value < -SIGNIFICANT]
-    relative = float(costs[name].mean() / told.mean()) - 1.0
+    relative = float(costs[name].mean() / limit.mean()) - 1.0
     return Nearest(problem.id, scenario, reference, episodes, name, relative, errors[name], below)
 
 
@@ -104,17 +106,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("environment", nargs="*", help="default: all")
     parser.add_argument(
-        "--episodes", type=int, default=2000, help="of each competitor; fewer where a measurement is dear"
+        "--episodes", type=int, default=2000, help="of each competitor; fewer where a measurement takes long"
     )
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--policy", action="append", help="default: everything that is ranked")
-    asked = parser.parse_args()
+    parser.add_argument("--policy", action="append", help="default: all ranked competitors")
+    args = parser.parse_args()
     found = []
-    for id in asked.environment or catalogue():
+    for id in args.environment or catalogue():
         problem = problem_of(id)
         for scenario in problem.task.scenarios:
-            episodes = affordable_episodes(problem, scenario, asked.episodes)
-            found.append(nearest(problem, scenario, episodes, asked.seed, asked.policy or ()))
+            episodes = affordable_episodes(problem, scenario, args.episodes)
+            found.append(nearest(problem, scenario, episodes, args.seed, args.policy or ()))
             print(f"{id} {scenario}: {found[-1].verdict}", file=sys.stderr, flush=True)
     header = [
         "environment",

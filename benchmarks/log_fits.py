@@ -1,11 +1,11 @@
-"""Parameters fitted to logs whose true parameters are known: how far off they are, how often their intervals hold, and
-how much likelier the best of many starts is.
+"""Parameters fitted to logs of known true parameters: their errors, the coverage of their intervals, and the gain of
+many starts.
 
 Targets move by the family's own model: ``constant-velocity`` by white acceleration, constant in every interval;
 ``imm-two`` by two sizes of it, between which a Markov chain switches. Every fourth log is clean, has outliers (3 % of
 the plots, 20 deviations away), is a third as long, or is irregular (intervals between a half and three halves).
 
-The likelihood of an interacting multiple model is an approximation, which merges all that happened before. Without
+The likelihood of an interacting multiple model is an approximation, which merges the histories of modes. Without
 outliers the fitted and the true values of ``imm-two`` are therefore also compared by the likelihood of the target's own
 model, a sum over the likeliest sequences of its modes.
 
@@ -35,11 +35,11 @@ TRUE = {
 KINDS = "clean", "outliers", "short", "irregular"
 SEARCHED = "acceleration_quiet", "ratio", "leave_quiet", "leave_noisy", "noise_scale"
 SEQUENCES = 100
-"""Of modes that are kept from one measurement to the next."""
+"""Number of sequences of modes that are kept from one measurement to the next."""
 
 
 def accelerations(family: str, count: int, rng: numpy.random.Generator) -> numpy.ndarray:
-    """Size of the acceleration in every interval, m/s^2."""
+    """Return the size of the acceleration in every interval, m/s^2."""
     true = TRUE[family]
     if family == "constant-velocity":
         return numpy.full(count, true["acceleration"])
@@ -74,23 +74,26 @@ def simulated_log(folder: Path, family: str, measurements: int, seed: int) -> Re
 
 
 def likelihood_of_sequences(recording: Recording, values: dict[str, float]) -> float:
-    """Log-likelihood of a log without gaps under ``imm-two``, nats: of each sequence of modes a Kalman filter, of which
-    the ``SEQUENCES`` likeliest are kept and none are merged. With a ratio of one it is that of one Kalman filter.
+    """Return the log-likelihood of a log without gaps under ``imm-two``, nats. Each sequence of modes has a Kalman
+    filter; the ``SEQUENCES`` likeliest are kept and none are merged. With a ratio of one it is that of one Kalman
+    filter.
 
     Args:
-        recording: of one track.
-        values: of the parameters, as they are searched.
+        recording: recording of one track.
+        values: values of the parameters, in the units of the search.
     """
     quiet, ratio, leave_quiet, leave_noisy, scale = (10.0 ** values[f"log10_{name}"] for name in SEARCHED)
     sizes = numpy.array([quiet, quiet * ratio])
     transitions = numpy.log([[1.0 - leave_quiet, leave_quiet], [leave_noisy, 1.0 - leave_noisy]])
-    said = {name: values[0] for name, values in recording.measurements.items()}
-    # Axes do not depend on each other: states (sequence, axis, 2) of position and velocity.
+    measured = {name: values[0] for name, values in recording.measurements.items()}
+    # Axes are independent: states (sequence, axis, 2) of position and velocity.
     m = numpy.repeat(recording.initial["mean"].reshape(1, 2, 2).swapaxes(1, 2), 2, axis=0)
     whole = recording.initial["covariance"][0] * scale**2
     P = numpy.stack([[whole[axis::2, axis::2] for axis in range(2)]] * 2)
     mode, weight, total = numpy.arange(2), numpy.log([0.5, 0.5]), 0.0
-    for z, variance, interval in zip(said["position"], said["variance"], said["interval"], strict=True):
+    for z, variance, interval in zip(
+        measured["position"], measured["variance"], measured["interval"], strict=True
+    ):
         F, G = numpy.array([[1.0, interval], [0.0, 1.0]]), numpy.array([0.5 * interval**2, interval])
         after = numpy.tile([0, 1], len(mode))
         weight = numpy.repeat(weight, 2) + transitions[numpy.repeat(mode, 2), after]
@@ -103,7 +106,7 @@ def likelihood_of_sequences(recording: Recording, values: dict[str, float]) -> f
         m, P = m + K * residual[..., None], P - K[..., None] * P[..., None, 0, :]
         kept = numpy.argsort(-weight)[:SEQUENCES]
         m, P, mode, weight = m[kept], P[kept], after[kept], weight[kept]
-        weight = weight - numpy.logaddexp.reduce(weight)  # those left out would have predicted as these do
+        weight = weight - numpy.logaddexp.reduce(weight)  # the dropped ones have nearly the same predictions
     return float(total)
 
 
@@ -114,26 +117,28 @@ def main() -> None:
     parser.add_argument("--logs", type=int, default=20)
     parser.add_argument("--measurements", type=int, default=300)
     parser.add_argument("--family", choices=sorted(TRUE), default="constant-velocity")
-    parser.add_argument("--starts", type=int, default=0, help="compare with the best of so many starts")
-    asked = parser.parse_args()
+    parser.add_argument(
+        "--starts", type=int, default=0, help="compare with the best of this number of starts"
+    )
+    args = parser.parse_args()
     problem = problem_of(ID)
-    true = {f"log10_{name}": math.log10(value) for name, value in TRUE[asked.family].items()}
+    true = {f"log10_{name}": math.log10(value) for name, value in TRUE[args.family].items()}
     true["log10_noise_scale"] = math.log10(SIGMA / STATED)
     errors, inside, widths = ({name: [] for name in true} for _ in range(3))
     below, likelier = [], []
     with tempfile.TemporaryDirectory() as folder:
-        for seed in range(asked.logs):
-            recording = simulated_log(Path(folder), asked.family, asked.measurements, seed)
-            family = families_of(problem, recording)[asked.family]
+        for seed in range(args.logs):
+            recording = simulated_log(Path(folder), args.family, args.measurements, seed)
+            family = families_of(problem, recording)[args.family]
             _, found, intervals = fit_all(FittedLog(problem, recording), family)
             others = [found.log_likelihood]
-            for start in range(1, asked.starts):
+            for start in range(1, args.starts):
                 rng = numpy.random.default_rng(1000 + start)
                 begin = {name: rng.uniform(low, high) for name, (low, high) in family.limits.items()}
                 other = dataclasses.replace(family, start=begin)
                 others.append(fit_all(FittedLog(problem, recording, seed=start), other)[1].log_likelihood)
             below.append(max(others) - others[0])
-            if asked.family == "imm-two" and KINDS[seed % len(KINDS)] != "outliers":
+            if args.family == "imm-two" and KINDS[seed % len(KINDS)] != "outliers":
                 both = (likelihood_of_sequences(recording, values) for values in (true, found.values))
                 likelier.append(next(both) - next(both))
             for name, value in true.items():
@@ -157,9 +162,9 @@ def main() -> None:
             f"{sum(nats > 0.0 for nats in likelier)} of {len(likelier)} logs without outliers, by "
             f"{numpy.mean(likelier):.1f} nats in the mean"
         )
-    if asked.starts:
+    if args.starts:
         most, mean = max(below), numpy.mean(below)
-        print(f"nats below the best of {asked.starts} starts: {most:.2f} at most, {mean:.2f} in the mean")
+        print(f"nats below the best of {args.starts} starts: {most:.2f} at most, {mean:.2f} in the mean")
 
 
 if __name__ == "__main__":

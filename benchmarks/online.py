@@ -1,8 +1,9 @@
-"""Filters in a loop of one's own: the same bits as a replay, and the time of an update beside filterpy and Stone Soup.
+"""Filters in a user's loop: equality of bits with a replay, and the time of an update compared with filterpy and Stone
+Soup.
 
-Tracks with scans that missed the target are written as a log. Each is replayed by an evaluation, and fed row by row to
-the running filter, which is saved and restored by pickle on the way. Then every filter takes the same plots, one track,
-some updates after the others in turn; the times are of the processor. A peer that is not installed is left out.
+Tracks with scans that missed the target are written as a log. Each is replayed by an evaluation, and passed row by row
+to the running filter, which is saved and restored by pickle in between. Then every filter processes the same plots of
+one track, in rounds of updates in turn; the times are of the processor. A peer that is not installed is left out.
 
 Example: python benchmarks/online.py --tracks 5 --plots 2000
 """
@@ -27,7 +28,7 @@ ID = "filtergym/ManeuveringTarget-v0"
 COMPETITORS = ("imm", "kalman-imm", "kalman-imm-turn", "adaptive-rearm", "sage-husa", "bptt", "kalman-net")
 PEER, PEER_OF_TWO = "filterpy, IMM of two Kalman filters", "filterpy, Kalman filter of two states"
 OF_TWO = "Kalman filter of two states"
-"""A model of one's own; what it is, beside filterpy's of the same."""
+"""Names of a user's model, and of filterpy's filter of the same model."""
 ROUND = 100
 """Updates of one filter before the next one's turn."""
 T, SIGMA, MISSED, SAVED_EVERY = 4.0, 100.0, 0.1, 500
@@ -52,7 +53,7 @@ def write_log(path: Path, tracks: int, plots: int) -> numpy.ndarray:
 
 
 def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> tuple[int, int]:
-    """Count updates, and those whose estimate is not that of the replay to the last bit."""
+    """Count updates, and those whose estimate differs from that of the replay in any bit."""
     replayed = filtergym.evaluate(
         ID, name, recording, episodes=len(recording.names), tracks=True, sampling_interval=T
     )
@@ -84,7 +85,7 @@ def own_update(name: str, backend: str) -> Callable[[float, float, float], objec
 
 
 def own_update_of_two() -> Callable[[float, float, float], object]:
-    """Return an update of a Kalman filter of a model of one's own."""
+    """Return an update of a Kalman filter of a user's model."""
     filtergym.state_space(
         "mine/OfTwo-v0", f=[[1, 1.0], [0, 1]], h=[[1, 0]], Q=[[0.25, 0.5], [0.5, 1.0]], R=[[25.0]],
         mean=[0, 10], covariance=[[100, 0], [0, 25]],
@@ -166,7 +167,7 @@ def stone_soup_update() -> Callable[[float, float, float], object]:
 def latencies(
     cases: Mapping[str, Callable[[float, float, float], object]], updates: int
 ) -> dict[str, numpy.ndarray]:
-    """Return processor seconds of each update of each filter, after some that are not counted."""
+    """Return processor seconds of each update of each filter, after a warm-up."""
     rng = numpy.random.default_rng(1)
     plots = numpy.array([2e4, 3e4]) + SIGMA * rng.standard_normal((updates + ROUND, 2))
     found = {name: numpy.empty(len(plots)) for name in cases}
@@ -188,10 +189,10 @@ def main() -> None:
     parser.add_argument("--tracks", type=int, default=5)
     parser.add_argument("--plots", type=int, default=2000, help="of each track")
     parser.add_argument("--updates", type=int, default=5000, help="that are timed")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
-        table = write_log(path, asked.tracks, asked.plots)
+        table = write_log(path, args.tracks, args.plots)
         recording = read_recording(path, ID, speeds=(0.001, 1000.0), sampling_interval=T)
         for name in COMPETITORS:
             count, differing = differing_updates(name, recording, table)
@@ -204,7 +205,7 @@ def main() -> None:
     for name, make in {**peers, "Stone Soup, one Kalman filter": stone_soup_update}.items():
         with suppress(ImportError):
             cases[name] = make()
-    found = latencies(cases, asked.updates)
+    found = latencies(cases, args.updates)
     rows = []
     for name, seconds in found.items():
         median, late = numpy.median(seconds), numpy.quantile(seconds, 0.999)

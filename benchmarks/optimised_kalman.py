@@ -8,8 +8,8 @@ Greenberg, Yannay and Mannor, "Optimization or Architecture: How to Hack Kalman 
 fits all entries of Q and R, through Cholesky factors, by descent on the squared error of tracks with truth. It takes
 matrices; where the model is not linear, a subclass of a few lines linearises it as the extended Kalman filter does.
 
-It is trained on simulated episodes of the training split. The Q and R that it finds are judged in our Kalman filter, on
-the episodes of all others; a check shows that the package's filter gives the same estimates. The record is
+It is trained on simulated episodes of the training split. The resulting Q and R are judged in our Kalman filter, on the
+episodes of all other filters; a check compares the estimates with those of the package's filter. The record is
 ``public_optimised``.
 """
 
@@ -31,18 +31,18 @@ import filtergym
 from filtergym.evaluation.storage.files import write_text
 
 SEEDS = 3
-"""Training runs, unless the command says otherwise."""
+"""Default number of training runs."""
 TRACKS, LENGTH = 200, 100
-"""Of a training run: simulated tracks, of which the package validates on 15 %, and measurements of each."""
+"""Simulated tracks of a training run, of which the package validates on 15 %, and measurements of each."""
 RATE = 0.1
-"""Of learning. Each track is seen once and a step takes ten, the package's defaults; its rate is 0.01."""
+"""Learning rate. Each track is used once and a step takes ten, the package's defaults; its rate is 0.01."""
 CHECKED, AGREE = 3, 1e-9
 """Tracks on which both filters are compared, and the largest difference of their errors."""
 NAME = "public_optimised"
 
 
 class Problem(NamedTuple):
-    """What the filters believe."""
+    """Model of the filters."""
 
     name: str
     id: str
@@ -50,9 +50,9 @@ class Problem(NamedTuple):
     """A matrix, or the order of the series."""
     h: numpy.ndarray
     start: float
-    """Every entry of the initial mean."""
+    """Value of every entry of the initial mean."""
     certainty: float
-    """Every variance of its error."""
+    """Value of every variance of its error."""
     stored: bool = False
     """Whether it is judged on KalmanNet's stored set."""
 
@@ -83,7 +83,7 @@ class ExtendedOptimised(okf.OKF):  # type: ignore[misc]
         term, slope = x, torch.eye(3, dtype=x.dtype)
         self.x, F = term, slope
         for j in range(1, self.order + 1):
-            # A term is A(x) times the one before; the entries of A hold x, too.
+            # A term is A(x) times the one before; the entries of A depend on x, too.
             by_entries = torch.stack([*5 * [zero], -term[0], zero, term[0], zero]).reshape(3, 3)
             slope = (public.INTERVAL / j) * (A @ slope + by_entries)
             term = (public.INTERVAL / j) * (A @ term)
@@ -91,7 +91,7 @@ class ExtendedOptimised(okf.OKF):  # type: ignore[misc]
         self.P = F @ self.P @ F.T + okf.OKF.get_SPD(self.Q_D, self.Q_L)
 
     def estimate_noise(self, X: list[numpy.ndarray], Z: list[numpy.ndarray]) -> None:
-        """Begin with the covariances of what the believed model leaves, as the package does of matrices."""
+        """Start from the covariances of the residuals of the filters' model, as the package does for matrices."""
         left = [x[1:] - numpy.stack(public.taylor(x[:-1].T, self.order), axis=1) for x in X]
         noises = (
             numpy.cov(numpy.concatenate(left).T),
@@ -131,7 +131,9 @@ def estimates_of(model: okf.OKF, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def optimise(problem: Problem, seed: int) -> dict[str, Any]:
-    """Train the package's filter, and compare it with ours; returns Q, R, seconds and that difference."""
+    """Train the package's filter, and compare it with ours; return Q, R, seconds and the largest difference of their
+    errors.
+    """
     torch.manual_seed(seed)
     recording = filtergym.record(problem.id, episodes=TRACKS, seed=seed, split="train", horizon=LENGTH)
     assert recording.truth is not None
@@ -151,7 +153,7 @@ def optimise(problem: Problem, seed: int) -> dict[str, Any]:
 
 
 def run_file(folder: Path, problem: Problem, seed: int) -> Path:
-    """Return where the result of a training run is kept."""
+    """Return the path of the result of a training run."""
     return folder / f"{problem.id.replace('/', '.')}.{seed}.json"
 
 
@@ -162,13 +164,13 @@ def main() -> None:
     )
     parser.add_argument("--kalmannet", type=Path, required=True, help="folder of KalmanNet_TSP")
     parser.add_argument(
-        "--runs", type=Path, default=Path("runs/optimised"), help="what training runs have found"
+        "--runs", type=Path, default=Path("runs/optimised"), help="folder of the results of training runs"
     )
     parser.add_argument("--seeds", type=int, default=SEEDS, help="training runs")
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
-    # Every problem once, before any is trained a second time: a table that is cut short says how many runs it has.
+    # Every problem once, before a second training of any: an incomplete table states its number of runs.
     for seed in range(options.seeds):
         for problem in PROBLEMS:
             file = run_file(options.runs, problem, seed)

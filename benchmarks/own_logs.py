@@ -2,8 +2,8 @@
 
 python benchmarks/own_logs.py
 
-The machines and their models are docs/examples/own_logs. What is fitted to one log is judged on ten others. The limit
-is our filter with the factors on Q and R that have the least error on these ten: nobody knows them beforehand.
+The machines and their models are docs/examples/own_logs. A filter that is fitted to one log is judged on ten others.
+The limit is our filter with the factors on Q and R of least error on these ten, which are unknown beforehand.
 """
 
 import argparse
@@ -33,17 +33,19 @@ from filtergym.papers.grid import markdown_table
 
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples" / "own_logs"
 LATE = 0.15
-"""Of the camera, s."""
+"""Delay of the camera, s."""
 COLUMNS = ("machine", "filter", "RMSE", "of filterpy's", "factors", "processor time, s")
 CANDIDATES = 40
-"""Factors that are tried for the limit, three times, each time closer to the best."""
+"""Candidate factors for the limit, refined three times around the best."""
 
 
-# --- filters of filterpy, of rows of a log by column
+# --- filters of filterpy, which read rows of a log by column
 
 
 def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Data sheets: GPS 3 m, odometry 0.2 m/s; Q by hand: white acceleration of 2 m/s^2 in a second."""
+    """Filter GPS and odometry. Data sheets: GPS 3 m, odometry 0.2 m/s; Q by hand: white acceleration of 2 m/s^2 in a
+    second.
+    """
     kf, last = KalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([100.0, 100, 25, 25]), []
     columns = ("time", "gps_x", "gps_y", "odometry_x", "odometry_y")
@@ -61,7 +63,9 @@ def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Data sheets: gauge 2 cm, stick 1 cm; by hand: a rate that wanders by 0.02 m/h in an hour, 5 cm of drift a day."""
+    """Filter a level gauge and a stick. Data sheets: gauge 2 cm, stick 1 cm; by hand: a rate that wanders by 0.02 m/h
+    in an hour, 5 cm of drift a day.
+    """
     kf, last = KalmanFilter(3, 1), 0.0
     kf.x, kf.P, found = np.array([10.0, 0, 0]), np.diag([0.01, 0.0025, 0.0025]), []
     for t, gauge, stick in zip(log["time"] / 3600, log["gauge"], log["stick"], strict=True):
@@ -79,7 +83,9 @@ def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
-    """By hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad since the drone accelerates; innovations wrapped."""
+    """Filter pitch and roll. By hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad since the drone accelerates;
+    innovations wrapped.
+    """
     kf, last = ExtendedKalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([0.01, 0.01, 0.0025, 0.0025]), []
     rows = zip(*(log[n] for n in ("time", "gyro_p", "gyro_q", "roll_angle", "pitch_angle")), strict=True)
@@ -99,7 +105,9 @@ def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def battery(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Data sheets: current 50 mA, voltage 10 mV; Q by hand: a charge that wanders by 0.1 % and 1 mV in a minute."""
+    """Filter the charge of a battery. Data sheets: current 50 mA, voltage 10 mV; Q by hand: a charge that wanders by
+    0.1 % and 1 mV in a minute.
+    """
     kf, last = ExtendedKalmanFilter(2, 1), 0.0
     kf.x, kf.P, found = np.array([0.8, 0]), np.diag([0.01, 1e-4]), []
     slope = lambda s: np.array([[0.9 - 1.2 * s[0] + 1.65 * s[0] ** 2, -1.0]])  # noqa: E731
@@ -116,7 +124,9 @@ def battery(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def late_vision(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Data sheets: camera 2 cm, accelerometer 0.1 m/s^2; a late fix is moved on by the velocity times its delay."""
+    """Filter late camera fixes. Data sheets: camera 2 cm, accelerometer 0.1 m/s^2; a late fix is moved on by the
+    velocity times its delay.
+    """
     kf, dt, late = KalmanFilter(3, 1, 1), 0.01, round(LATE / 0.01)
     kf.x, kf.P, found = np.zeros(3), np.diag([0.01, 0.1, 0.04]), []
     kf.F, kf.B = np.array([[1, dt, -(dt**2) / 2], [0, 1, -dt], [0, 0, 1]]), np.array([dt**2 / 2, dt, 0])
@@ -138,7 +148,7 @@ BY_HAND = {one.__name__: one for one in (gps_odometry, level_gauge, pitch_roll, 
 
 
 def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndarray:
-    """RMSE of the components that count, of every candidate and episode, ``(C, E)``."""
+    """Return the RMSE of the components that count, of every candidate and episode, ``(C, E)``."""
     episodes = len(recording.rows)
     spans = [Span(number, 0, int(rows)) for number, rows in enumerate(recording.rows)]
     windows = cut_windows(recording, task, spans, 0)
@@ -157,7 +167,7 @@ def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndar
 
 
 def limit(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
-    """Factors of the least error."""
+    """Return the factors of the least error."""
     rng, best, width = np.random.default_rng(0), np.zeros(len(names)), 2.0
     for _ in range(3):
         tried = best + width * rng.uniform(-1.0, 1.0, (CANDIDATES, len(names)))
@@ -167,7 +177,7 @@ def limit(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
 
 
 def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[str, float]) -> np.ndarray:
-    """RMSE of each log with fixes that arrive late, ``(E,)``."""
+    """Return the RMSE of each log with fixes that arrive late, ``(E,)``."""
     found = []
     for log in logs:
         seen = np.isfinite(log["camera"])
@@ -179,7 +189,7 @@ def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[st
 
 
 def processor_time(name: str, folder: Path) -> float:
-    """Of the three commands of the page, which fit, judge and export, s."""
+    """Return the processor time of the three commands of the page, which fit, judge and export, s."""
     machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", used()
     for words in (
         ["advise", folder / f"{name}.csv", "--environment", machine, "--out", filter],
@@ -203,19 +213,19 @@ def processor_time(name: str, folder: Path) -> float:
 
 
 def used() -> float:
-    """Processor time of the processes that this one has waited for, s."""
+    """Return the processor time of the processes that this one has waited for, s."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 
 
 def problem_id(name: str) -> str:
-    """Id of the environment of a machine."""
+    """Return the id of the environment of a machine."""
     module = importlib.import_module(name)
     return next(cls.id for cls in vars(module).values() if hasattr(cls, "definition"))
 
 
 def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
-    """Columns of each recording of a table."""
+    """Return the columns of each recording of a table."""
     table = np.genfromtxt(file, delimiter=",", names=True)
     return [
         {name: table[name][table["recording"] == number] for name in table.dtype.names}
@@ -224,7 +234,7 @@ def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
 
 
 def compare(name: str, folder: Path) -> list[list[str]]:
-    """Rows of the table of one machine."""
+    """Return the rows of the table of one machine."""
     module = importlib.import_module(name)
     problem = problem_of(problem_id(name))
     log, judged = (read_recording(folder / f"{name}{part}.csv", problem.id) for part in ("", "_judged"))

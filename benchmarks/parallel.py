@@ -1,7 +1,7 @@
-"""Many processes against one: the same records, the time they take, and the memory.
+"""Many processes against one: equality of records, time and memory.
 
-``python benchmarks/parallel.py`` prints what docs/many_cores.md shows; ``--cluster`` kills a worker and then a node of
-a cluster of Ray, ``--memory N`` evaluates N episodes with ten competitors.
+``python benchmarks/parallel.py`` prints the results in docs/many_cores.md; ``--cluster`` kills a worker and then a node
+of a cluster of Ray, ``--memory N`` evaluates N episodes with ten competitors.
 """
 
 import argparse
@@ -21,7 +21,7 @@ COMPETITORS = (
 
 
 def tree(root: int) -> list[int]:
-    """Process ids of a process and all that it began, from /proc."""
+    """Return the process ids of a process and all its descendants, from /proc."""
     parents = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -35,7 +35,7 @@ def tree(root: int) -> list[int]:
 
 
 def resident(processes: list[int]) -> float:
-    """Memory of processes together, GiB; what they share is shared out among them."""
+    """Return the memory of processes together, GiB; shared memory counts once."""
     total = 0
     for process in processes:
         try:
@@ -47,7 +47,7 @@ def resident(processes: list[int]) -> float:
 
 
 def filtergym(*words: str) -> tuple[float, float, float]:
-    """Run a command; return its seconds, seconds of processors, and most memory of all its processes together, GiB."""
+    """Run a command; return its seconds, seconds of processors, and peak memory of all its processes together, GiB."""
     began, most = time.monotonic(), 0.0
     command = [sys.executable, "-m", "filtergym", *words]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -63,7 +63,7 @@ def filtergym(*words: str) -> tuple[float, float, float]:
 
 
 def results(folder: Path) -> str:
-    """Everything that a benchmark has found, without the command that says how it was spread."""
+    """Return all results of a benchmark, without the command, which differs between the runs."""
     return (folder / "results.json").read_text(encoding="utf-8").partition("\n")[2]
 
 
@@ -103,7 +103,7 @@ def command_of(process: int) -> str:
 
 
 def killing(words: list[str]) -> None:
-    """A cluster of two nodes; after some results a worker is killed, then a node with everything on it."""
+    """Run on a cluster of two nodes; after some results kill a worker, then a node with all its processes."""
     import ray
     from ray.cluster_utils import Cluster
 

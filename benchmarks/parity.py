@@ -1,10 +1,10 @@
-"""How far compiled steps are from NumPy's: whole episodes in every environment, control and scenario.
+"""Differences of compiled steps from NumPy's: whole episodes in every environment, control and scenario.
 
     python benchmarks/parity.py [--environment ID] [--episodes N]
 
-Both backends fly the same episodes with the same random actions. The differences are of rounding: functions of the
+Both backends run the same episodes with the same random actions. The differences are of rounding: functions of the
 vector library, sums in another order, products with a constant zero that are left out. They grow where a filter is
-unstable or decides by a threshold. Shown are the largest differences of an observation and of a reward over all
+unstable or decides by a threshold. The table shows the largest differences of an observation and of a reward over all
 episodes and steps, ``|compiled - numpy| / (1 + |numpy|)``, and the median over the episodes of their largest.
 """
 
@@ -28,18 +28,18 @@ class Parity(NamedTuple):
     observation: float
     reward: float
     median: float
-    """Over episodes, of the largest difference of an observation."""
+    """Median over episodes of the largest difference of an observation."""
 
 
 def parity(id: str, control: str, scenario: str, episodes: int, decisions: int | None = None) -> Parity:
-    """Fly episodes on both backends.
+    """Run episodes on both backends.
 
     Args:
         id: environment.
-        control: what random actions steer.
+        control: control of the random actions.
         scenario: name.
-        episodes: number of them, side by side.
-        decisions: of each; default: whole episodes.
+        episodes: number of episodes, side by side.
+        decisions: decisions of each; default: whole episodes.
     """
     envs = [
         gymnasium.make_vec(
@@ -72,7 +72,7 @@ def _difference(one: numpy.ndarray, other: numpy.ndarray) -> numpy.ndarray:
 
 
 def all_parities(ids: list[str], episodes: int) -> Iterator[Parity]:
-    """Every control in every scenario."""
+    """Yield the differences of every control in every scenario."""
     for id in ids:
         for control in catalogue()[id].controls:
             for scenario in catalogue()[id].scenarios:

@@ -1,6 +1,6 @@
 """Peer of the compiled steps: the text of an environment's own step on ``jax.numpy``, under ``jax.jit``.
 
-It computes what a compiled step computes (world, filter, reward, observation), in float64, from noise that is given.
+It computes the same as a compiled step (world, filter, reward, observation), in float64, from given noise.
 JAX is no dependency of the project: ``pip install jax``.
 """
 
@@ -31,7 +31,7 @@ def jitted_step(id: str, control: str, size: int, **keywords: Any) -> Callable[[
     import jax.numpy
 
     jax.config.update("jax_enable_x64", True)
-    # Arrays that are traced say where they are, so that constants can be put beside them; on the processor: nowhere.
+    # Traced arrays have a device, on which constants can be placed; on the processor it is None.
     jax.core.Tracer.device = None
     cls = import_task(id)
     lanes = Lanes(Model(make_task(cls, **keywords), control), size)

@@ -1,12 +1,12 @@
-"""What somebody gets who tries reinforcement learning for ten minutes: Stable-Baselines3 with its defaults.
+"""Results of ten minutes of reinforcement learning: Stable-Baselines3 with its defaults.
 
     python benchmarks/plain_ppo.py --out plain_ppo.json
     python benchmarks/plain_ppo.py --algo sac --out plain_sac.json
     python benchmarks/plain_ppo.py --algo sac --set ent_coef=0.001 --split validation --out less_entropy.json
 
 One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 in
-TightlyCoupledNavigation), five training seeds; then the deterministic policy, the action zero and the paper's
-algorithm meet the same episodes of the test split. Runs that a file holds are not repeated.
+TightlyCoupledNavigation), five training seeds; then the deterministic policy, the action zero and the paper's algorithm
+run on the same episodes of the test split. Runs in the file are not repeated.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.engine.catalogue import bare_name
 
 LONG = {"filtergym/TightlyCoupledNavigation-v0"}
-"""Where a decision holds for ten measurements of three filters: fewer of them, and fewer episodes."""
+"""Environments in which a decision takes ten measurements of three filters: fewer decisions, and fewer episodes."""
 
 
 POLICIES = {"ppo": "MlpPolicy", "recurrent-ppo": "MlpLstmPolicy", "sac": "MlpPolicy"}
@@ -52,7 +52,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--episodes", type=int, default=2000, help="of the test; a fifth in TightlyCoupledNavigation"
     )
-    parser.add_argument("--split", default="test", help="whose episodes the policies meet")
+    parser.add_argument("--split", default="test", help="split of the episodes of the policies")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="in place of the algorithm's default"
     )
@@ -85,7 +85,7 @@ def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
     paper = baselines_of(id).score_paper
     nothing = filtergym.FunctionPolicy(lambda shown: numpy.zeros((len(shown), *env.action_space.shape)))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a model that is not normalised, and was not
+        warnings.simplefilter("ignore")  # of a model without normalisation
         results = filtergym.evaluate(
             id,
             {"plain": model, paper: paper, "nothing": nothing},
@@ -112,7 +112,7 @@ def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
 
 
 def table(runs: list[dict]) -> Table:
-    """Mean over the seeds with Student's interval for a new one, and every seed."""
+    """Return the mean over the seeds with Student's interval for a new one, and every seed."""
     from scipy.stats import t
 
     title = "Stable-Baselines3, its defaults and ours: cost against the paper, %"

@@ -1,15 +1,15 @@
-"""Other people's problems as environments of ours: KalmanNet's linear and Lorenz problems, and NCLT's drives.
+"""Published problems as environments: KalmanNet's linear and Lorenz problems, and NCLT's drives.
 
     git clone https://github.com/KalmanNet/KalmanNet_TSP
     git clone https://github.com/SongJgit/filternet
     python benchmarks/public_problems.py --kalmannet KalmanNet_TSP --filternet filternet --runs runs/public
 
-It tunes, trains and judges, and writes the records ``public_problems`` and ``public_drives``; agents and tuned
-values of an earlier call in ``--runs`` are taken as they are. Nothing of these repositories is imported, and nothing of
-them is kept but figures; tensors are read with ``torch.load(weights_only=True)``.
+It tunes, trains and judges, and writes the records ``public_problems`` and ``public_drives``; agents and tuned values
+of an earlier call in ``--runs`` are used unchanged. No code of these repositories is imported, and only figures of them
+are stored; tensors are read with ``torch.load(weights_only=True)``.
 
-Tuning and training see simulated episodes of the training split alone (NCLT: the two validation drives). Judged are the
-stored test sets, or simulated episodes of the test split.
+Tuning and training use simulated episodes of the training split alone (NCLT: the two validation drives). Filters are
+judged on the stored test sets, or on simulated episodes of the test split.
 """
 
 import argparse
@@ -39,13 +39,13 @@ from filtergym.evaluation.statistics.bootstrap import Bootstrap
 
 MODULE = Path(__file__).stem
 ALGORITHMS = {"kalman-net": (), "bptt": ("--control", "noise"), "ppo": ("--control", "noise")}
-"""Learned filters, and what else their training is told."""
+"""Learned filters, and further options of their training."""
 SEEDS = 3
 """Training runs of each learned filter."""
 TEST_EPISODES = 1000
-"""Of simulated problems."""
+"""Test episodes of simulated problems."""
 TUNING_BUDGET = 2_000_000
-"""Measurements that the search of two scales may spend."""
+"""Budget of the search of two scales, in measurements."""
 
 # --- linear, two states: main_linear_canonical.py and its parameters
 
@@ -85,7 +85,7 @@ INTERVAL = 0.02
 
 
 def taylor(x: Any, order: int) -> list[Any]:
-    """KalmanNet's transition: the Taylor series of ``exp(A(x) T)`` to some order, applied to the state."""
+    """Return KalmanNet's transition: the Taylor series of ``exp(A(x) T)`` to some order, applied to the state."""
     answer, term = list(x), list(x)
     for j in range(1, order + 1):
         term = [entry * (INTERVAL / j) for entry in _product(x, term)]
@@ -94,12 +94,12 @@ def taylor(x: Any, order: int) -> list[Any]:
 
 
 def _product(x: Any, y: Sequence[Any]) -> list[Any]:
-    """``A(x) y``; with y = x the derivative of the state."""
+    """Return ``A(x) y``; with y = x the derivative of the state."""
     return [10.0 * (y[1] - y[0]), 28.0 * y[0] - y[1] - x[2] * y[0], x[1] * y[0] - (8.0 / 3.0) * y[2]]
 
 
 def flow(x: Any, steps: int = 4) -> list[Any]:
-    """The attractor over an interval, by Runge and Kutta's method of fourth order."""
+    """Return the state of the attractor after an interval, by Runge and Kutta's method of fourth order."""
     T, state = INTERVAL / steps, list(x)
 
     def ahead(slope: Sequence[Any], share: float) -> list[Any]:
@@ -116,12 +116,12 @@ def flow(x: Any, steps: int = 4) -> list[Any]:
 
 
 def order_five(x: Any) -> list[Any]:
-    """Transition of the generator, and of a filter with full information."""
+    """Return the transition of the generator, and of a filter with full information."""
     return taylor(x, 5)
 
 
 def order_two(x: Any) -> list[Any]:
-    """Transition of a filter with partial information."""
+    """Return the transition of a filter with partial information."""
     return taylor(x, 2)
 
 
@@ -149,7 +149,7 @@ DECIMATED: dict[str, Any] = {
     "switching": False,
     "horizon": 500,
 }
-"""r^2 = 1. KalmanNet's world has no process noise; so little here keeps the reference's covariance definite. The
+"""r^2 = 1. KalmanNet's world has no process noise; a small one here keeps the reference's covariance definite. The
 filters' Q is KalmanNet's, 0.3873^2."""
 LorenzDecimated = filtergym.state_space(
     "public/LorenzDecimated-v0",
@@ -161,13 +161,13 @@ LorenzDecimated = filtergym.state_space(
 # --- NCLT
 
 STATES = ("x", "y", "speed", "heading", "rate", "error")
-"""North and east (m), speed (m/s), heading (rad), its rate (rad/s), and what the compass reads beyond it (rad)."""
+"""North and east (m), speed (m/s), heading (rad), its rate (rad/s), and the offset of the compass from it (rad)."""
 WHEEL_SCALE = 1.075
 """Speed by the wheels over that of the truth, in both validation drives."""
 
 
 def drive(x: Any) -> list[Any]:
-    """Forward along the heading for a second."""
+    """Return the state after a second forward along the heading."""
     middle = x[3] + 0.5 * x[4]
     return [
         x[0] + x[2] * numpy.cos(middle),
@@ -182,7 +182,7 @@ def drive(x: Any) -> list[Any]:
 Drives = filtergym.state_space(
     "public/Drives-v0",
     f=drive,
-    # Deviations in a second: beyond the model 0.1 m; speed and rate may change as they like; of the compass 1 mrad.
+    # Deviations in a second: beyond the model 0.1 m; speed and rate may change freely; of the compass 1 mrad.
     Q={
         "slip": numpy.diag([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]) ** 2,
         "motion": numpy.diag([0.0, 0.0, 0.5, 0.01, 0.3, 0.0]) ** 2,
@@ -205,7 +205,7 @@ Drives = filtergym.state_space(
 TUNED = ("receiver_noise", "slip_noise", "magnetism_noise", "compass_noise")
 """Factors on R and Q that are tuned."""
 STARTS = ([2.0, 0.0, 0.0, 0.6], [3.0, 0.0, 2.0, 2.0])
-"""Of the search, their decimal logarithms."""
+"""Starts of the search, as decimal logarithms."""
 
 
 class WithNoises(Extended):
@@ -214,7 +214,7 @@ class WithNoises(Extended):
     Args:
         task: the problem.
         Q: covariance of the process noise, ``(n, n)``.
-        R: of the measurement noise, ``(m, m)``.
+        R: covariance of the measurement noise, ``(m, m)``.
     """
 
     def __init__(self, task: Any, Q: numpy.ndarray, R: numpy.ndarray) -> None:
@@ -222,16 +222,16 @@ class WithNoises(Extended):
         self.Q, self.R = (task.constant(noise)[:, :, None] for noise in (Q, R))
 
     def process_noise(self, mean: Any, measurement: Any) -> Any:
-        """Its own, whatever the state."""
+        """Return the given Q for any state."""
         return self.Q
 
     def sensor_noise(self, mean: Any, measurement: Any) -> Any:
-        """Its own, whatever the state."""
+        """Return the given R for any state."""
         return self.R
 
 
 def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
-    """Return what makes a Kalman filter with these noises."""
+    """Return the maker of a Kalman filter with these noises."""
 
     def make(task: Any) -> WithNoises:
         return WithNoises(task, Q, R)
@@ -251,7 +251,7 @@ def read_tensors(file: Path) -> Any:
 
 
 def stored_linear(folder: Path, id: str) -> Recording:
-    """KalmanNet's stored test set of the linear problem, 200 tracks of 100 measurements."""
+    """Return KalmanNet's stored test set of the linear problem, 200 tracks of 100 measurements."""
     stored = read_tensors(folder / "Simulations/Linear_canonical/data/2x2_rq020_T100.pt")
     z, truth = (part.double().numpy().swapaxes(1, 2) for part in stored[4:6])
     episodes, times, _ = z.shape
@@ -268,11 +268,12 @@ def stored_linear(folder: Path, id: str) -> Recording:
 
 
 def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]:
-    """Drives of filternet's NCLT problem, and the RMSE a coordinate of the receiver alone, held where it is silent.
+    """Return the drives of filternet's NCLT problem, and the RMSE a coordinate of the receiver alone, whose last
+    position stands where it has no fix.
 
     Args:
-        folder: of the repository.
-        name: of the set, ``test`` or ``val``.
+        folder: folder of the repository.
+        name: name of the set, ``test`` or ``val``.
     """
     drives = [
         {key: value.numpy() if hasattr(value, "numpy") else value for key, value in one.items()}
@@ -286,7 +287,7 @@ def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]
     held = {}
     for i, one in enumerate(drives):
         rows = len(one["gps"])
-        # A row holds what wheels, compass and gyroscope said at the row before.
+        # A row contains the readings of wheels, compass and gyroscope at the row before.
         now = numpy.minimum(numpy.arange(rows) + 1, rows - 1)
         left, right, compass, rate = one["wheel"][now].T
         table = numpy.column_stack([one["filtered_gps"], 0.5 * (left + right), compass, rate])
@@ -330,18 +331,18 @@ class Row(NamedTuple):
     anees: float
     nanoseconds: float
     seeds: int
-    """Training runs behind it; one for what is not trained."""
+    """Number of training runs; one for an untrained filter."""
     spread_db: float
-    """From the best run to the worst."""
+    """Difference from the best run to the worst, dB."""
 
 
 def decibels(values: Any) -> Any:
-    """``10 log10``."""
+    """Return ``10 log10``."""
     return 10.0 * numpy.log10(values)
 
 
-def tuned(id: str, name: str, runs: Path) -> Any:
-    """Tune the scales of Q and R of an estimator on training episodes, or take what is stored in ``runs``."""
+def tune_scales(id: str, name: str, runs: Path) -> Any:
+    """Tune the scales of Q and R of an estimator on training episodes, or read the values stored in ``runs``."""
     problem, file = problem_of(id), runs / f"{short_name(id)}.{name}.tuned.json"
     if not file.exists():
         found = tune(problem, name, Search(TUNING_BUDGET, episodes=128))
@@ -352,7 +353,7 @@ def tuned(id: str, name: str, runs: Path) -> Any:
 
 
 def train(id: str, algorithm: str, steps: int, seed: int, runs: Path) -> str:
-    """Train an agent on training episodes, unless ``runs`` has it; returns its folder."""
+    """Train an agent on training episodes, unless ``runs`` contains it; return its folder."""
     folder = runs / f"{short_name(id)}.{algorithm}.{seed}"
     if not (folder / "best").exists():
         words = ["train", f"{MODULE}:{id}", "--algo", algorithm, "--steps", str(steps), "--seed", str(seed)]
@@ -403,37 +404,39 @@ def judge(
 
 
 class Problem(NamedTuple):
-    """A problem of state-space models, and where it is judged."""
+    """A problem of state-space models, and its test set."""
 
     name: str
     id: str
     scales: tuple[float, ...] = ()
-    """Factors on Q that are shown beside the tuned ones."""
+    """Factors on Q that are shown in addition to the tuned ones."""
     recording: Recording | None = None
     """A stored test set; None: simulated test episodes."""
 
 
 def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: Path) -> dict[str, Any]:
-    """Filters of a problem by their names: as written, tuned and trained.
+    """Return the filters of a problem by their names: as written, tuned and trained.
 
     Args:
-        problem: of them.
+        problem: problem of the filters.
         agents: folders of the runs of each algorithm.
-        runs: where tuned values are kept.
+        runs: folder of the tuned values.
     """
     known = problem_of(problem.id).baselines
     untuned = ["extended", *(name for name in ("unscented", "kalman-imm") if name in known.estimators)]
     competitors: dict[str, Any] = {name: name for name in (*untuned, "covariance-matching")}
     for scale in problem.scales:
         competitors[f"extended, Q x {scale:g}"] = Variant(Extended, process_noise=scale)
-    competitors |= {f"{name}, tuned": tuned(problem.id, name, runs) for name in untuned}
+    competitors |= {f"{name}, tuned": tune_scales(problem.id, name, runs) for name in untuned}
     for algorithm, folders in agents.items():
         competitors |= {f"{algorithm}/{seed}": Path(folder) for seed, folder in enumerate(folders)}
     return competitors if problem.recording else {**competitors, "known-model": "known-model"}
 
 
 def tune_drives(recording: Recording) -> dict[str, float]:
-    """Factors with the least squared error over the validation drives, by the simplex method from some starts."""
+    """Return the factors with the least squared error over the validation drives, by the simplex method from some
+    starts.
+    """
     from scipy.optimize import minimize
 
     def cost(logarithms: numpy.ndarray) -> float:
@@ -452,7 +455,7 @@ def tune_drives(recording: Recording) -> dict[str, float]:
 
 
 def judge_drives(folder: Path, runs: Path) -> tuple[list[dict[str, Any]], dict[str, float]]:
-    """RMSE a coordinate of every test drive by the receiver alone and by filters, and the tuned factors."""
+    """Return the RMSE a coordinate of every test drive by the receiver alone and by filters, and the tuned factors."""
     recording, held = stored_drives(folder, "test")
     file = runs / "drives.tuned.json"
     if not file.exists():
@@ -497,19 +500,19 @@ def _text(value: float, digits: int) -> str:
 
 
 def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns and rows of the table of the problems of state-space models."""
+    """Return the columns and rows of the table of the problems of state-space models."""
     rows = []
     if "noise_floor_db" in figures:
         floor = _text(figures["noise_floor_db"], 3)
         rows.append(["linear, stored set", "measurement as it is", floor, "", "", ""])
     for row in figures["rows"]:
-        told = " (reference)" if row["kind"] == "reference" else ""
+        suffix = " (reference)" if row["kind"] == "reference" else ""
         runs = f"{row['seeds']}, {row['spread_db']:.2f} dB apart" if row["seeds"] > 1 else ""
         mse = f"{row['mse_db']:.3f} [{row['low_db']:.2f}, {row['high_db']:.2f}]"
         rows.append(
             [
                 row["problem"],
-                row["name"] + told,
+                row["name"] + suffix,
                 mse,
                 _text(row["anees"], 2),
                 _text(row["nanoseconds"], 0),
@@ -520,7 +523,7 @@ def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns and rows of the table of drives, what is published first."""
+    """Return the columns and rows of the table of drives, published results first."""
     rows = [["published", name, *(_text(v, 2) for v in values), "", ""] for name, values in PUBLISHED.items()]
     for one in figures["drives"]:
         anees = ", ".join(_text(one["anees"][date], 1) for date in DATES) if "anees" in one else ""
@@ -530,7 +533,7 @@ def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECORDS) -> None:
-    """Write a record of each table, with the figures that it is made of."""
+    """Write a record of each table, with its figures."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = {
         PROBLEMS: (problem_table, "noise_floor_db", "rows"),
@@ -554,12 +557,12 @@ def main() -> None:
     parser.add_argument("--filternet", type=Path, help="folder of filternet")
     parser.add_argument("--runs", type=Path, default=Path("runs/public"), help="tuned values and agents")
     parser.add_argument("--jobs", type=int, default=2, help="trainings side by side")
-    parser.add_argument("--only", choices=(PROBLEMS, DRIVES), help="make one record")
+    parser.add_argument("--only", choices=(PROBLEMS, DRIVES), help="write only one record")
     parser.add_argument("--steps", type=int, default=200_000, help="measurements of a training")
     options = parser.parse_args()
     if options.only == DRIVES and not options.filternet:
         parser.error(f"{DRIVES} needs --filternet")
-    # Agents name the module in which their training has found the environment.
+    # Agents store the module of the environment of their training.
     sys.modules[MODULE] = sys.modules["__main__"]
     options.runs.mkdir(parents=True, exist_ok=True)
     command = "python benchmarks/public_problems.py"

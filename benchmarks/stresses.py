@@ -1,8 +1,7 @@
-"""Stresses: flights that no training holds, with parameters outside of their training range, alone and in pairs.
+"""Stresses: flights outside the training distribution, with parameters beyond their training range, alone and in pairs.
 
-Each is what stands in ``usual``, legs or targets of any kind under a scenario without faults, and the keywords of the
-stress. A test holds every one against the training distribution: at least one of its parameters lies beyond all that
-training draws.
+Each consists of ``usual``, legs or targets of any kind under a scenario without faults, and the keywords of the stress.
+A test compares every one with the training distribution: at least one of its parameters lies outside it.
 """
 
 from collections.abc import Mapping
@@ -10,12 +9,12 @@ from typing import Any, NamedTuple
 
 
 class Stresses(NamedTuple):
-    """Of one environment."""
+    """Stresses of one environment."""
 
     scenario: str
-    """Without faults."""
+    """Scenario without faults."""
     usual: Mapping[str, Any]
-    """Parameters of all of them."""
+    """Parameters of all stresses."""
     each: Mapping[str, Mapping[str, Any]]
     """Parameters of each, by its name."""
 
@@ -189,4 +188,4 @@ STRESSES: Mapping[str, Stresses] = {
         },
     ),
 }
-"""By Gymnasium id."""
+"""Stresses by Gymnasium id."""

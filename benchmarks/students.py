@@ -3,7 +3,7 @@
     python benchmarks/students.py runs/ManeuveringTarget/student-?
 
 Differences of the cost are geometric means of the episodes' ratios, with 95 % bootstrap intervals, on the test split;
-beside them the ANEES, and the time of a measurement over that of ``bptt``.
+the table also has the ANEES, and the time of a measurement over that of ``bptt``.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.papers.grid import markdown_table
 
 OPPONENTS = ("bptt", "bptt-small", "kalman-net", "semi-markov-9", "semi-markov-15", "semi-markov")
-"""Whom students are compared with: agents, banks of less time, and the strongest filter."""
+"""Opponents of the students: agents, banks of less time, and the strongest filter."""
 SCENARIOS = ("random", "atc", "cruise", "descent", "irregular-scans", "glint")
 """The training distribution, and held-out ones."""
 

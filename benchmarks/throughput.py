@@ -1,4 +1,4 @@
-"""How fast things are that users wait for, beside peers in the same run.
+"""Speed of steps and evaluations, compared with peers in the same run.
 
     python benchmarks/throughput.py [SECTION ...] [--environment ID] [--size N] [--seconds S] [--large] [--json FILE]
 
@@ -6,22 +6,21 @@ Sections, all of them by default:
 
 ``environments``
     The public ``step`` of ``gymnasium.make_vec(ID, num_envs=N)`` and of ``gymnasium.make(ID)`` (N = 1, with Gymnasium's
-    wrappers), with nothing but defaults and its share of a reset: millions of measurements a second. A step of
-    TightlyCoupledNavigation is ten measurements. Beside them Gymnasium's own CartPole in its native vector form, which
-    has four additions where these have a filter.
+    wrappers), with defaults and its share of a reset: millions of measurements a second. A step of
+    TightlyCoupledNavigation is ten measurements. For comparison Gymnasium's own CartPole in its native vector form,
+    which has four additions where these have a filter.
 ``steps``
     One step of 4096 episodes: the environment's own text compiled, by NumPy, by ``jax.jit`` where JAX is installed, and
-    filterpy's filters in a loop; beside them the time that the step's arithmetic alone takes in compiled code that does
-    nothing else (the floor).
+    filterpy's filters in a loop; also the time of the step's arithmetic alone in compiled code (the floor).
 ``evaluations``
     ``filtergym.evaluate`` of ten competitors over 2000 episodes, with ``--large`` over 100,000.
 ``scaling``
     Time and peak memory of processes that evaluate one, two and four times as many episodes, competitors and
     measurements, and step as many environments.
 
-One thread. Times are of the processor: what others on the machine take is left out, but not what they do to its
-caches, so take ratios. A figure is the median over rounds. Two versions are compared by running this file with the
-Python of each at the same time, and by dividing the figures in the files that ``--json`` writes.
+One thread. Times are of the processor: other processes on the machine do not count, but they affect its caches, so use
+ratios. A figure is the median over rounds. Two versions are compared by running this file with the Python of each at
+the same time, and by dividing the figures in the files that ``--json`` writes.
 """
 
 import argparse
@@ -54,7 +53,7 @@ from filtergym.envs.engine.reward import cost_reward
 
 SIZES = (1, 16, 256, 4096, 65536)
 STEPS = 100
-"""Steps of a round, at most."""
+"""Largest number of steps of a round."""
 PEER = "CartPole-v1"
 EPISODES, MANY_EPISODES = 2000, 100_000
 COMPETITORS = (
@@ -65,14 +64,14 @@ Record = dict[str, Any]
 
 
 def processor_seconds(call: Callable[[], object]) -> float:
-    """Time that this process was given for a call."""
+    """Return the processor time of a call."""
     begin = time.process_time()
     call()
     return time.process_time() - begin
 
 
 def median_seconds(call: Callable[[], object], share: float, fewest: int = 3) -> float:
-    """Median time of a call over rounds that take ``share`` seconds together."""
+    """Return the median time of a call over rounds that take ``share`` seconds together."""
     call()  # compiles; warms caches and clocks
     times: list[float] = []
     while len(times) < fewest or sum(times) < share:
@@ -84,7 +83,7 @@ def median_seconds(call: Callable[[], object], share: float, fewest: int = 3) ->
 
 
 def step_seconds(env: Any, share: float) -> float:
-    """Median time of a step, with its share of a reset of all environments."""
+    """Return the median time of a step, with its share of a reset of all environments."""
     env.action_space.seed(0)
     actions = itertools.cycle([env.action_space.sample() for _ in range(8)])
     length = getattr(env.unwrapped, "last_decision", 500)
@@ -106,7 +105,7 @@ def step_seconds(env: Any, share: float) -> float:
 
 
 def measure_environments(ids: list[str], sizes: list[int], share: float) -> Iterator[Record]:
-    """Step environments as users make them."""
+    """Measure the steps of environments with default options."""
     for id in [*ids, PEER]:
         interval = make_model(catalogue()[id]).task.decision_interval if id in catalogue() else 1
         row: Record = {"environment": id.removeprefix("filtergym/")}
@@ -122,7 +121,7 @@ def measure_environments(ids: list[str], sizes: list[int], share: float) -> Iter
 
 
 class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A single environment that begins its next episode by itself."""
+    """A single environment that resets automatically at the end of an episode."""
 
     def step(self, action: Any) -> Any:
         """Step, and reset where the episode is over."""
@@ -136,7 +135,9 @@ class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def compiled_costs() -> tuple[float, float]:
-    """Seconds of an addition or product, and of an exponential, in compiled programs that do nothing else."""
+    """Return the seconds of an addition or product, and of an exponential, in compiled programs without other
+    operations.
+    """
     chains, links, x = 16, 64, numpy.linspace(-1.0, 1.0, 16 * 8).reshape(16, 8)
 
     def arithmetic(x: Any) -> Any:
@@ -165,7 +166,7 @@ def compiled_costs() -> tuple[float, float]:
 
 
 def floor_seconds(model: Any) -> float:
-    """Seconds of the arithmetic that is left in the programs of a compiled step of one episode."""
+    """Return the seconds of the arithmetic in the programs of a compiled step of one episode."""
     parts = model.programs.later
     programs = [parts.update, parts.advance, parts.predict, model.programs.report_program(cost_reward)]
     names = [step.operation for special in programs for step in special.program.steps]
@@ -177,7 +178,7 @@ def floor_seconds(model: Any) -> float:
 
 
 def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Record]:
-    """Step by the compiled backend, by NumPy, by JAX, and by filterpy."""
+    """Measure the step by the compiled backend, by NumPy, by JAX, and by filterpy."""
     try:
         import jax  # noqa: F401
         import peer_jax
@@ -196,7 +197,7 @@ def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Re
                 try:
                     step = peer_jax.jitted_step(id, control, few, decision_interval=1)
                     row["jax.jit, ns"] = 1e9 * median_seconds(step, share) / few
-                except (TypeError, NotImplementedError):  # what jax.numpy lacks
+                except (TypeError, NotImplementedError):  # jax.numpy lacks it
                     pass
             if id == peer_imm.PEER_OF and control != "gain":
                 row["filterpy, ns"] = 1e9 / peer_imm.imm_steps_per_second(500)
@@ -234,8 +235,10 @@ _STEP = (
 
 
 def run_apart(code: str) -> tuple[float, float]:
-    """Processor seconds and peak memory in MB of the last of two runs of some code in a process of its own."""
-    # Not getrusage: what it says of a process begins with the memory of the one that started it.
+    """Return the processor seconds and peak memory in MB of the last of two runs of some code in a process of its
+    own.
+    """
+    # Not getrusage: its peak of a process includes the memory of the parent at the start.
     program = (
         "import re, pathlib, time, gymnasium, numpy, filtergym\ndef run():\n    "
         + code.replace("\n", "\n    ")
@@ -250,7 +253,7 @@ def run_apart(code: str) -> tuple[float, float]:
 
 
 def measure_scaling(id: str) -> Iterator[Record]:
-    """Do one, two and four times as much."""
+    """Measure one, two and four times as many episodes, competitors, measurements and environments."""
     names = [name for name in COMPETITORS if name != "bptt"][:8]
     usual: Record = {"id": id, "names": names[:2], "episodes": 2000, "horizon": 100}
     kinds: dict[str, Callable[[int], str]] = {
@@ -290,7 +293,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("section", nargs="*", choices=[*sections, []], help="what to time (default: all)")
+    parser.add_argument("section", nargs="*", choices=[*sections, []], help="sections to time (default: all)")
     parser.add_argument("--environment", action="append", metavar="ID", help="only this one; may be repeated")
     parser.add_argument("--size", action="append", type=int, metavar="N", help="only this N; may be repeated")
     parser.add_argument("--seconds", type=float, default=0.5, help="for the rounds of a figure (default 0.5)")

@@ -1,10 +1,10 @@
-"""What a budget of training buys: ``bptt`` after 100,000, a million and ten million decisions, in Markdown.
+"""Costs of ``bptt`` by budget of training, after 100,000, a million and ten million decisions, in Markdown.
 
     python benchmarks/training_budgets.py --runs runs/budgets
 
-Each run is one of its own with the settings of ``filtergym train``, whose learning rate falls over its own length; runs
-that the folder holds are not repeated. TightlyCoupledNavigation is left out: there a decision takes ten measurements of
-three filters, and the shipped runs have 100,000 of them. The best agent of each run meets the episodes of the test
+Each is a separate run with the settings of ``filtergym train``, whose learning rate falls over its own length; runs in
+the folder are not repeated. TightlyCoupledNavigation is left out: there a decision takes ten measurements of three
+filters, and the shipped runs have 100,000 of them. The best agent of each run is evaluated on the episodes of the test
 split.
 """
 
@@ -24,7 +24,7 @@ BUDGETS = (100_000, 1_000_000, 10_000_000)
 
 
 def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
-    """Train once for each seed, and return the folders; what is done is left alone, what was interrupted goes on."""
+    """Train once for each seed, and return the folders; finished runs are not repeated, interrupted ones continue."""
     words = ["train", id, "--algo", algo, "--steps", str(steps), "--seeds", f"0-{seeds - 1}", "--no-compare"]
     command = [sys.executable, "-m", "filtergym", *words, "--out", str(run)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
@@ -39,19 +39,19 @@ def main() -> None:
     parser.add_argument("--environment", action="append", help="short name; repeatable; default: four")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--episodes", type=int, default=1000)
-    asked = parser.parse_args()
+    args = parser.parse_args()
     rows = []
-    for name in asked.environment or ENVIRONMENTS:
+    for name in args.environment or ENVIRONMENTS:
         id, cells = f"filtergym/{name}-v0", []
         paper = baselines_of(id).score_paper
         for steps in BUDGETS:
-            runs = train(id, asked.algo, steps, asked.seeds, asked.runs / f"{name}-{asked.algo}-{steps}")
-            results = filtergym.evaluate(id, [paper, *runs], episodes=asked.episodes, seed=0)
+            runs = train(id, args.algo, steps, args.seeds, args.runs / f"{name}-{args.algo}-{steps}")
+            results = filtergym.evaluate(id, [paper, *runs], episodes=args.episodes, seed=0)
             cost = results["cost"].mean(["episode", "time"]).values
             change = 100.0 * (cost[1:] / cost[0] - 1.0)
             cells.append(f"{numpy.mean(change):+.1f} ({change.min():+.1f} to {change.max():+.1f})")
         rows.append([name, *cells])
-    header = [f"{asked.algo}, {asked.seeds} seeds", *(f"{steps:,} decisions" for steps in BUDGETS)]
+    header = [f"{args.algo}, {args.seeds} seeds", *(f"{steps:,} decisions" for steps in BUDGETS)]
     print("\n".join(markdown_table(header, rows)))
 
 

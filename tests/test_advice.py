@@ -13,7 +13,7 @@ from models import Asked
 from filtergym import evaluate
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines import fitting
-from filtergym.baselines.advice import FittedLog, advise, share_out
+from filtergym.baselines.advice import FittedLog, advise, split_recording
 from filtergym.baselines.fitted_filters import families_of, own_family, read_artefact
 from filtergym.baselines.fitting import fit, fit_profiles, with_noise_scale
 from filtergym.baselines.judgement import AS_GOOD, Judgement
@@ -221,7 +221,7 @@ def test_what_the_log_says_nothing_of_is_open(tmp_path):
 
 def test_shares_are_apart_and_are_all(tmp_path):
     recording = read(write_log(tmp_path, count=962))
-    share = share_out(recording)
+    share = split_recording(recording)
     assert len(share.judged) == 6  # one in four of the blocks of forty measurements
     taken = np.zeros(int(recording.rows[0]), dtype=int)
     for spans in (share.fitted, share.chosen, share.judged):
@@ -305,7 +305,7 @@ def test_files_that_are_no_fitted_filter_are_refused(tmp_path):
             {"values": {"log10_jerk": 1.0}},
             "must give 'constant-velocity' a number for each of log10_acceleration",
         ),
-        ({"values": [1.0]}, "is no fitted filter"),
+        ({"values": [1.0]}, "is not the file of an advised filter"),
     ):
         path.write_text(json.dumps(table | change))
         with pytest.raises(ValueError, match=message):
@@ -328,7 +328,7 @@ def one_family(monkeypatch):
 
 
 def test_a_short_log_says_that_it_is_short(one_family, tmp_path):
-    with pytest.raises(ValueError, match=r"has 3 measurements after the start of its track: .* takes 5"):
+    with pytest.raises(ValueError, match=r"has 3 measurements after the start of its track: .* needs at least 5"):
         advise(FittedLog(PROBLEM, read(write_log(tmp_path, count=5))), {})
     recording = read(write_log(tmp_path, count=12))
     found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
@@ -402,7 +402,7 @@ def test_of_two_that_are_as_good_the_cheaper_is_advised(one_family, tmp_path):
     assert lines[0].startswith(
         "Take constant-velocity, with the parameters below, as good as true and cheaper: "
     )
-    likelier = found._replace(dearer=("true", IntervalEstimate(0.25, -0.125, 0.5)))
+    likelier = found._replace(likeliest=("true", IntervalEstimate(0.25, -0.125, 0.5)))
     assert (
         "true is likelier where filters were chosen: it would bring +0.250 [-0.125, +0.500] nats per measurement and "
         "takes 500 operations an update for 400." in list(advice_lines(likelier, []))

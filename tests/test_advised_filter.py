@@ -172,7 +172,7 @@ def test_latitude_needs_an_origin_and_lies_near_it(tmp_path):
     for name, value in (("latitude", 91.0), ("longitude", math.nan), ("height", 0.0)):
         changed = {**table["log"], "origin": {**table["log"]["origin"], name: value}}
         path.write_text(json.dumps(table | {"log": changed}))
-        with pytest.raises(ValueError, match="what it says of its log is none"):
+        with pytest.raises(ValueError, match="its entry on the log is invalid"):
             find_competitor(PROBLEM, path)
 
 

@@ -407,8 +407,8 @@ def test_the_quick_benchmark_runs_a_tuned_one_in_the_place_of_what_it_was_and_on
         for id in (ENV, "filtergym/LooselyCoupledNavigation-v0")
     )
     names = own.policies
-    assert own.problem.tuned_values.has_won("kalman-imm")
-    assert not loose.problem.tuned_values.has_won("fault-bank")
+    assert own.problem.tuned_values.is_improved("kalman-imm")
+    assert not loose.problem.tuned_values.is_improved("fault-bank")
     assert {"kalman-imm-tuned", "semi-markov"} <= {*names}
     assert "fault-bank" in loose.policies
     assert "kalman-imm" not in names

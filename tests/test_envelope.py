@@ -89,7 +89,7 @@ def test_the_envelope_speaks_soon_and_not_for_one_value():
     shown[10:20, 2] = -2.0  # for a while
     alarm, memory, spoken = OneField(), None, []
     for i, row in enumerate(shown):
-        heard, memory = alarm.hear(row[:, None], memory, np.full(3, i == 0))
+        heard, memory = alarm.update(row[:, None], memory, np.full(3, i == 0))
         spoken.append(heard)
     spoken = np.array(spoken)
     assert not spoken[:, :2].any()
@@ -112,7 +112,7 @@ def test_an_agent_is_inside_of_its_envelope_in_training_and_outside_of_it_elsewh
         lanes, state, memory, spoken = start_lanes(model, seeds), None, None, np.zeros(100, dtype=bool)
         for step in range(lanes.decisions_per_episode):
             shown = lanes.observe()
-            heard, memory = alarm.hear(shown, memory, np.full(100, step == 0))
+            heard, memory = alarm.update(shown, memory, np.full(100, step == 0))
             spoken |= heard
             action, state = policy.predict(shown, state)
             lanes.decide(action)

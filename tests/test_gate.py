@@ -25,7 +25,7 @@ class Scripted(Alarm):
 
     window = 3
 
-    def hear(self, observation, memory, start):
+    def update(self, observation, memory, start):
         return observation[:, 0] > 1.0, None
 
 
@@ -82,7 +82,7 @@ def heard(alarm, shown):
     """Whether the alarm speaks, ``(decisions, N)``."""
     memory, found = None, []
     for i, row in enumerate(shown):
-        spoken, memory = alarm.hear(row, memory, np.full(len(row), i == 0))
+        spoken, memory = alarm.update(row, memory, np.full(len(row), i == 0))
         found.append(spoken)
     return np.array(found)
 
@@ -159,7 +159,7 @@ def test_every_alarm_serves_every_control(env_id, control, short):
     shown, _ = env.reset(seed=0)
     memory, start = None, np.ones(3, dtype=bool)
     for _ in range(2):
-        spoken, memory = alarm.hear(shown, memory, start)
+        spoken, memory = alarm.update(shown, memory, start)
         assert spoken.shape == (3,)
         assert spoken.dtype == bool
         assert not np.isnan(memory.sums).any()
@@ -222,14 +222,14 @@ class Lying(Policy):
 class Silent(Alarm):
     """Never speaks."""
 
-    def hear(self, observation, memory, start):
+    def update(self, observation, memory, start):
         return observation[:, 0] != observation[:, 0], None
 
 
 class Loud(Alarm):
     """Speaks always."""
 
-    def hear(self, observation, memory, start):
+    def update(self, observation, memory, start):
         return observation[:, 0] == observation[:, 0], None
 
 
@@ -322,7 +322,7 @@ def test_who_has_no_gate_is_refused(name, message):
         (lambda model: Gate(model, fallback=Constant), "gains", "fallback is made for control 'gain', but"),
         (lambda model: Gated(model, Constant), "gains", "policy is made for control 'gain', but the task"),
         (lambda model: Gate(model, window=0), "gain", "window must be at least one decision, got 0"),
-        (InnovationAlarm, "gains", "shows no 'innovation' under control 'gains'"),
+        (InnovationAlarm, "gains", "has no 'innovation' in its observation under control 'gains'"),
     ],
 )
 def test_gates_that_cannot_be(make, control, message):

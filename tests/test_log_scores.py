@@ -12,7 +12,7 @@ from filtergym import read_recording
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines import log_scores
 from filtergym.baselines.advice import FittedLog
-from filtergym.baselines.judgement import roles_of, share_out
+from filtergym.baselines.judgement import roles_of, split_recording
 from filtergym.baselines.log_scores import report_picture, score_log
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
@@ -54,7 +54,7 @@ def recording(tmp_path_factory):
 def test_scores_are_those_of_the_whole_evaluation(recording, rows, monkeypatch):
     """Of every pair, whatever is run at once; sums round otherwise than means by 1e-12."""
     monkeypatch.setattr(log_scores, "ROWS", rows)
-    share, makers = share_out(recording), competitors()
+    share, makers = split_recording(recording), competitors()
     roles, names = roles_of(share, recording.seconds.shape), list(makers)
     shares = []
     scores = score_log(PROBLEM.experiment(recording), makers, roles, shares.append)
@@ -132,7 +132,7 @@ def test_memory_does_not_grow_with_rows_times_competitors(tmp_path, monkeypatch)
     makers = {name: PROBLEM.competitor(name) for name in ("imm", "kalman-imm", "kalman-pda", "sage-husa")}
     for count in rows:
         recording = read(write_log(tmp_path, count=count))
-        roles = roles_of(share_out(recording), recording.seconds.shape)
+        roles = roles_of(split_recording(recording), recording.seconds.shape)
         experiment = PROBLEM.experiment(recording)
         score_log(experiment, makers, roles)  # what is compiled once
         scored.append(peak(lambda e=experiment, r=roles: score_log(e, makers, r)))

@@ -184,7 +184,7 @@ def test_recovery_times_of_made_up_runs():
     error[3, 12:18], error[3, 19:22] = 1.0, 1.0  # one small sample does not count
     available[4], error[4] = 1.0, 1.0
     available[4, 30:35] = 0.0  # too late to be judged
-    found = recovery_times(error, available, 0.5, held=3, longest=20)
+    found = recovery_times(error, available, 0.5, hold=3, longest=20)
     np.testing.assert_array_equal(found, [0, 5, 20, 7, np.nan, np.nan])
 
 

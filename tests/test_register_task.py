@@ -273,7 +273,7 @@ def test_baselines_must_fit_the_task(turns):
         (Baselines(turns.id, {}, score_paper="imm"), "unknown policy as score_paper 'imm'"),
         (Baselines(turns.id, {"far": Elsewhere}), "unknown control of policy 'far' 'throttle'"),
         (Baselines(turns.id, {}, {"none": NoKind}), "stands in the table as reference"),
-        (Baselines(turns.id, {}, bounds={"none": Silent}), "does not say what it knows"),
+        (Baselines(turns.id, {}, bounds={"none": Silent}), "does not state what it knows"),
     ):
         with pytest.raises(ValueError, match=expected):
             filtergym.register_task(turns, table)

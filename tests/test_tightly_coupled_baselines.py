@@ -377,7 +377,7 @@ def test_lasting_and_switches_are_what_a_loop_finds():
         naive = [
             [row[k : k + steps].all() and k + steps <= len(row) for k in range(len(row))] for row in condition
         ]
-        assert (metrics.lasting(condition, steps) == naive).all()
+        assert (metrics.find_lasting(condition, steps) == naive).all()
     mode = numpy.array([[0] * 20 + [2] * 30 + [1] * 5, [1] * 55])
     probability = numpy.zeros((2, 55, 3))
     probability[0, 23:26, 2] = 0.9  # too short

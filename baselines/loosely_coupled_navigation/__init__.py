@@ -1,4 +1,4 @@
-"""What LooselyCoupledNavigation is compared with."""
+"""Baselines of LooselyCoupledNavigation."""
 
 from .policies import BASELINES
 

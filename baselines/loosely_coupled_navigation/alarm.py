@@ -1,4 +1,4 @@
-"""When something is wrong in LooselyCoupledNavigation: INS or receiver are not as modelled."""
+"""Alarm of LooselyCoupledNavigation: INS or receiver are not as modelled."""
 
 import numpy
 
@@ -11,12 +11,12 @@ SYMLOG_VARIANCE = 0.38684360137
 
 
 class FusionAlarm(Alarm):
-    """Innovations of the augmented filter that are larger, smaller or to one side. An outage is none of these: every
-    filter is told of it.
+    """Innovations of the augmented filter that are larger, smaller or to one side. An outage raises no alarm: every
+    filter observes it.
 
-    Under ``noise`` they are the steered filter's, shown over the deviation that goes with the receiver's noise as it
-    reports it, whatever the agent takes it to be. Under ``mode`` and ``weights`` there is an augmented filter in the
-    bank, which nobody steers. Under ``gain`` there is none, and the plain scheme's innovations are judged as they are.
+    Under ``noise`` they are the steered filter's, over the deviation for the noise that the receiver reports, whatever
+    noise the agent chooses. Under ``mode`` and ``weights`` they are those of an augmented filter in the bank, which no
+    action steers. Under ``gain`` there is no such filter, and the innovations of the plain scheme are used.
     """
 
     def __init__(self, model: Model) -> None:
@@ -26,9 +26,9 @@ class FusionAlarm(Alarm):
         self.axes: int = self.task.parameters.axes
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Weigh the innovations of each axis."""
+        """Return the log-likelihood ratios of the innovations of each axis."""
         innovation, available = self.innovation(observation)[:, -self.axes :], self.available(observation)
-        # Shown is the mean over a decision's measurements of the compressed value.
+        # The observation contains the mean over a decision's measurements of the compressed value.
         measurements = self.measurements(before)
         count = numpy.maximum(available * measurements, 1.0)
         mean = symlog(innovation, numpy) * measurements / numpy.sqrt(count * SYMLOG_VARIANCE)

@@ -1,10 +1,10 @@
 """The augmented filter of LooselyCoupledNavigation with receiver noise as reported, or estimated.
 
-A policy under ``gain`` runs it beside the plain scheme, an estimator reports it.
+A policy under ``gain`` runs it in parallel with the plain scheme; an estimator reports it.
 
-The receiver may say nothing of a change. So the noise is estimated from the innovations, beginning with what is
-reported; when the report changes it begins anew. One receiver measures all axes: an innovation is the root of their
-mean square.
+The receiver may not report a change. So the noise is estimated from the innovations, starting from the reported
+variance; the estimate restarts when the report changes. One receiver measures all axes: an innovation is the root of
+their mean square.
 """
 
 from collections.abc import Iterable
@@ -19,22 +19,22 @@ from ..measurement_noise import RULES, MeasurementNoise
 from ..table import Tunable, Variant, tunable
 
 WINDOW = 25.0
-"""Measurements of a window without tuning: 0.25 s, the time constant of the averages that are shown."""
+"""Measurements of a window without tuning: 0.25 s, the time constant of the averages in the observation."""
 
 _FADING = {"memory": (5.0, WINDOW, 200.0), "trust": (1.0, WINDOW, 200.0)}
 LIMITS = {"mehra": {"window": (5.0, WINDOW, 150.0)}, "sage-husa": _FADING, "variational-bayes": _FADING}
-"""Of the arguments of each rule: the least, those without tuning, the largest."""
+"""Limits of the arguments of each rule: the smallest, those without tuning, the largest."""
 
 
 def with_rules(
     host: type, name: str, description: str, rules: Iterable[str] = RULES
 ) -> tuple[dict[str, Variant], dict[str, Tunable]]:
-    """Return a policy or an estimator with each rule for the receiver's noise, and what is tuned in it, by name.
+    """Return a policy or an estimator with each rule for the receiver's noise, and its tunable values, by name.
 
     Args:
         host: its class, which takes the task, a rule, and the arguments of the rule.
-        name: of the host, to which that of the rule is added.
-        description: of the host, to which that of the rule is added.
+        name: name of the host, to which that of the rule is added.
+        description: description of the host, to which that of the rule is added.
         rules: names of the rules for the receiver's noise; default: all.
     """
     variants, tunables = {}, {}
@@ -43,33 +43,33 @@ def with_rules(
         untuned = {value: start for value, (_, start, _) in LIMITS[rule].items()}
         variants[f"{name}-{rule}"] = Variant(host, f"{description} {words}.", rule=cls, **untuned)
         found = tunable(variants[f"{name}-{rule}"], **LIMITS[rule])
-        tunables[f"{name}-{rule}"] = replace(found, in_lanes=rule != "mehra")  # which has a whole window
+        tunables[f"{name}-{rule}"] = replace(found, in_lanes=rule != "mehra")  # the window is an integer
     return variants, tunables
 
 
 class AugmentedMemory(NamedTuple):
-    """What the augmented filter knows beside the position."""
+    """State of the augmented filter without the position."""
 
     drift: Array
     """Estimate of beta, ``(A, N)``, m/s."""
     coloured: Array
     """Estimate of eta, ``(A, N)``, m/s."""
     covariance: ins_gnss.AugmentedCovariance
-    """``(N,)`` each."""
+    """Covariance entries, ``(N,)`` each."""
     reported: Array
-    """Variance last reported, ``(N,)``, m^2."""
+    """Variance that the receiver reported last, ``(N,)``, m^2."""
     noise: Any
-    """Memory of the receiver's noise."""
+    """Memory of the estimate of the receiver's noise."""
     variance: Array
-    """Of the receiver, with which the last fix was used, ``(N,)``, m^2."""
+    """Variance of the receiver in the last update, ``(N,)``, m^2."""
 
 
 class AugmentedFilter:
-    """The augmented filter without its position, which whoever runs it keeps.
+    """The augmented filter without its position, which the caller stores.
 
     Args:
-        parameters: of the task.
-        noise: the receiver's.
+        parameters: parameters of the task.
+        noise: model of the receiver's noise.
     """
 
     def __init__(self, parameters: LooselyCoupledNavigationParameters, noise: MeasurementNoise) -> None:
@@ -77,7 +77,7 @@ class AugmentedFilter:
         self.noise = noise
 
     def start(self, none: Array) -> AugmentedMemory:
-        """Memory at the start of the track.
+        """Return the memory at the start of the track.
 
         Args:
             none: zeros, ``(A, N)``.
@@ -86,7 +86,7 @@ class AugmentedFilter:
         return AugmentedMemory(none, none, p.prior_covariance(zero), zero, self.noise.start(zero), zero)
 
     def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
-        """Displacement that the rate errors make in a step, m, ``(A, N)``, and memory."""
+        """Return the displacement by the rate errors in a step, m, ``(A, N)``, and memory."""
         p, s = self.parameters, self.parameters.sampling
         P = ins_gnss.predict_augmented(memory.covariance, s, *p.variance_growth)
         displacement = s.step * memory.drift + s.drive * memory.coloured
@@ -95,7 +95,7 @@ class AugmentedFilter:
     def update(
         self, memory: AugmentedMemory, innovation: Array, reported: Array, available: Array
     ) -> tuple[Array, AugmentedMemory]:
-        """Correction of the position, m, ``(A, N)``, and memory.
+        """Return the correction of the position, m, ``(A, N)``, and memory.
 
         Args:
             memory: after :meth:`predict`.

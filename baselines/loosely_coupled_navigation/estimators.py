@@ -26,11 +26,11 @@ class Navigator(NamedTuple):
 
 
 def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: Any) -> Likelihood:
-    """How well a fix was predicted; NaN where there is none.
+    """Return the likelihood of a fix; NaN where there is none.
 
     Args:
-        innovation: m, ``(A, N)``.
-        variance: of each axis of it, m^2, ``(N,)``.
+        innovation: measurement less prediction, m, ``(A, N)``.
+        variance: its variance for each axis, m^2, ``(N,)``.
         available: one where there is a fix, ``(N,)``.
         xp: array namespace.
     """
@@ -42,7 +42,7 @@ def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: 
 
 
 class AugmentedEstimator(Filter[LooselyCoupledNavigation, Measurement, Navigator]):
-    """The augmented filter, which also estimates the constant and coloured rate errors, reported as it is."""
+    """The augmented filter, which also estimates the constant and coloured rate errors."""
 
     def __init__(
         self, task: LooselyCoupledNavigation, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
@@ -52,7 +52,7 @@ class AugmentedEstimator(Filter[LooselyCoupledNavigation, Measurement, Navigator
         self.eye: Array = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial) -> Navigator:
-        """Start where INS and reference agree."""
+        """Start with equal positions of INS and reference."""
         rates = self.filter.start(0.0 * initial.mean)
         return Navigator(initial.mean, initial.covariance, rates, Likelihood.unknown(initial.mean[0]))
 

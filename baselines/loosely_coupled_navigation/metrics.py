@@ -1,11 +1,11 @@
-"""What is measured of LooselyCoupledNavigation beside the metrics of every environment: recovery, detection, integrity.
+"""Metrics of LooselyCoupledNavigation in addition to those of every environment: recovery, detection, integrity.
 
-All follows from what every competitor reports: its error, NEES and NIS. So whether it is a policy or an estimator, a
-fault is detected by the same test of its innovations: the sum of the NIS of the last ``WINDOW`` fixes beyond the
-quantile of its chi-square distribution (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and
-navigation", 2001, 5.4). The protection level bounds the error with the integrity risk ``RISK`` if the reported
-covariance is right: ``k sigma``, sigma the reported deviation in the direction of the error, ``k^2`` the quantile of
-the chi-square distribution of as many degrees as axes. NEES is ``(error / sigma)^2``, so that nothing else is needed.
+All follow from the error, NEES and NIS that every competitor reports. So the same test of its innovations detects a
+fault for policies and estimators: the sum of the NIS of the last ``WINDOW`` fixes beyond the quantile of its chi-square
+distribution (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, 5.4). The
+protection level bounds the error with the integrity risk ``RISK`` if the reported covariance is right: ``k sigma``,
+sigma the reported deviation in the direction of the error, ``k^2`` the quantile of the chi-square distribution of as
+many degrees as axes. NEES is ``(error / sigma)^2``, so that error and NEES determine it.
 """
 
 import math
@@ -27,15 +27,16 @@ if TYPE_CHECKING:
 RECOVERY_ERROR = 0.25
 """Error over the nominal standard deviation of a measurement, for each axis, below which a run has recovered."""
 HOLD_TIME = 0.1
-"""Time for which it must stay below, s: shorter than the memory of any sensible gain, long for noise."""
+"""Time for which the error must stay below the limit, s: shorter than the memory of any sensible gain, long for
+noise."""
 LONGEST = 1.0
-"""Time after the outage that is looked at, s; a run that has not recovered by then counts with it."""
+"""Largest recovery time, s; a run that has not recovered by then counts with it."""
 WINDOW = 25
-"""Fixes whose innovations are tested together: 0.25 s, as the averages that are shown."""
+"""Fixes whose innovations are tested together: 0.25 s, the time constant of the averages in the observation."""
 FALSE_ALARM = 1e-4
 """Probability of an alarm at a measurement of a filter whose covariance is right."""
 RISK = 1e-3
-"""Integrity risk: how often the error may be beyond the protection level."""
+"""Integrity risk: tolerated probability of an error beyond the protection level."""
 UNITS = {
     "recovery_time": "s",
     "not_recovered": "1",
@@ -45,45 +46,45 @@ UNITS = {
     "protection_level": "m",
     "beyond_protection_level": "1",
 }
-"""Of the metrics."""
+"""Units of the metrics."""
 
 
 def recovery_times(
-    error: numpy.ndarray, available: numpy.ndarray, limit: float, held: int, longest: int
+    error: numpy.ndarray, available: numpy.ndarray, limit: float, hold: int, longest: int
 ) -> numpy.ndarray:
-    """Samples from the end of an outage until the error stays small, for each episode.
+    """Return the samples from the end of an outage until the error stays small, for each episode.
 
     Args:
         error: size of the error, ``(episodes, time)``.
         available: one where there is a measurement, same shape.
-        limit: what counts as small.
-        held: samples for which it must stay small.
-        longest: samples looked at; the answer for a run that does not recover in them.
+        limit: largest error that counts as small.
+        hold: samples for which it must stay small.
+        longest: largest number of samples, which is the result for a run that does not recover within it.
 
     Returns:
         ``(episodes,)``; zero where the error was small from the first measurement after the outage on; NaN
-        for episodes without an outage, or with less than ``longest + held`` samples after it.
+        for episodes without an outage, or with less than ``longest + hold`` samples after it.
     """
     episodes, steps = error.shape
     ends = (available[:, :-1] < 0.5) & (available[:, 1:] > 0.5)
     first = numpy.where(ends.any(axis=1), ends.argmax(axis=1) + 1, steps)
-    counted = first + longest + held <= steps
-    window = numpy.arange(longest + held)
+    counted = first + longest + hold <= steps
+    window = numpy.arange(longest + hold)
     index = numpy.minimum(first[:, None] + window, steps - 1)
     small = numpy.take_along_axis(error, index, axis=1) < limit
     runs = numpy.cumsum(numpy.concatenate([numpy.zeros((episodes, 1), int), small], axis=1), axis=1)
-    held_from = runs[:, held:] - runs[:, :-held] == held
-    found = held_from[:, :longest]
+    holds_from = runs[:, hold:] - runs[:, :-hold] == hold
+    found = holds_from[:, :longest]
     time = numpy.where(found.any(axis=1), found.argmax(axis=1), longest)
     return numpy.where(counted, time.astype(float), math.nan)
 
 
 def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
-    """Whether the innovations of the last ``WINDOW`` fixes are too large, booleans ``(episodes, time)``.
+    """Return whether the innovations of the last ``WINDOW`` fixes are too large, booleans ``(episodes, time)``.
 
     Args:
-        nis: normalised innovation squared, NaN without a fix, same shape.
-        degrees: of the NIS of a fix.
+        nis: normalised innovation squared, NaN without a fix, ``(episodes, time)``.
+        degrees: degrees of freedom of the NIS of a fix.
     """
     sums, fixes = (
         numpy.cumsum(numpy.pad(values, ((0, 0), (WINDOW, 0))), axis=1)
@@ -97,16 +98,16 @@ def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
 
 
 def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Measurements until a fault is detected, whether it is missed, and alarms before anything is wrong.
+    """Return the delay until a fault is detected, in measurements, whether it is missed, and alarms before any fault.
 
     Args:
         alarm: ``(episodes, time)`` booleans.
         fault: whether the fault is there, same shape.
-        others: whether anything else is wrong, same shape.
+        others: whether another fault is there, same shape.
 
     Returns:
         ``delay`` and ``missed`` ``(episodes, 1)``, NaN without a fault, the delay also where it is missed; ``false``
-        ``(episodes, time)``, NaN from the first measurement on at which anything is wrong.
+        ``(episodes, time)``, NaN from the first measurement with a fault on.
     """
     found = alarm & fault
     there, hit = fault.any(axis=1), found.any(axis=1)
@@ -121,15 +122,15 @@ def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray)
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return what the metrics need of each episode: sums, and how many terms they have; nothing of a bound."""
+    """Return the sums for the metrics of each episode and their numbers of terms; none for a bound."""
     if "available" not in run or numpy.isnan(run["available"].values).all():
         return MetricInputs()
     task = make_task(LooselyCoupledNavigation, run.attrs["scenario"], **keywords_of(run))
     p = task.parameters
     T, nominal = p.sampling_interval, math.sqrt(p.receiver_variance * p.axes)
     size = numpy.sqrt((run["error"].values ** 2).sum(axis=-1))
-    held, longest = (max(round(t / T), 1) for t in (HOLD_TIME, LONGEST))
-    times = recovery_times(size, run["available"].values, RECOVERY_ERROR * nominal, held, longest)
+    hold, longest = (max(round(t / T), 1) for t in (HOLD_TIME, LONGEST))
+    times = recovery_times(size, run["available"].values, RECOVERY_ERROR * nominal, hold, longest)
     found = {
         "recovery_time": times[:, None] * T,
         "not_recovered": numpy.where(numpy.isnan(times), math.nan, times == longest)[:, None],
@@ -140,7 +141,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     deviation = numpy.where(usable, size / numpy.sqrt(numpy.where(usable, nees, 1.0)), math.nan)
     found["protection_level"] = math.sqrt(quantile) * deviation
     found["beyond_protection_level"] = numpy.where(numpy.isnan(nees), math.nan, nees > quantile)
-    # A learned estimator says nothing of its innovations.
+    # A learned estimator reports no innovations.
     if VARIABLE in run and "nis" in run and not numpy.isnan(run["nis"].values).all():
         causes = dict(held_causes(run))
         wrong = [causes[name] for name in run["cause"].values.tolist() if name not in ("spoofing", "outlier")]
@@ -154,11 +155,11 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Measures of recovery, detection and integrity; those of what never happens are left out.
+    """Return the measures of recovery, detection and integrity, without those of events that never happen.
 
     ``recovery_time`` after an outage and the share of runs that do not recover within a second (``not_recovered``).
     ``detection_time`` of spoofing that is detected, the share that is not while it lasts (``missed_spoofing``), and
-    the share of measurements with an alarm before anything is wrong (``false_alarms``). Mean ``protection_level`` and
+    the share of measurements with an alarm before any fault (``false_alarms``). Mean ``protection_level`` and
     the share of measurements with an error beyond it.
     """
     present = {name: sums for name, sums in gathered.averaged.items() if sums[0, 1]}
@@ -170,4 +171,4 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
 
 
 METRICS = OwnMetrics(gather, measures)
-"""Of the environment."""
+"""Metrics of the environment."""

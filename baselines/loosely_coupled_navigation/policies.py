@@ -1,4 +1,4 @@
-"""Policies of LooselyCoupledNavigation, and the table of all it is compared with.
+"""Policies of LooselyCoupledNavigation, and the table of its baselines.
 
 Equation numbers are those of the task's paper (Benkafo, Lobaty).
 """
@@ -26,7 +26,7 @@ from .references import Matched, MatchedCovariance
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Bank of a task under control ``gain``."""
+    """Return the bank of a task under control ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 
@@ -83,16 +83,16 @@ class _Variances(NamedTuple):
     P: numpy.ndarray
     """Variance of the estimate after the last sample, ``(N, axes)``, m^2."""
     squares: numpy.ndarray
-    """Average square of the innovation, ``(N, axes)``, m^2."""
+    """Mean square of the innovation, ``(N, axes)``, m^2."""
     weight: numpy.ndarray
-    """Measurements that this average has seen, ``(N,)``."""
+    """Number of measurements in this mean, ``(N,)``."""
 
 
 class TimeVarying(Policy):
     """The plain scheme with the Riccati gain (5): high at the start of an error, settled later.
 
-    The variance follows from the equivalent intensity ``Ge``, from the noise that the receiver reports and
-    from the gaps in the data; innovations do not matter. Without gaps and changes only time does.
+    The variance follows from the equivalent intensity ``Ge``, the noise that the receiver reports and the gaps in the
+    data, not from the innovations. Without gaps and changes it depends on time only.
     """
 
     control = "gain"
@@ -135,22 +135,24 @@ class TimeVarying(Policy):
         available: numpy.ndarray,
         observation: numpy.ndarray,
     ) -> tuple[_Variances, numpy.ndarray]:
-        """Memory and variance of the measurement noise, ``(N, axes)`` or ``(N, 1)``: here as reported."""
+        """Return the memory and the variance of the measurement noise, ``(N, axes)`` or ``(N, 1)``: here the reported
+        one.
+        """
         return memory, reported
 
 
 class TimeVaryingWhite(TimeVarying):
-    """The same for the white part of the INS noise only, ``Ge = G``."""
+    """The plain scheme with the Riccati gain (5) for the white part of the INS noise only, ``Ge = G``."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, model.task.parameters.equivalent_intensities[0])
 
 
 class InnovationAdaptive(TimeVarying):
-    """The Riccati gain with the receiver noise taken from the innovations instead of the report.
+    """The Riccati gain with the receiver noise estimated from the innovations instead of the report.
 
-    An innovation has the variance ``P + R``; so R is the average square over a window, less P. The window
-    begins with the reported noise as its first values.
+    An innovation has the variance ``P + R``; so R is the mean square over a window, less P. The window starts with the
+    reported noise as its first values.
     """
 
     def __init__(self, model: Model, window: float = 0.25) -> None:
@@ -165,7 +167,7 @@ class InnovationAdaptive(TimeVarying):
         available: numpy.ndarray,
         observation: numpy.ndarray,
     ) -> tuple[_Variances, numpy.ndarray]:
-        """Average the squared innovations; R is at least a tenth of what that average leaves of it."""
+        """Average the squared innovations; R is at least a tenth of that average."""
         first = (memory.weight == 0)[:, None]
         before = numpy.where(first, P + reported, memory.squares)
         innovation = self.innovation(observation)
@@ -185,10 +187,10 @@ class _Offset(NamedTuple):
 class AugmentedGain(TimeVarying):
     """An augmented filter inside the policy, which steers the plain scheme towards its own estimate.
 
-    The correction of a sample is gain times innovation, and the agent sees the innovation before it chooses:
-    with ``gain = wanted correction / innovation``, where that lies in [0, 1], the estimate goes where it is
-    wanted; otherwise it waits for an innovation of the other sign, which comes after two samples on average.
-    So one gain can do more than weigh two sensors, at the price of a covariance that knows nothing of it.
+    The correction of a sample is gain times innovation, and the agent observes the innovation before it acts:
+    with ``gain = wanted correction / innovation``, where that lies in [0, 1], the estimate gets the wanted correction;
+    otherwise the policy waits for an innovation of the other sign, after two samples on average. So one gain can do
+    more than weigh two sensors, but the covariance does not include this.
     """
 
     traceable = True
@@ -200,7 +202,7 @@ class AugmentedGain(TimeVarying):
         self.filter: AugmentedFilter = AugmentedFilter(self.task.parameters, rule(**values))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Run the augmented filter and choose the gain that brings the estimate nearest to its own."""
+        """Run the augmented filter and choose the gain that moves the estimate nearest to its estimate."""
         p = self.loose.parameters
         none = numpy.zeros((p.axes, len(observation)))
         memory = _Offset(none, self.filter.start(none))
@@ -222,7 +224,7 @@ class AugmentedGain(TimeVarying):
         return gain_bank(self.model).action_for_gain(gain.T), _Offset(wanted - gain * innovation, rates)
 
 
-# --- what can be tuned
+# --- tunable values
 
 
 POLICIES_BY_RULE, TUNABLE_POLICIES = with_rules(
@@ -234,8 +236,8 @@ ESTIMATORS, TUNABLE_ESTIMATORS = with_rules(
 ESTIMATORS |= {
     "fault-bank": Variant(
         FaultBank,
-        "Kalman filters over the noises of INS and receiver, its coloured error among them, and since when the "
-        "receiver is pulled off, each with a Gaussian sum over the receiver's noise, by the prior of the training "
+        "Kalman filters over the noises of INS and receiver, its coloured error among them, and the onset of "
+        "spoofing, each with a Gaussian sum over the receiver's noise, by the prior of the training "
         "distribution.",
         prior=TRAINING,
     ),
@@ -274,7 +276,7 @@ BASELINES = Baselines(
         **POLICIES_BY_RULE,
         "augmented": Variant(
             ConstantMode,
-            "Believe the augmented error-state filter, which also estimates the constant and coloured rate errors.",
+            "The augmented error-state filter alone, which also estimates the constant and coloured rate errors.",
             mode=SCHEMES.index("augmented"),
         ),
         "ins-only": Variant(FixedGain, "The INS alone: no measurement is used.", gain=0.0),
@@ -313,4 +315,4 @@ BASELINES = Baselines(
     ),
     metrics=METRICS,
 )
-"""What the environment is compared with."""
+"""Baselines of the environment."""

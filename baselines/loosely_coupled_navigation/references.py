@@ -1,16 +1,16 @@
 """The reference estimator and the bound of LooselyCoupledNavigation.
 
-Told the draw of the episode (every noise level, and when what befalls the receiver and how strongly), INS error and
-receiver error are linear and Gaussian, and the Kalman filter has the least mean square error of all estimators that
-take the motion from the INS:
+Given the draw of the episode (every noise level, and time and strength of every receiver fault), INS error and receiver
+error are linear and Gaussian, and the Kalman filter has the least mean square error of all estimators that take the
+motion from the INS:
 
     X - (Z - pull) = delta - e - sigma n,        pull = rate (t - onset) while the receiver is spoofed, otherwise 0,
 
-with the INS error (delta, beta, eta), the coloured error e of the receiver, and the deviation sigma of this very
-measurement, be it changed, jammed or an outlier. What stays unknown are the errors themselves and the motion.
+with the INS error (delta, beta, eta), the coloured error e of the receiver, and the deviation sigma of this
+measurement, changed, jammed or an outlier. The errors themselves and the motion stay unknown.
 
-Reading: the motion is taken for one about which nothing is known. A filter with a model of the motion may know a little
-more; the manoeuvres are drawn so strong that it is little (``manoeuvre_acceleration``).
+Reading: no model of the motion is used. A filter with a model of the motion may gain a little; the manoeuvres are drawn
+so strong that the gain is small (``manoeuvre_acceleration``).
 """
 
 from types import ModuleType
@@ -30,23 +30,23 @@ from .estimators import likelihood_of_fix
 
 
 class ErrorState(NamedTuple):
-    """Memory of the filter that is told the draw of the episode."""
+    """State of the filter that is given the draw of the episode."""
 
     delta: Array
     """Estimate of the INS error, m, ``(A, N)``."""
     drift: Array
-    """Of beta, m/s, ``(A, N)``."""
+    """Estimate of beta, m/s, ``(A, N)``."""
     coloured: Array
-    """Of eta, m/s, ``(A, N)``."""
+    """Estimate of eta, m/s, ``(A, N)``."""
     receiver: Array
-    """Of the receiver's coloured error, m, ``(A, N)``."""
+    """Estimate of the receiver's coloured error, m, ``(A, N)``."""
     covariance: receiver_faults.FaultCovariance
     """``(N,)`` each, the same for every axis."""
 
 
 class _Matched:
-    """The Kalman filter told the draw of the episode. Errors are Gaussian once that is known, so it is the filter of
-    least mean square error.
+    """The Kalman filter that is given the draw of the episode. Errors are then Gaussian, so it is the filter of least
+    mean square error.
     """
 
     traceable = True
@@ -112,8 +112,8 @@ class _Matched:
 
 
 class Matched(_Matched):
-    """The Kalman filter told the draw of the episode, the estimate of least mean square error: the noise levels of INS
-    and receiver, sample by sample, the coloured error's, and when the receiver is pulled off, and how fast.
+    """The Kalman filter that is given the draw of the episode, the estimate of least mean square error: the noise
+    levels of INS and receiver, sample by sample, that of the coloured error, and onset and rate of the spoofing.
     """
 
     kind = "reference"
@@ -132,6 +132,6 @@ class MatchedCovariance(_Matched):
     kind = "bound"
 
     def update(self, memory: ErrorState, measurement: Measurement, truth: Truth) -> tuple[Array, ErrorState]:
-        """Variance of every axis, ``(A, N)``."""
+        """Return the variance of the error of every axis, m^2, ``(A, N)``."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

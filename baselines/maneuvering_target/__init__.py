@@ -1,4 +1,4 @@
-"""What ManeuveringTarget is compared with."""
+"""Baselines of ManeuveringTarget."""
 
 from .policies import BASELINES
 

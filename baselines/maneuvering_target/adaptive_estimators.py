@@ -1,6 +1,6 @@
 """Single Kalman filters of constant velocity that estimate their noise from the innovations.
 
-A scan that missed the target says nothing of any noise: what is estimated holds.
+A scan that missed the target contains no information on noise: the estimate stays.
 """
 
 from typing import NamedTuple
@@ -41,19 +41,19 @@ class SageHusaProcessNoise(KalmanModel):
         self.least: float = least**2
 
     def start(self, initial: Initial) -> ProcessNoiseTrack:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         nothing = 0.0 * initial.mean[0]
         level = noise_adaptation.Level(self.variance + nothing, 1.0 + nothing)
         return ProcessNoiseTrack(*self.first_track(initial), level)
 
     def update(self, state: ProcessNoiseTrack, given: FilterInput) -> ProcessNoiseTrack:
-        """Predict with the noise estimated so far, update, and estimate it anew."""
+        """Predict with the noise estimated so far, update, and estimate the noise anew."""
         measurement = given.measurement
         F, unit = self.motion(measurement.interval)
         mean, carried = kalman.predict(state.mean, state.covariance, F, 0.0 * unit)
         predicted = carried + unit * state.level.value
         result = self.update_estimate((mean, predicted), measurement)
-        # In no time there is no noise, and a correction says nothing of it.
+        # An interval of zero has no process noise, and its correction no information on it.
         passed = measurement.interval >= SHORTEST * self.task.parameters.sampling_interval
         sample = noise_adaptation.process_noise_factor(
             result.mean - mean,
@@ -65,7 +65,7 @@ class SageHusaProcessNoise(KalmanModel):
         return ProcessNoiseTrack(*self.track(measurement, result), level)
 
     def diagonal(self, covariance: Array) -> Array:
-        """Variances, ``(4, N)``."""
+        """Return the variances, ``(4, N)``."""
         return self.xp.stack([covariance[i, i] for i in range(4)])
 
 
@@ -81,12 +81,12 @@ class MeasurementNoiseTrack(NamedTuple):
 class VariationalBayes(KalmanModel):
     """A Kalman filter that estimates its measurement noise by variational Bayes (Särkkä and Nummenmaa 2009).
 
-    What is estimated along x and y is the factor by which the radar's variance is wrong.
+    Along x and y it estimates the ratio of the true variance to that of the radar.
 
     Args:
         task: the problem.
         acceleration: standard deviation of the acceleration, m/s^2.
-        forgetting: rho, the share of what is known that lasts another scan.
+        forgetting: rho, the share of the information that lasts another scan.
         shape: half the number of measurements for which the radar's own variance stands at the start.
     """
 
@@ -105,7 +105,7 @@ class VariationalBayes(KalmanModel):
         self.shape = shape
 
     def start(self, initial: Initial) -> MeasurementNoiseTrack:
-        """Start where everyone starts, and believe the radar."""
+        """Start from the initial estimate, with the radar's variances."""
         shape = self.shape + 0.0 * initial.mean[:2]
         return MeasurementNoiseTrack(*self.first_track(initial), noise_adaptation.InverseGamma(shape, shape))
 
@@ -124,7 +124,7 @@ class VariationalBayes(KalmanModel):
 
         before = noise_adaptation.forget(state.noise, self.forgetting, available)
         noise, result = noise_adaptation.variational_bayes(before, update, self.iterations, available)
-        # With the noise known before this scan: with that of its own update, it would have predicted itself.
+        # With the noise estimated before this scan: with the noise of its own update it would not be a prediction.
         nominal = self.update_estimate(predicted, measurement._replace(variance=before.variance * variance))
-        told = self.likelihood(measurement, *nominal[2:])
-        return MeasurementNoiseTrack(result.mean, result.covariance, told, noise)
+        likelihood = self.likelihood(measurement, *nominal[2:])
+        return MeasurementNoiseTrack(result.mean, result.covariance, likelihood, noise)

@@ -1,4 +1,4 @@
-"""When something is wrong in ManeuveringTarget: the target turns, errors are larger, or scans are missed."""
+"""Alarm of ManeuveringTarget: the target turns, errors are larger, or scans are missed."""
 
 from typing import ClassVar
 
@@ -6,17 +6,17 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Reader
-from ..alarm import Alarm, certain, innovation_evidence
+from ..alarm import Alarm, fault_evidence, innovation_evidence
 
 ROUNDING = 1e-6
-"""Of an interval, scan periods."""
+"""Rounding of an interval, scan periods."""
 
 
 class RadarAlarm(Alarm):
     """Innovations of the filter with the lowest gain that are larger, smaller or to one side; a filter of higher gain
-    that explains the scans better; or a scan that missed the target or came early, for which fixed gains are not made.
-    Of a learned Kalman filter, and of all hypotheses together under control ``hypotheses``, innovations are all that
-    counts: these filters are told of such scans.
+    that explains the scans better; or a scan that missed the target or came early, which fixed gains do not model. For
+    a learned Kalman filter, and for all hypotheses together under control ``hypotheses``, only innovations count: these
+    filters model such scans.
     """
 
     window = 50
@@ -32,7 +32,7 @@ class RadarAlarm(Alarm):
         self.elapsed: Reader | None = model.reader("elapsed") if self.fixed_gains else None
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Weigh scans, and what there is of them."""
+        """Return the log-likelihood ratios of the scans."""
         there = self.available(observation) > 0.0
         innovation, *likelihood = (read(observation) for read in self.read)
         if self.bank:
@@ -43,4 +43,4 @@ class RadarAlarm(Alarm):
         if self.elapsed is None:
             return weighed
         irregular = ~there | (numpy.abs(self.elapsed(observation) - 1.0) > ROUNDING)
-        return numpy.concatenate([weighed, *likelihood, certain(irregular[:, 0])], axis=1)
+        return numpy.concatenate([weighed, *likelihood, fault_evidence(irregular[:, 0])], axis=1)

@@ -1,4 +1,4 @@
-"""A filter of positions with slow errors that a second sensor anchors, and where its fit begins."""
+"""A filter of positions with slow errors, anchored by a second sensor, and the start of its fit."""
 
 import math
 from typing import Any
@@ -12,9 +12,9 @@ from ...filters import dead_reckoning
 from .estimators import DEGREE, KalmanModel
 
 STEP = 10.0
-"""s, over which displacements by both sensors are compared: less says more of noise."""
+"""Time over which displacements by both sensors are compared, s: over shorter times noise dominates."""
 FIXED_POINTS = 30
-"""Iterations of the regression, far more than it takes."""
+"""Iterations of the regression, far more than convergence takes."""
 
 
 class DeadReckoning(KalmanModel):
@@ -24,15 +24,15 @@ class DeadReckoning(KalmanModel):
 
     Args:
         task: the problem.
-        error_deviation: of the slow error of the measured positions, m.
-        correlation_time: of that error, s.
-        drift: of dead reckoning, m over the root of a metre of way.
-        scale: of its displacements.
-        heading_offset: by which these are turned clockwise, degrees.
+        error_deviation: standard deviation of the slow error of the measured positions, m.
+        correlation_time: correlation time of that error, s.
+        drift: drift of dead reckoning, m over the root of a metre of way.
+        scale: factor on its displacements.
+        heading_offset: clockwise rotation of its displacements, degrees.
     """
 
     acceleration: float = 1.0
-    """m/s^2, where the odometry says nothing; ours, of what has wheels or legs."""
+    """Acceleration where there is no odometry, m/s^2; ours, for machines with wheels or legs."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class DeadReckoning(KalmanModel):
         self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start where everyone starts, off by an unknown error."""
+        """Start from the initial estimate, with an unknown slow error."""
         return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
@@ -76,19 +76,20 @@ class DeadReckoning(KalmanModel):
 
 
 def regress_odometry(recording: Recording) -> tuple[float, float]:
-    """Scale and heading offset (degrees) of the odometry, from displacements of the measured positions over ``STEP``.
+    """Return the scale and heading offset (degrees) of the odometry, from displacements of the measured positions over
+    ``STEP``.
 
     Iteratively reweighted least squares: a displacement off by e counts as ``|e|^-1.5``, so that excursions of the
-    fixes hardly do. Where the target does not move, 1 and 0.
+    fixes hardly count. Where the target does not move, 1 and 0.
 
     Args:
-        recording: with a second sensor.
+        recording: recording with a second sensor.
     """
-    said, found, moved = recording.measurements, [], []
+    measured, found, moved = recording.measurements, [], []
     for episode, rows in enumerate(recording.rows.tolist()):
-        time, seen = recording.seconds[episode, :rows], said["available"][episode, :rows] > 0.0
-        position = said["position"][episode, :rows] @ numpy.array([1.0, 1.0j])
-        reckoned = numpy.cumsum(said["odometry_displacement"][episode, :rows] @ numpy.array([1.0, 1.0j]))
+        time, seen = recording.seconds[episode, :rows], measured["available"][episode, :rows] > 0.0
+        position = measured["position"][episode, :rows] @ numpy.array([1.0, 1.0j])
+        reckoned = numpy.cumsum(measured["odometry_displacement"][episode, :rows] @ numpy.array([1.0, 1.0j]))
         ends = numpy.searchsorted(time, time + STEP)
         both = numpy.flatnonzero(ends < rows)
         both = both[seen[both] & seen[ends[both]]]

@@ -1,6 +1,6 @@
-"""Estimators of ManeuveringTarget that take all plots of a scan in, where there is clutter.
+"""Estimators of ManeuveringTarget that use all plots of a scan in clutter.
 
-Equations: ``filters/data_association.py``. Without clutter each is the estimator that it is made of.
+Equations: ``filters/data_association.py``. Without clutter each equals the estimator that it extends.
 """
 
 from ...envs.contract.filter import Likelihood
@@ -19,14 +19,14 @@ from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, Kalman
 class AllPlots(KalmanModel):
     """Probabilistic data association in place of the nearest plot.
 
-    The density of false plots is not known; it is taken to be that of the plots of the scan (nonparametric; Bar-Shalom
+    The density of false plots is unknown; it is estimated by that of the plots of the scan (nonparametric; Bar-Shalom
     and Fortmann 1988, section 6.4).
     """
 
     detection_probability: float = 0.9
 
     def density(self, plots: Plots) -> Array:
-        """Plots of the scan over the area of the window, at least of one, 1/m^2, ``(N,)``."""
+        """Return the density of the plots of the scan over the window, with at least one plot, 1/m^2, ``(N,)``."""
         parameters: ManeuveringTargetParameters = self.task.parameters
         count = ordered_sum(plots.available[i] for i in range(plots.available.shape[0]))
         return self.xp.clip(count, 1.0, None) / parameters.window_area
@@ -34,7 +34,7 @@ class AllPlots(KalmanModel):
     def update_estimate(
         self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
     ) -> kalman.Update:
-        """Update with all plots; where a measurement holds one, with that."""
+        """Update with all plots; with the only one where a measurement contains one."""
         plots = measurement.plots
         if plots is None:
             return super().update_estimate(predicted, measurement, H)
@@ -42,8 +42,8 @@ class AllPlots(KalmanModel):
         return data_association.update_position(*predicted, plots, self.detection_probability, density)
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
-        """Tell how well one plot was predicted, nothing of several: densities of different numbers of plots cannot be
-        compared.
+        """Return the likelihood of a single plot; NaN for several, since densities of different numbers of plots cannot
+        be compared.
         """
         if measurement.plots is None:
             return super().likelihood(measurement, log_likelihood, nis)
@@ -70,7 +70,7 @@ class SemiMarkovDataAssociation(SemiMarkov, AllPlots):
     """The semi-Markov Gaussian sum, each of whose hypotheses weighs all plots of a scan."""
 
     def update_table(self, table: AgedHypotheses, measurement: Measurement) -> kalman.Update:
-        """Update every hypothesis with all plots; where a measurement holds one, with that."""
+        """Update every hypothesis with all plots; with the only one where a measurement contains one."""
         plots = measurement.plots
         if plots is None:
             return super().update_table(table, measurement)

@@ -1,6 +1,6 @@
-"""Estimators of ManeuveringTarget: what the measurements allow beyond the filters that an action steers.
+"""Estimators of ManeuveringTarget that no action steers.
 
-They predict over the time between two scans, whatever it is, and a scan that missed the target is prediction only.
+They predict over the actual time between two scans; for a scan that missed the target they only predict.
 """
 
 import math
@@ -19,26 +19,26 @@ DEGREE = math.pi / 180.0
 
 
 class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
-    """The constant-velocity model with what estimators share."""
+    """Base of the estimators with the constant-velocity model."""
 
     def start(self, initial: Initial) -> Any:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         return self.first_track(initial)
 
     def first_track(self, initial: Initial) -> EstimateState:
-        """Estimate before the first scan."""
+        """Return the estimate before the first scan."""
         return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
 
     def mean(self, state: Any) -> Array:
-        """Position and velocity, whatever else is estimated."""
+        """Return the position and velocity, without further states."""
         return state.mean[:4]
 
     def covariance(self, state: Any) -> Array:
-        """Likewise."""
+        """Return the covariance of position and velocity, without further states."""
         return state.covariance[:4, :4]
 
     def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
-        """State after an update."""
+        """Return the state after an update."""
         return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))
 
 
@@ -55,7 +55,7 @@ class ConstantVelocity(KalmanModel):
         self.variance: float = acceleration**2
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """One cycle of the filter."""
+        """Predict and update."""
         F, Q = self.motion(given.measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
         return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
@@ -78,7 +78,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
     Args:
         task: the problem.
         accelerations: standard deviation of the acceleration of each filter, m/s^2.
-        stay: probability of each mode to last another scan; it is left for any other alike.
+        stay: probability of each mode to last another scan; all others are equally likely next.
     """
 
     def __init__(
@@ -93,12 +93,12 @@ class KalmanInteractingMultipleModel(KalmanModel):
         self.transition: Array = task.constant(
             [[stay[i] if i == j else (1.0 - stay[i]) / (len(stay) - 1) for j in modes] for i in modes]
         )
-        # All modes are left equally often in the long run, so they are met in proportion to how long they last.
+        # All modes are left equally often in the long run, so their probabilities are in proportion to their durations.
         lasting = [1.0 / (1.0 - probability) for probability in stay]
         self.probabilities: Array = task.constant([scans / sum(lasting) for scans in lasting])
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Give an estimate of position and velocity the state in which the filters are mixed."""
+        """Extend an estimate of position and velocity to the state in which the filters are mixed."""
         return mean, covariance
 
     def predict_and_update(
@@ -114,7 +114,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         ]
 
     def start(self, initial: Initial) -> KalmanMixture:
-        """Start all filters where everyone starts."""
+        """Start all filters from the initial estimate."""
         xp, M = self.xp, self.probabilities.shape[0]
         mean, covariance = self.augment(initial.mean, initial.covariance)
         return KalmanMixture(
@@ -126,7 +126,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         )
 
     def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
-        """One IMM cycle. Its normalised innovation squared is the mean of the filters' by their posterior weights."""
+        """Run one IMM cycle. Its normalised innovation squared is the filters' mean by their posterior weights."""
         xp, measurement = self.xp, given.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
         mixed = imm.mix(state.means, state.covariances, prediction.mixing)
@@ -149,7 +149,7 @@ class TurnModel(ConstantVelocityModel):
     Args:
         task: the problem.
         acceleration: standard deviation of the acceleration along x and y, m/s^2.
-        turn_rate_change: of the change of the turn rate from scan to scan, degrees/s.
+        turn_rate_change: standard deviation of the change of the turn rate from scan to scan, degrees/s.
     """
 
     def __init__(self, task: ManeuveringTarget, acceleration: float, turn_rate_change: float) -> None:
@@ -159,12 +159,12 @@ class TurnModel(ConstantVelocityModel):
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def noise(self, T: Array) -> Array:
-        """Covariance of the process noise over intervals, s, ``(5, 5, N)``."""
+        """Return the covariance of the process noise over intervals, s, ``(5, 5, N)``."""
         Q = self.variance * self.motion(T)[1]
         return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, (T * self.change) ** 2)[1]
 
     def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-        """Time update over intervals, s, by the extended Kalman filter."""
+        """Apply the time update of the extended Kalman filter over intervals, s."""
         return coordinated_turn.predict(mean, covariance, T, self.noise(T))
 
 
@@ -172,16 +172,16 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
     """IMM over quiet and noisy constant velocity and an extended Kalman filter of the coordinated turn.
 
     The filters differ in dimension. Reading: one of constant velocity counts as one of five states whose turn rate
-    has mean zero and the variance of a turn that begins, independent of the rest, and forgets what is mixed into it
+    has mean zero and the variance of a turn that begins, independent of the rest, and discards what is mixed into it
     (unbiased mixing: Yuan, Bar-Shalom, Willett and others, IEEE Trans. AES 48, 2012, 3250-3267; Granström, Willett and
-    Bar-Shalom, IEEE Trans. AES 51, 2015, 2975-2986), not as one that is certain not to turn.
+    Bar-Shalom, IEEE Trans. AES 51, 2015, 2975-2986), not as one with a turn rate of zero and no variance.
 
     Args:
         task: the problem.
         accelerations: standard deviation of the acceleration of each filter, the turn's last, m/s^2.
         turn_rate_start: standard deviation of the turn rate of a turn that begins, degrees/s.
-        turn_rate_change: of its change from scan to scan, degrees/s.
-        stay: probability of each mode to last another scan; it is left for any other alike.
+        turn_rate_change: standard deviation of its change from scan to scan, degrees/s.
+        stay: probability of each mode to last another scan; all others are equally likely next.
     """
 
     def __init__(
@@ -220,8 +220,8 @@ class UnscentedTurn(TurnModel, KalmanModel):
     Args:
         task: the problem.
         acceleration: standard deviation of the acceleration along x and y, m/s^2.
-        turn_rate_change: of the change of the turn rate from scan to scan, degrees/s.
-        turn_rate_start: of the turn rate at the start of the track, degrees/s.
+        turn_rate_change: standard deviation of the change of the turn rate from scan to scan, degrees/s.
+        turn_rate_start: standard deviation of the turn rate at the start of the track, degrees/s.
     """
 
     def __init__(
@@ -235,11 +235,11 @@ class UnscentedTurn(TurnModel, KalmanModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start where everyone starts, with a turn rate about zero."""
+        """Start from the initial estimate, with a turn rate of mean zero."""
         return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Carry the sigma points through the turn and update with the measured position."""
+        """Propagate the sigma points through the turn and update with the measured position."""
         T = given.measurement.interval
         mean, covariance = unscented.transform(
             state.mean, state.covariance, lambda points: coordinated_turn.propagate(points, T)

@@ -1,7 +1,8 @@
-"""Filters whose parameters are fitted to a log of positions, and how far they may go.
+"""Filters whose parameters are fitted to a log of positions, and the limits of these.
 
 Limits follow from the log: an acceleration of ``r / T^2`` moves a target by the deviation r of a measurement within an
-interval T. What is far below is a straight line to the sensor, what is far above follows every measurement.
+interval T. A far smaller acceleration is a straight line to the sensor, with a far larger one the filter follows every
+measurement.
 """
 
 import dataclasses
@@ -32,8 +33,8 @@ class ConstantAcceleration(KalmanModel):
 
     Args:
         task: the problem.
-        jerk: standard deviation of the change of the acceleration a second, constant from scan to scan, m/s^3.
-        acceleration: of the acceleration at the start, m/s^2.
+        jerk: standard deviation of the change of the acceleration in a second, constant from scan to scan, m/s^3.
+        acceleration: standard deviation of the acceleration at the start, m/s^2.
     """
 
     def __init__(self, task: ManeuveringTarget, jerk: float = 0.3, acceleration: float = 1.0) -> None:
@@ -43,7 +44,7 @@ class ConstantAcceleration(KalmanModel):
         self.H = task.constant([[float(i == j) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start where everyone starts, with an acceleration about zero."""
+        """Start from the initial estimate, with an acceleration of mean zero."""
         xp = self.xp
         zero = 0.0 * initial.mean
         right = xp.concat([initial.covariance, zero[:, None][:, :, :] + 0.0 * zero[None, :2]], axis=1)
@@ -55,7 +56,7 @@ class ConstantAcceleration(KalmanModel):
         return super().start(Initial(*augmented))
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """One cycle of the filter."""
+        """Predict and update."""
         xp, T = self.xp, given.measurement.interval
         none, one = 0.0 * T, 1.0 + 0.0 * T
         half = 0.5 * T**2
@@ -110,10 +111,10 @@ UNITS = {
     "leave_noisy": "chance a measurement that a manoeuvre ends",
     "noise_scale": "times the stated deviations",
 }
-"""Units of the parameters of all families; of those that have none, what they are."""
+"""Units of the parameters of all families; for pure numbers a description."""
 
 DECADES = 12.0
-"""How far limits of sizes that follow a recording lie from those of 1 s and 1 m: of a millisecond and a kilometre."""
+"""Decades between limits that follow a recording and those of 1 s and 1 m: for a millisecond and a kilometre."""
 BEYOND = {
     **dict.fromkeys(
         (
@@ -124,14 +125,14 @@ BEYOND = {
     ),
     "log10_correlation_time": 1.0, "scale": 100.0, "heading_offset": 360.0,
 }  # fmt: skip
-"""How far values may lie beyond limits that follow a recording, see :attr:`.Tunable.beyond`."""
+"""Tolerance of values beyond limits that follow a recording, see :attr:`.Tunable.beyond`."""
 
 
 def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
-    """Return what can be fitted to a log of positions, the simplest first.
+    """Return the families that can be fitted to a log of positions, the simplest first.
 
     Args:
-        recording: of ManeuveringTarget, whose intervals and deviations set the limits; None: 1 s and 1 m.
+        recording: recording of ManeuveringTarget, whose intervals and deviations set the limits; None: 1 s and 1 m.
     """
     T = r = 1.0
     if recording is not None:
@@ -141,7 +142,7 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
     usual = math.log10(r / T**2)
     acceleration = usual - 3.5, usual - 1.5, usual + 1.5
     jerk = usual - math.log10(T) - 4.5, usual - math.log10(T) - 2.0, usual - math.log10(T) + 1.5
-    # Degrees a second: from what nobody sees over a hundred scans to a quarter turn within one.
+    # Degrees a second: from a rate that is undetectable over a hundred scans to a quarter turn within one.
     turn = math.log10(0.05 / T), math.log10(2.0 / T), math.log10(90.0 / T)
     leave = {"log10_leave_quiet": (-2.7, -1.5, -0.3), "log10_leave_noisy": (-2.3, -1.0, -0.3)}
     ratio = math.log10(2.0), math.log10(8.0), 3.5
@@ -192,17 +193,17 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
 
 
 def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable:
-    """Dead reckoning by a second sensor, with slow errors of the positions.
+    """Return the dead reckoning by a second sensor, with slow errors of the positions.
 
-    Limits are narrow where a log says little. An error that lasts for more than five minutes cannot be told from a
-    place elsewhere in a log of an hour. Dead reckoning errs by 3 to 10 m after a hundred: to believe it more is
-    dangerous, as likelihood may where errors are no Gauss-Markov process, to believe it less than it deserves costs
+    Limits are narrow where a log contains little information. In a log of an hour an error that lasts for more than
+    five minutes cannot be distinguished from another place. Dead reckoning errs by 3 to 10 m after a hundred. A smaller
+    drift is dangerous, and the likelihood may prefer it where errors are no Gauss-Markov process; a larger drift costs
     little.
 
     Args:
-        recording: with a second sensor; None: any.
+        recording: recording with a second sensor; None: any.
         T: interval between measurements, s.
-        r: their deviation, m.
+        r: standard deviation of a measurement, m.
     """
     scale, heading = (1.0, 0.0) if recording is None else regress_odometry(recording)
     shortest = min(2.0 * T, 10.0)

@@ -20,27 +20,26 @@ if TYPE_CHECKING:
     import xarray
 
 CUTOFF = 1000.0
-"""c, m: a target turns no further off a straight course in two scans."""
+"""c, m: the largest deviation of a turning target from a straight course in two scans."""
 LASTING = 10
 """Scans in a row with an error beyond ``CUTOFF``, after which a track counts as lost."""
 
 
 def gospa(distance: numpy.ndarray, cutoff: float = CUTOFF) -> numpy.ndarray:
-    """GOSPA of one target and one track, m; NaN stays.
+    """Return the GOSPA of one target and one track, m; NaN stays.
 
     Args:
-        distance: between them, m.
+        distance: distance between them, m.
         cutoff: c, m.
     """
     return numpy.minimum(distance, cutoff)
 
 
 def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
-    """First scan of the first ``LASTING`` in a row beyond ``CUTOFF``, from 0 on, ``(episodes,)``; -1 where there are
-    none.
+    """Return the index of the first of ``LASTING`` scans in a row beyond ``CUTOFF``, ``(episodes,)``; -1 without any.
 
     Args:
-        distance: between target and track, m, ``(episodes, time)``.
+        distance: distance between target and track, m, ``(episodes, time)``.
     """
     beyond = distance > CUTOFF
     if beyond.shape[1] < LASTING:
@@ -51,7 +50,7 @@ def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return what the metrics need of each episode; nothing where there is no clutter, and nothing of a bound."""
+    """Return the terms of the metrics for each episode; none without clutter, and none for a bound."""
     if "false_association" not in run or str(run["kind"].values) == "bound":
         return MetricInputs()
     distance = numpy.sqrt(squared_errors(run, "position", groups_of(run)))
@@ -65,12 +64,12 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Measures of tracks in clutter, of one policy.
+    """Return the measures of tracks in clutter, of one policy.
 
     ``gospa``: mean over scans and episodes, m. ``track_loss_rate``: share of episodes with ``LASTING`` scans in a row
     whose error exceeds ``CUTOFF``; ``track_loss_scan``: median of the first of them, over the tracks lost.
     ``false_association_rate``: share of scans in which the plot that is nearest to its prediction, in the gate, is not
-    the target's; of what takes in all plots, too.
+    the target's; also for filters that use all plots.
     """
     return list(_measures(gathered, bootstrap, evaluation)) if gathered.each else []
 

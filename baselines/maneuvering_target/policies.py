@@ -1,4 +1,4 @@
-"""Policies of ManeuveringTarget, and the table of all it is compared with.
+"""Policies of ManeuveringTarget, and the table of its baselines.
 
 Equation numbers and readings are those of the task's paper (Bakulev, Sychev, Nguyen).
 """
@@ -40,12 +40,12 @@ class InteractingMultipleModel(Policy):
         self.log_predicted: Reader = model.reader("log_predicted")
 
     def probabilities(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Posterior mode probabilities, ``(N, M)``."""
+        """Return the posterior mode probabilities, ``(N, M)``."""
         log_predicted, log_likelihood = self.log_predicted(observation), self.log_likelihood(observation)
         return imm.mode_posterior(log_predicted.T, log_likelihood.T).T
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """State the posterior probabilities as weights."""
+        """Return the posterior probabilities as weights."""
         return self.probabilities(observation), None
 
 
@@ -59,13 +59,13 @@ class SteadyStateInteractingMultipleModel(InteractingMultipleModel):
 
 
 class ZeroEvidence(PaperAction):
-    """Nothing added to Bayes' rule: the paper's IMM, inside the task."""
+    """No evidence added to Bayes' rule: the paper's IMM, inside the task."""
 
     control = "evidence"
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Bank of a task under control ``gain``."""
+    """Return the bank of a task under control ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 
@@ -81,14 +81,14 @@ class FixedGain(ConstantPolicy):
 
 
 class FixedLow(FixedGain):
-    """The smallest of the bank's gains, never changed."""
+    """The smallest of the bank's gains, constant."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, min(model.task.parameters.gains))
 
 
 class FixedHigh(FixedGain):
-    """The largest of the bank's gains, never changed."""
+    """The largest of the bank's gains, constant."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, max(model.task.parameters.gains))
@@ -107,7 +107,7 @@ class AdaptiveGain(Policy):
     alpha falls linearly from the larger gain to the smaller one over seven scans, at the start (scans 1 to
     8) and after every alarm. Reading: the paper does not describe the detector; here the normalised
     innovation squared of one scan, both axes, against the chi-square limit of ``false_alarm_probability``,
-    and no alarm while a ramp runs, the first one included, which is what the one complete ramp of its figure 3 shows.
+    and no alarm while a ramp runs, the first one included, as the one complete ramp of its figure 3 shows.
     """
 
     control = "gain"
@@ -124,7 +124,9 @@ class AdaptiveGain(Policy):
         self.available: Reader = model.reader("available")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Go down the ramp, or start it again at an alarm; a scan that missed the target is no step of it."""
+        """Decrease the gain along the ramp, or restart the ramp at an alarm; a scan that missed the target does not
+        count.
+        """
         step = numpy.where(start, 0, 0 if state is None else state)
         alarm = self.squared(observation)[:, 0] > self.threshold
         may = (step > 0) if self.rearm else (step >= self.ramp_scans)
@@ -136,10 +138,10 @@ class AdaptiveGain(Policy):
 
 
 class RearmingAdaptiveGain(AdaptiveGain):
-    """The same with an alarm during the ramp starting it again: an equally ordinary detector.
+    """The paper's comparator with a ramp that an alarm restarts while it runs: an equally ordinary detector.
 
     Reading: the paper sets alpha to the larger gain "if a manoeuvre is detected" and makes no exception for the first
-    ramp, so an alarm restarts that one, too. At the first scan an alarm changes nothing: the ramp begins there.
+    ramp, so an alarm restarts that one, too. An alarm at the first scan has no effect, since the ramp begins there.
     """
 
     rearm = True
@@ -182,7 +184,7 @@ TUNABLE = {
 }
 
 LEFT_OUT = ("semi-markov-3", "semi-markov-5", "semi-markov-15", "semi-markov-wide")
-"""Estimators without which the quick benchmark tells as much."""
+"""Estimators that the quick benchmark leaves out as redundant."""
 
 BASELINES = Baselines(
     environment="filtergym/ManeuveringTarget-v0",

@@ -12,7 +12,8 @@ from ...filters.small_matrices import apply
 from .estimators import KalmanModel
 
 DISTURBANCES = ("glint", "coloured", "bias", "clutter")
-"""All are told to the reference. The bound is told of none: each but false plots, which it never takes, adds errors."""
+"""The reference is given all of them. The bound ignores them: each but false plots, which it never uses, adds
+errors."""
 
 
 class TurnMemory(NamedTuple):
@@ -22,22 +23,22 @@ class TurnMemory(NamedTuple):
     covariance: Array
     likelihood: Likelihood
     truth: Truth
-    """At the last scan."""
+    """Truth at the last scan."""
 
 
 class KnownTurn(KalmanModel):
-    """The Kalman filter that is told the manoeuvres of the episode: the optimal one, given these.
+    """The Kalman filter that is given the manoeuvres of the episode: the optimal one, given these.
 
-    It knows when each begins and ends and what it is: the acceleration of thrust, the rate of a turn. Then nothing
-    disturbs the flight. With x the state, z what is told of the target and F the transition that turns a deviation of
-    the velocity as the target turns (:meth:`.Course.carry`), the errors obey ``x(k) - z(k) = F (x(k-1) - z(k-1))``: its
+    It knows begin, end and kind of each: the acceleration of thrust, the rate of a turn. Then the flight has no random
+    disturbance. With x the state, z the given state of the target and F the transition that turns a deviation of the
+    velocity as the target turns (:meth:`.Course.carry`), the errors obey ``x(k) - z(k) = F (x(k-1) - z(k-1))``: its
     prediction is ``x' = F x + (z(k) - F z(k-1))``, whose second term is the effect of thrust alone and zero in a turn.
-    Of the measurements it is told the variances at the true position, in which scans there is glint, a constant bias,
-    and in clutter which plot is the target's. Of a coloured error it is told deviation and correlation time, and has
-    its level as two more states.
+    Of the measurements it knows the variances at the true position, the scans with glint, a constant bias, and in
+    clutter the plot of the target. Of a coloured error it knows deviation and correlation time, and estimates its level
+    as two more states.
 
-    Of flights that are tables, such as those of aircraft, nobody knows turn rates: there it is told the acceleration
-    from scan to scan, which is thrust.
+    Flights that are tables, such as those of aircraft, have no turn rates: there it is given the acceleration from scan
+    to scan, which counts as thrust.
     """
 
     kind = "reference"
@@ -49,7 +50,7 @@ class KnownTurn(KalmanModel):
     disturbances = DISTURBANCES
 
     def initialise(self, given: FilterInput) -> TurnMemory:
-        """Start where everyone starts; a coloured error is stationary from the start."""
+        """Start from the initial estimate; a coloured error is stationary from the start."""
         (mean, covariance), truth = given.measurement, given.truth
         if "coloured" in truth.disturbances:
             none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2
@@ -58,7 +59,7 @@ class KnownTurn(KalmanModel):
         return TurnMemory(mean, covariance, Likelihood.unknown(mean[0]), truth)
 
     def block_diagonal(self, first: Array, second: Array) -> Array:
-        """Matrix of two blocks, ``(n + m, n + m, N)``."""
+        """Return the block-diagonal matrix of two blocks, ``(n + m, n + m, N)``."""
         corner = 0.0 * first[:, :1] + 0.0 * second[:1]
         return self.xp.concat(
             [
@@ -68,7 +69,7 @@ class KnownTurn(KalmanModel):
         )
 
     def update(self, state: TurnMemory, given: FilterInput) -> TurnMemory:
-        """Predict with what is known of the flight since the scan before, and update with the measured position."""
+        """Predict with the known flight since the scan before, and update with the measured position."""
         measurement, truth = given.measurement, given.truth
         xp, world, disturbances = self.xp, self.task.world, truth.disturbances
         assert isinstance(world, RadarWorld)
@@ -104,7 +105,7 @@ class KnownTurn(KalmanModel):
 
 
 class KnownInputBound(ConstantVelocityModel):
-    """Posterior Cramér-Rao bound of an estimator that is told the whole acceleration: no process noise."""
+    """Posterior Cramér-Rao bound of an estimator that is given the whole acceleration: no process noise."""
 
     kind = "bound"
     traceable = True
@@ -112,12 +113,12 @@ class KnownInputBound(ConstantVelocityModel):
     disturbances = DISTURBANCES
 
     def start(self, initial: Initial, truth: Truth) -> Array:
-        """Covariance of the start."""
+        """Return the covariance of the start."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
-        """Bound after this scan: the diagonal of the covariance recursion at the true position. A scan that missed the
-        target adds no information.
+        """Return the bound after this scan: the diagonal of the covariance recursion at the true position. A scan that
+        missed the target adds no information.
         """
         world = self.task.world
         assert isinstance(world, RadarWorld)

@@ -1,7 +1,7 @@
-"""Smoothers of ManeuveringTarget: its Kalman filters, asked again when later scans are known.
+"""Smoothers of ManeuveringTarget: its Kalman filters with later scans.
 
-They are not causal. They run forward as the estimators that they are made of, so that with lag zero they say what these
-say; scans that missed the target are prediction only, backward too.
+They are not causal. Their forward passes are those estimators, so that with lag zero they return the same estimates;
+for scans that missed the target they only predict, backward too.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class ConstantVelocitySmoother(ConstantVelocity):
     Args:
         task: the problem.
         acceleration: standard deviation of the acceleration, m/s^2.
-        lag: how many later scans each estimate uses; default: all of them.
+        lag: number of later scans that each estimate uses; default: all of them.
     """
 
     kind = "smoother"
@@ -44,7 +44,7 @@ class ConstantVelocitySmoother(ConstantVelocity):
     def smooth(
         self, measurements: Sequence[Measurement], states: Sequence[EstimateState]
     ) -> tuple[Array, Array]:
-        """Smooth the whole track, or with the lag."""
+        """Smooth the whole track, or with the fixed lag."""
         filtered = smoothing.Gaussian(*scans.stack_scans(states)[:2])
         motion = scans.by_stretches(self._motion, filtered.mean, scans.stack_scans(measurements))
         smoothed = smoothing.smooth(filtered, motion, self.lag)
@@ -56,7 +56,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
 
     Args:
         task: the problem.
-        lag: how many later scans each estimate uses; default: all of them.
+        lag: number of later scans that each estimate uses; default: all of them.
         **arguments: of :class:`.KalmanInteractingMultipleModel`.
     """
 
@@ -67,7 +67,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         self.lag = lag
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """How every filter predicts over intervals.
+        """Return the motion of every filter over intervals.
 
         Args:
             mixed: mean from which each starts, ``(n, M, N)``.
@@ -95,7 +95,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
     def smooth(
         self, measurements: Sequence[Measurement], states: Sequence[KalmanMixture]
     ) -> tuple[Array, Array]:
-        """Smooth the whole track, or with the lag."""
+        """Smooth the whole track, or with the fixed lag."""
         filtered = smoothing.GaussianMixture(*scans.stack_scans(states)[3:])
         arrival = scans.by_stretches(self._arrival, filtered, scans.stack_scans(measurements))
 
@@ -110,17 +110,17 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
 class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleModel):
     """IMM over quiet and noisy constant velocity and the coordinated turn, smoothed by a second filter backward.
 
-    The turn is linearised where the filter has linearised it. A filter of constant velocity forgets the turn rate: its
-    transition is zero there, and its noise the variance of a turn that begins.
+    The turn is linearised where the filter has linearised it. A filter of constant velocity discards the turn rate: its
+    transition is zero there, and its noise is the variance of a turn that begins.
 
     Args:
         task: the problem.
-        lag: how many later scans each estimate uses; default: all of them.
+        lag: number of later scans that each estimate uses; default: all of them.
         **arguments: of :class:`.KalmanTurnInteractingMultipleModel`.
     """
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """How every filter predicts; arguments as of the class before."""
+        """Return the motion of every filter; arguments of :meth:`KalmanIMMSmoother.motions`."""
         xp = self.xp
         F, unit = self.motion(T)
         nothing = 0.0 * unit[0]

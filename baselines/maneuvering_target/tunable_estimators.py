@@ -1,6 +1,6 @@
-"""The estimators of ManeuveringTarget by name, and what can be tuned in them.
+"""The estimators of ManeuveringTarget by name, and their tunable values.
 
-Deviations and small probabilities are searched by their logarithm: their sizes are not known beforehand.
+Deviations and small probabilities are searched by their logarithm, since their orders of magnitude are unknown.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ ESTIMATORS: dict[str, Any] = {
     **FEW,
     "semi-markov-wide": Variant(
         SemiMarkov,
-        "`semi-markov` with a prior that holds harder manoeuvres than those of training, too: 40 hypotheses.",
+        "`semi-markov` with a prior that includes harder manoeuvres than those of training: 40 hypotheses.",
         prior=WIDE,
     ),
     "semi-markov-vague": SEMI_MARKOV_VAGUE,
@@ -93,7 +93,7 @@ TURNS: dict[int, dict[str, tuple[float, float]]] = {
     1: {"turn": (0.5, 7.0)},
     2: {"turn_gentle": (0.5, 3.0), "turn_steep": (3.0, 7.0)},
 }
-"""Limits of the mean acceleration of as many kinds of turns."""
+"""Limits of the mean acceleration, one for each kind of turn."""
 
 
 def _semi_markov(make: Callable[..., Any], prior: SemiMarkovPrior, likelihood: bool = False) -> Tunable:

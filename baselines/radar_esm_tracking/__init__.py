@@ -1,4 +1,4 @@
-"""What RadarEsmTracking is compared with."""
+"""Baselines of RadarEsmTracking."""
 
 from .policies import BASELINES
 

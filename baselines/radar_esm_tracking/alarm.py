@@ -1,4 +1,4 @@
-"""When something is wrong in RadarEsmTracking: the class, or what the ESM hears, is not as the paper's rule assumes."""
+"""Alarm of RadarEsmTracking: the class or the ESM decisions are not as the paper's rule assumes."""
 
 import math
 from typing import ClassVar
@@ -12,23 +12,24 @@ from ...filters import class_fusion, imm
 from ..alarm import Alarm, innovation_evidence
 
 REFUSAL_SHARE = 0.5
-"""Share of decisions that the gate refuses where a second emitter is heard; ours."""
+"""Share of decisions that the gate refuses where a second emitter is received; ours."""
 NIS_LIMIT = 9.2
-"""Normalised innovation squared of two channels that one scan in a hundred exceeds: beyond it no class explains it."""
+"""Normalised innovation squared of two channels that one scan in a hundred exceeds: beyond it no class explains the
+innovation."""
 MOST = 2.0
-"""Nats that one scan may tell for another class; ours, so that one outlier raises no alarm."""
+"""Largest log-likelihood ratio of one scan for another class, nats; ours, so that one outlier raises no alarm."""
 LEAST = 1e-300
 """Smallest likelihood whose logarithm is taken."""
 
 
 class ClassAlarm(Alarm):
-    """A class that explains the radar better than the weights in force; decisions that are all about one type, where
-    the paper draws it anew every time; or too many that the bearing gate refuses.
+    """Alarm on a class that explains the radar better than the weights in force, on decisions that are all about one
+    type, where the paper draws the type anew every time, and on too many decisions that the bearing gate refuses.
 
-    Radar errors that no class explains raise no alarm: weighing the classes otherwise cannot heal them.
+    Radar errors that no class explains raise no alarm: other weights of the classes cannot correct them.
     """
 
-    window = 1000  # what it finds lasts as long as the episode
+    window = 1000  # a detected condition lasts as long as the episode
     false_alarms: ClassVar[float] = 1.0  # of a bound that is far from tight; measured: 0.03 in ``paper``
 
     def __init__(self, model: Model) -> None:
@@ -49,7 +50,7 @@ class ClassAlarm(Alarm):
         self.refusal: float = p.association_error
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Weigh radar and ESM."""
+        """Return the log-likelihood ratios of radar and ESM."""
         likelihood = numpy.exp(self.log_likelihood(observation))
         expected = (self.last_weight(observation) * likelihood).sum(axis=1)
         another = numpy.log(likelihood.mean(axis=1) / numpy.maximum(expected, LEAST))
@@ -65,7 +66,7 @@ class ClassAlarm(Alarm):
         return numpy.stack([another, one_type, refusals], axis=1)
 
     def _one_type(self, used_count: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood ratio of one type to types drawn anew, of all decisions so far."""
+        """Return the log-likelihood ratio of one type to types drawn anew, of all decisions so far."""
         counts = COUNT_UNIT * used_count.T
         fixed = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         redrawn = self.log_esm @ counts

@@ -24,7 +24,7 @@ TIMES = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 
 
 def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
-    """Ratio of means over episodes, ``(1 + resamples,)``; without numbers where there is no share."""
+    """Return the ratio of means over episodes, ``(1 + resamples,)``; NaN where the denominator is zero."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return means / shares
 
@@ -32,21 +32,22 @@ def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
 def time_quantile(
     bootstrap: Bootstrap, first: numpy.ndarray, chosen: numpy.ndarray, seconds: numpy.ndarray, share: float
 ) -> IntervalEstimate:
-    """Time by which a share of the chosen episodes has got there; infinite where too few do, NaN where none is chosen.
+    """Return the time by which a condition holds in a share of the chosen episodes; infinite where too few reach it,
+    NaN without any.
 
     Args:
-        bootstrap: of the episodes.
-        first: index of the first time at which it holds, or the number of times, ``(episodes,)``.
-        chosen: which episodes count, ``(episodes,)`` booleans.
-        seconds: of each time, ``(T,)``.
-        share: such as 0.5 for the median.
+        bootstrap: resamples of the episodes.
+        first: index of the first time at which the condition holds, or the number of times, ``(episodes,)``.
+        chosen: whether an episode counts, ``(episodes,)`` booleans.
+        seconds: times, s, ``(T,)``.
+        share: share, such as 0.5 for the median.
     """
     times = numpy.append(seconds, math.inf)[first]
     return bootstrap.interval(bootstrap.quantiles(times, share, chosen))
 
 
 def _first(condition: numpy.ndarray) -> numpy.ndarray:
-    """Index of the first true entry along time, or the number of times, ``(episodes,)``."""
+    """Return the index of the first true entry along time, or the number of times, ``(episodes,)``."""
     return numpy.where(condition.any(axis=1), condition.argmax(axis=1), condition.shape[1])
 
 
@@ -68,17 +69,16 @@ def _missing(run: "xarray.Dataset", name: str) -> bool:
 
 
 def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
-    """Whether a target is of a class, ``(..., classes)``."""
     return numpy.asarray(true_class[..., None] == numpy.arange(CLASSES))
 
 
 def _of_group(true_class: numpy.ndarray) -> numpy.ndarray:
-    """Whether a target is of a group, ``(..., 1 + classes)``: everybody, and each class."""
+    """Return whether a target is of each group, ``(..., 1 + classes)``: all targets, and each class."""
     return numpy.concatenate([numpy.ones((*true_class.shape, 1), bool), _of_class(true_class)], axis=-1)
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return what the metrics need of each episode; nothing of a bound, and of a reference no beliefs."""
+    """Return the terms of the metrics for each episode; none for a bound, and no beliefs for a reference."""
     if _missing(run, "true_class"):
         return MetricInputs()
     true_class = run["true_class"].values.astype(int)
@@ -137,7 +137,7 @@ def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
 
 
 def _moments(seconds: numpy.ndarray) -> dict[float, int]:
-    """Indices of the times of :data:`TIMES` that there are."""
+    """Return the indices of the times of :data:`TIMES` within the episode."""
     found = {moment: numpy.flatnonzero(numpy.isclose(seconds, moment)) for moment in TIMES}
     return {moment: int(at[0]) for moment, at in found.items() if len(at)}
 
@@ -147,7 +147,7 @@ def _last(seconds: numpy.ndarray) -> int:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Errors by true class, recognition of the class, and calibration, of one policy.
+    """Return the errors by true class, recognition of the class, and calibration, of one policy.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
     ``time_to_recognise_median``, ``_90_quantile`` (first P(true class) >= 0.9) and ``_censored``, the share of
@@ -159,7 +159,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
     ``false_class_changes``, how often in an episode the most probable class leaves the true one that has not changed;
     ``right_class``, the share of scans at which it is the true one; ``class_log_score``, the mean logarithm of the true
     class's probability (at least 1e-6).
-    A reference has no class probabilities: of it only errors and calibration.
+    A reference has no class probabilities, so that only errors and calibration are computed.
     """
     if not gathered.averaged:
         return []
@@ -168,7 +168,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
 
 
 GROUPS = ("", *(f"S{s}" for s in range(CLASSES)))
-"""Names of everybody, and of the targets of each class."""
+"""Names of the group of all targets, and of the groups of each class."""
 
 
 def _errors(means: Arrays, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> Iterator[Measure]:

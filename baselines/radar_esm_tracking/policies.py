@@ -1,4 +1,4 @@
-"""Policies of RadarEsmTracking, and the table of all it is compared with.
+"""Policies of RadarEsmTracking, and the table of its baselines.
 
 Equation numbers and readings are those of the task's paper (Ivanov, Seliverstov).
 """
@@ -23,13 +23,13 @@ from .references import Ideal, KnownDrawBound
 
 
 class QuasiOptimal(PaperAction):
-    """The paper's algorithm (8)-(12): nothing added to its rule."""
+    """The paper's algorithm (8)-(12): no evidence added to its rule."""
 
     control = "evidence"
 
 
 class FixedWeights(ConstantPolicy):
-    """The uniform combination of the filters, never changed."""
+    """The uniform combination of the filters, constant."""
 
     control = "weights"
 
@@ -39,12 +39,14 @@ class FixedWeights(ConstantPolicy):
 
 
 class _Posterior(Policy):
-    """Shared reading of the observation: log-likelihoods of the classes, ``(M, N)`` each."""
+    """Base of the policies with class probabilities: log-likelihoods of the classes from the observation, ``(M, N)``
+    each.
+    """
 
     control = "weights"
     traceable = True
     task_keywords: ClassVar[dict[str, Any]] = {"decision_interval": 1}
-    """It states a posterior of every scan."""
+    """Its posterior changes at every scan."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -60,20 +62,20 @@ class _Posterior(Policy):
         )
 
     def radar(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood of all radar measurements so far, up to a constant."""
+        """Return the log-likelihood of all radar measurements so far, up to a constant."""
         return self.accumulated(observation).T
 
     def counts(self, observation: numpy.ndarray, refused: float = 0.0) -> numpy.ndarray:
-        """How often the ESM decided for each type, refused decisions counting ``refused``, ``(J, N)``."""
+        """Return how often the ESM decided for each type, with weight ``refused`` for refused decisions, ``(J, N)``."""
         shown = self.used_count(observation) + refused * self.refused_count(observation)
         return COUNT_UNIT * shown.T
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Log-probability of the classes, up to a constant."""
+        """Return the log-probability of the classes, up to a constant."""
         raise NotImplementedError
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """State the probabilities as weights."""
+        """Return the probabilities as weights."""
         return imm.softmax(self.log_posterior(observation)).T, None
 
 
@@ -81,7 +83,7 @@ class RadarOnly(_Posterior):
     """Class probabilities from the radar's innovations alone."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior and radar."""
+        """Return the log-probability from prior and radar."""
         return self.log_prior + self.radar(observation)
 
 
@@ -89,19 +91,19 @@ class EsmOnly(_Posterior):
     """Class probabilities from the ESM decisions alone, each taken as new evidence, as in (8)."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior and ESM."""
+        """Return the log-probability from prior and ESM."""
         return self.log_prior + self.log_esm @ self.counts(observation)
 
 
 class Ungated(_Posterior):
     """The paper's rule with every ESM decision, also those that the gate refuses.
 
-    With one emitter in sight a refused decision is as good as any: on ``paper`` this is the exact posterior
-    given all that the agent is shown, which nothing can beat. With a second emitter the gate is needed.
+    With a single emitter a refused decision is as good as any: on ``paper`` this is the exact posterior given the
+    observations, which no policy can beat. With a second emitter the gate is needed.
     """
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior, radar, and all decisions."""
+        """Return the log-probability from prior, radar, and all decisions."""
         return self.log_prior + self.radar(observation) + self.log_esm @ self.counts(observation, 1.0)
 
 
@@ -109,9 +111,9 @@ class JointType(_Posterior):
     """Posterior over type and class together: right where a target has one type.
 
     Args:
-        model: in which it acts.
-        refused: what a decision that the gate refuses counts for, 0 to 1.
-        esm: what any decision counts for, 0 to 1.
+        model: the environment's model for the policy.
+        refused: weight of a decision that the gate refuses, 0 to 1.
+        esm: weight of any decision, 0 to 1.
     """
 
     def __init__(self, model: Model, refused: float = 0.0, esm: float = 1.0) -> None:
@@ -120,21 +122,21 @@ class JointType(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior, radar, and all decisions as statements about one type."""
+        """Return the log-probability from prior, radar, and all decisions as measurements of one type."""
         counts = self.esm * self.counts(observation, self.refused)
         esm = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         return self.log_prior + self.radar(observation) + esm
 
 
 class ForgettingJointType(JointType):
-    """Posterior over type and class together where the class may change and bring its own type: old evidence fades.
+    """Posterior over type and class together where the class may change, and the type with it: old evidence fades.
 
     Args:
-        model: in which it acts.
+        model: the environment's model for the policy.
         change: probability that the class changes from one decision to the next; by default once in 500 scans,
             four times the length of an episode.
         refused: as in :class:`JointType`.
-        esm: likewise.
+        esm: weight of any decision, 0 to 1.
     """
 
     traceable = True
@@ -145,7 +147,9 @@ class ForgettingJointType(JointType):
         self.log_start: numpy.ndarray = self.log_prior[:, None] + self.log_composition[..., None]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Radar under the class before, change of class, decisions about the type now."""
+        """Update by the radar under the class before, change of class, and decisions about the type now; return the
+        weights.
+        """
         radar, counts = self.radar(observation), self.esm * self.counts(observation, self.refused)
         joint, last_radar, last_counts = (self.log_start, 0.0, 0.0) if state is None else state
         joint = numpy.where(start, self.log_start, joint)
@@ -158,14 +162,15 @@ class ForgettingJointType(JointType):
 
 
 class Leaky(_Posterior):
-    """The paper's rule (8) with class transitions: it never becomes so sure that it cannot turn round.
+    """The paper's rule (8) with class transitions: probabilities stay away from zero, so that a change of class is
+    detected.
 
     Only the weights leak; the filters stay as they are (``class_transition`` would mix them too).
 
     Args:
-        model: in which it acts.
+        model: the environment's model for the policy.
         leak: probability that the class changes in one scan, shared equally by the others.
-        esm: what a decision counts for, 0 to 1.
+        esm: weight of a decision, 0 to 1.
     """
 
     def __init__(self, model: Model, leak: float = 0.01, esm: float = 1.0) -> None:
@@ -180,7 +185,7 @@ class Leaky(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Last weights and this scan's radar measurement, transition, this scan's decision."""
+        """Update the last weights by this scan's radar measurement, the transition, and this scan's decision."""
         last = imm.log_probabilities(self.last_weight(observation).T)
         this_scan = self.log_likelihood(observation).T
         predicted = self.transition.T @ imm.mode_posterior(last, this_scan)
@@ -211,7 +216,7 @@ ESTIMATORS = {
 
 
 def _tunable_bayes(name: str, prior: ClassPrior, **limits: tuple[float, float, float]) -> Tunable:
-    """Each candidate runs alone: values make tables."""
+    """Return the tunable values; each candidate runs alone, since values determine tables."""
     change = (-4.0, math.log10(prior.change_rate), -1.0)
     found = tunable(
         ESTIMATORS[name], log10_change_rate=change, coloured=(0.05, prior.coloured, 0.7), **limits
@@ -247,7 +252,7 @@ BASELINES = Baselines(
         "esm-only": EsmOnly,
         "non-adaptive": Variant(
             ConstantMode,
-            "The paper's comparator: the filter of the most agile class, whatever the target.",
+            "The paper's comparator: the filter of the most agile class for every target.",
             mode=-1,
         ),
         "fixed-weights": FixedWeights,

@@ -16,11 +16,11 @@ from ...filters import bounds, kalman
 from ...filters.small_matrices import mirror_lower
 
 NOTHING = 1e-12
-"""Variance of a coloured error that is not there, in units of the white one: the covariance stays positive definite."""
+"""Variance of an absent coloured error, in units of the white one: the covariance stays positive definite."""
 
 
 class KnownClassState(NamedTuple):
-    """Estimate, and the class that governs the coming motion."""
+    """Estimate, and the class that governs the next motion."""
 
     mean: Array
     """``(n, N)``; n = 3, or 5 with the radar's coloured errors."""
@@ -31,7 +31,7 @@ class KnownClassState(NamedTuple):
 
 
 class _KnownDraw:
-    """Models that the draw of the episode chooses scan by scan."""
+    """Base of reference and bound: the draw of the episode selects the models scan by scan."""
 
     knows = (
         "the true class at every scan, in which scans there is glint, how strong and how lasting the radar's coloured "
@@ -53,7 +53,7 @@ class _KnownDraw:
         )
 
     def start(self, initial: Start, truth: Truth) -> KnownClassState:
-        """Start where the filter of the true class starts; the first measurement's errors are correlated as told."""
+        """Start as the filter of the true class, with the true correlation of the first measurement's errors."""
         mean, P = initial.mean, self.of(self.start_covariance, truth.target_class)
         white, zero = self.white(truth), 0.0 * truth.radar_correlation
         start = [[P[i, j] if i == j else zero for j in range(3)] for i in range(3)]
@@ -74,21 +74,23 @@ class _KnownDraw:
         return KnownClassState(mean, self.matrix(start), truth.target_class)
 
     def matrix(self, rows: list[list[Array]]) -> Array:
-        """Stack the entries of a matrix."""
+        """Return a matrix from its entries."""
         return self.xp.stack([self.xp.stack(row) for row in rows])
 
     def of(self, matrices: Array, target_class: Array) -> Array:
-        """Matrix of each lane's class, ``(3, 3, N)``."""
+        """Return the matrix of each lane's class, ``(3, 3, N)``."""
         return self.xp.take(matrices, target_class, axis=-1)
 
     def white(self, truth: Truth) -> Array:
-        """Covariance of this scan's white errors, ``(2, 2, N)``."""
+        """Return the covariance of this scan's white errors, ``(2, 2, N)``."""
         (a, b), factor = self.deviations, self.task.world.error_factor(truth) ** 2
         cross = a * b * factor * truth.radar_correlation
         return self.matrix([[a * a * factor, cross], [cross, b * b * factor]])
 
     def motion(self, truth: Truth, governed: Array) -> tuple[Array, Array]:
-        """Transition and noise of the scan before this one, ``(n, n, N)``, under the class that governed it."""
+        """Return the transition and noise of the scan before this one, ``(n, n, N)``, under the class that governed
+        it.
+        """
         models = self.task.models
         F, Q = self.of(models.Phi, governed), self.of(models.Q, governed)
         if not self.coloured:
@@ -111,7 +113,7 @@ class _KnownDraw:
 
 
 class Ideal(_KnownDraw):
-    """The Kalman filter that is told the draw of the episode: the optimal one, given it."""
+    """The Kalman filter that is given the draw of the episode: the optimal one, given it."""
 
     kind = "reference"
 
@@ -136,7 +138,7 @@ class KnownDrawBound(_KnownDraw):
     def update(
         self, memory: KnownClassState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, KnownClassState]:
-        """Bound after this scan: the diagonal of the covariance."""
+        """Return the bound after this scan: the diagonal of the covariance."""
         F, Q = self.motion(truth, memory.target_class)
         P = bounds.predict_bound(memory.covariance, F, Q)
         P = bounds.posterior_cramer_rao_bound(P, self.H, self.white(truth))

@@ -1,4 +1,4 @@
-"""What TightlyCoupledNavigation is compared with."""
+"""Baselines of TightlyCoupledNavigation."""
 
 from .policies import BASELINES
 

@@ -1,15 +1,15 @@
-"""When something is wrong in TightlyCoupledNavigation: a sensor is noisy or stuck."""
+"""Alarm of TightlyCoupledNavigation: a sensor is noisy or stuck."""
 
 import numpy
 
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Reader
-from ..alarm import LARGER, Alarm, certain, scale_ratio
+from ..alarm import LARGER, Alarm, fault_evidence, scale_ratio
 
 
 class SensorAlarm(Alarm):
     """Innovations of a group of sensors too large under every hypothesis, or accelerometers that repeat their last
-    reading exactly: noise never does. Satellites that are hidden are none of these: the filters are told of them.
+    reading exactly: noise never does. Hidden satellites raise no alarm: the filters observe which are hidden.
     """
 
     window = 20
@@ -22,13 +22,15 @@ class SensorAlarm(Alarm):
         self.others = [sensor.readings.stop - sensor.readings.start for sensor in self.task.sensors[2:]]
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Weigh every group of sensors."""
+        """Return the log-likelihood ratios of every group of sensors."""
         count = len(observation)
         here = [read(observation).sum(axis=1) for read in self.available]
         here += [numpy.full(count, float(readings)) for readings in self.others]
-        # Shown is the mean over the readings and measurements of a decision.
+        # The observation contains the mean over the readings and measurements of a decision.
         measurements = self.measurements(before)
         degrees = measurements * numpy.stack(here, axis=1)
         mean = self.nis(observation).reshape(count, len(here), -1).min(axis=2)
         stuck = self.repeat(observation)[:, 0] > 0.0
-        return numpy.concatenate([scale_ratio(degrees * mean, degrees, LARGER), certain(stuck)], axis=1)
+        return numpy.concatenate(
+            [scale_ratio(degrees * mean, degrees, LARGER), fault_evidence(stuck)], axis=1
+        )

@@ -1,4 +1,4 @@
-"""Estimators of TightlyCoupledNavigation: the paper's bank with updates that no action can ask for."""
+"""Estimators of TightlyCoupledNavigation: the paper's bank with updates that no action can select."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,13 +15,13 @@ class HuberBank(HypothesisBank):
     """The paper's bank with thresholds of the robust update.
 
     Without accelerometers there are as many rates as unknown velocities. One that disagrees may be noisy; where they
-    disagree on the average a manoeuvre has begun, and a robust update would never follow it.
+    disagree on the average a manoeuvre has begun, and a robust update would not follow it.
 
     Args:
         task: the problem.
-        thresholds: of each group of sensors by its name; of others none.
-        manoeuvre: short average of the normalised innovation squared of a rate, under the hypothesis that has the
-            smallest one, from which on updates without accelerometers are plain.
+        thresholds: threshold of each group of sensors by its name; a group without one has plain updates.
+        manoeuvre: limit of the short average of the normalised innovation squared of a rate, under the hypothesis with
+            the smallest one; from it on updates without accelerometers are plain.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class HuberBank(HypothesisBank):
         ]
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array]:
-        """Those of every reading, ``(N,)`` each; infinity where updates are plain."""
+        """Return the threshold of every reading, ``(N,)`` each; infinity where updates are plain."""
         xp, forces = self.xp, self.task.sensors[2].readings
         there = xp.all(measurement.available[forces] > 0.0, axis=0)
         robust = there | (xp.min(state.average_nis[1], axis=0) < self.manoeuvre)
@@ -57,7 +57,7 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
 
     Args:
         task: the problem.
-        thresholds: of each group of sensors by its name; default: the usual one for all.
+        thresholds: threshold of each group of sensors by its name; default: the usual one for all.
         manoeuvre: see :class:`HuberBank`; by default every update is robust.
     """
 
@@ -72,11 +72,11 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         self.bank: HuberBank = HuberBank(task, everywhere if thresholds is None else thresholds, manoeuvre)
 
     def start(self, initial: Initial) -> HuberState:
-        """Start every filter where everyone starts."""
+        """Start all filters from the initial estimate."""
         return HuberState(self.bank.start(initial), Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: HuberState, given: FilterInput) -> HuberState:
-        """One cycle of the bank."""
+        """Run one cycle of the bank."""
         xp, measurement = self.xp, given.measurement
         readings = xp.where(xp.isnan(measurement.readings), 0.0, measurement.readings)
         measurement = measurement._replace(readings=readings)  # the bank weighs each by its availability
@@ -85,20 +85,20 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         return HuberState(filters, Likelihood.of_records(self.bank.records(filters, measurement)))
 
     def mean(self, state: HuberState) -> Array:
-        """That of the bank."""
+        """Return the mean of the bank."""
         return self.bank.mean(state.filters)
 
     def covariance(self, state: HuberState) -> Array:
-        """That of the bank."""
+        """Return the covariance of the bank."""
         return self.bank.covariance(state.filters)
 
 
 class HuberStuckCheck(Huber):
-    """Huber's update of ranges and rates, and accelerometers that repeat their last reading are left out at once.
+    """Huber's update of ranges and rates, without accelerometers that repeat their last reading.
 
-    Noise never repeats itself, so the first repeated reading shows the stuck sensor for certain. Robustness alone
-    cannot: a stuck accelerometer agrees with the prediction that it has made, and the outliers are the rates that
-    contradict it.
+    Noise never repeats itself, so the first repeated reading proves that the sensor is stuck. Robustness alone cannot
+    detect it: a stuck accelerometer agrees with the prediction from its own readings, and the rates that contradict it
+    look like outliers.
 
     Args:
         task: the problem.
@@ -112,7 +112,7 @@ class HuberStuckCheck(Huber):
         super().__init__(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
 
     def update(self, state: HuberState, given: FilterInput) -> HuberState:
-        """One cycle of the bank without what repeats itself."""
+        """Run one cycle of the bank without repeated readings."""
         xp, forces, measurement = self.xp, self.task.sensors[2].readings, given.measurement
         available = measurement.available
         fresh = xp.any(measurement.readings[forces] != state.filters.accelerometers, axis=0)

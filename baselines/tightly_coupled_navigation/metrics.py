@@ -1,4 +1,4 @@
-"""What is measured of TightlyCoupledNavigation beside the metrics of every environment."""
+"""Metrics of TightlyCoupledNavigation in addition to those of every environment."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -17,25 +17,25 @@ if TYPE_CHECKING:
 
 UNITS = {"position": "m", "velocity": "m/s"}
 RISK = 1e-3
-"""Of the integrity of an estimate, and of a false alarm of the innovation test at one step."""
+"""Integrity risk of an estimate, and probability of a false alarm of the innovation test at one step."""
 TESTED = 20
 """Steps over which the innovation test sums."""
 LASTING = 10
-"""Steps for which a hypothesis must stay believed, or a rate outside its aperture, to count."""
+"""Steps for which a hypothesis must stay most probable, or a rate outside its aperture, to count."""
 
 
 def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -> IntervalEstimate:
-    """Ratio of means over episodes, with its interval."""
+    """Return the ratio of means over episodes, with its interval."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
 
 
-def lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
-    """Where a condition begins to hold for some steps in a row; false where the end is too near.
+def find_lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
+    """Return where a condition begins to hold for some steps in a row; false where the end is too near.
 
     Args:
         condition: ``(episodes, time)`` booleans.
-        steps: how many.
+        steps: number of steps.
     """
     sums = numpy.cumsum(numpy.pad(condition, ((0, 0), (1, 0))), axis=1)
     held = numpy.zeros_like(condition)
@@ -51,13 +51,13 @@ class Switch(NamedTuple):
     before: int
     after: int
     wait: float
-    """Steps until the new hypothesis is believed, the first one counted; infinite where it never is."""
+    """Steps until the new hypothesis has more than one half, the first one counted; infinite where it never has."""
 
 
 def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switch]:
-    """Every change of the true hypothesis and how long the bank took to follow it.
+    """Return every change of the true hypothesis and the delay of the bank.
 
-    A hypothesis is believed from the first step on which its probability exceeds one half and does so for
+    The delay ends at the first step from which the probability of the new hypothesis exceeds one half for
     ``LASTING`` steps (or until the next change, if that comes sooner).
 
     Args:
@@ -72,14 +72,14 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
         others = numpy.flatnonzero(true_mode[episode, first:] != after)
         last = first + int(others[0]) if len(others) else length
         believed = probability[episode, first:last, after] > 0.5
-        held = lasting(believed[None], min(LASTING, last - first))[0]
+        held = find_lasting(believed[None], min(LASTING, last - first))[0]
         wait = float(held.argmax()) + 1.0 if held.any() else math.inf
         found.append(Switch(int(episode), before, after, wait))
     return found
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return what the metrics need of each episode; nothing of a bound."""
+    """Return the terms of the metrics for each episode; none for a bound."""
     if str(run["kind"].values) == "bound":
         return MetricInputs()
     true_mode = run["true_mode"].values.astype(int)
@@ -100,7 +100,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     moved = true_mode != true_mode[:, :1]
     begin = numpy.where(moved.any(axis=1), moved.argmax(axis=1), 0)
     in_motion = numpy.arange(true_mode.shape[1]) >= begin[:, None]
-    outside = lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
+    outside = find_lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
     each |= {
         "switches": _count_changes(switches(true_mode, run["mode_probability"].values), len(true_mode), step),
         "lost": numpy.asarray(outside.any(axis=1)),
@@ -110,14 +110,16 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def _integrity(run: "xarray.Dataset") -> Arrays:
-    """Errors that the covariance does not cover, innovations, and what a test of them finds, of each episode."""
+    """Return the number of errors outside the covariance's region, the correlation of innovations, and the results of a
+    test of them, for each episode.
+    """
     limit = chi_square_quantile(1.0 - RISK, run.sizes["component"])
     found: dict[str, numpy.ndarray] = {"misleading": (run["nees"].values > limit).mean(axis=1)}
     if "nis" not in run or numpy.isnan(run["nis"].values).all() or "sensor_fails" not in run:
         return found
     nis: numpy.ndarray = numpy.nan_to_num(run["nis"].values)
     degrees: numpy.ndarray = numpy.nan_to_num(run["nis_degrees"].values)
-    # The root tames the innovations of a fault, which would be all that is seen.
+    # The root limits the innovations of a fault, which would dominate.
     surprise = numpy.sqrt(nis / numpy.maximum(degrees, 1.0))
     apart = surprise - surprise.mean(axis=1, keepdims=True)
     found["innovation_products"] = (apart[:, 1:] * apart[:, :-1]).mean(axis=1)
@@ -130,11 +132,11 @@ def _integrity(run: "xarray.Dataset") -> Arrays:
 
 
 def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarray:
-    """Where the normalised innovation squared, summed over the last steps, is larger than chance allows.
+    """Return where the normalised innovation squared, summed over the last steps, exceeds the limit of the test.
 
     Args:
         nis: ``(episodes, time)``.
-        degrees: its degrees of freedom, likewise.
+        degrees: its degrees of freedom, ``(episodes, time)``.
     """
 
     def summed(values: numpy.ndarray) -> numpy.ndarray:
@@ -146,10 +148,10 @@ def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarra
 
 
 def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Arrays:
-    """False alarms, and of the first fault of each episode whether it is found while it lasts, and when."""
+    """Return the false alarms, and whether and when the first fault of each episode is detected while it lasts."""
     fault, first = numpy.logical_or.reduce(fails, axis=1), fails.argmax(axis=1)
     steps, length = numpy.arange(alarm.shape[1]), alarm.shape[1]
-    # What has gone wrong leaves its traces: only what comes before the first fault is a false alarm.
+    # A fault has effects after its end: only alarms before the first fault are false.
     before = numpy.where(fault, first, length)
     ended = ~fails & (steps > first[:, None])
     last = numpy.where(ended.any(axis=1), ended.argmax(axis=1), length)
@@ -165,7 +167,8 @@ def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Array
 
 
 def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
-    """Number of changes, of those that were missed, and seconds waited for the others, from and to each hypothesis.
+    """Return the numbers of changes and of missed ones, and the delay of the others in seconds, from and to each
+    hypothesis.
 
     Returns:
         ``(episodes, M, M, 3)``.
@@ -178,22 +181,21 @@ def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> num
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
+    """Return the errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,
-    whose mean a few lost tracks rule; ``adaptation_time`` (mean) from the first step that carries a new motion to the
-    first on which its hypothesis has more than one half and keeps it for ten steps, and
-    ``adaptation_censored``, the share of switches where that never comes; ``track_loss_rate`` and
-    ``track_loss_time`` (median of the tracks lost) of ten steps in a row with a pseudorange rate further than
-    the aperture from the combined prediction, from the first change of motion on. Those from ``adaptation_time``
-    on need the records of a bank: references have none.
+    whose mean a few lost tracks dominate; ``adaptation_time`` (mean) from the first step that carries a new motion to
+    the first on which its hypothesis has more than one half and keeps it for ten steps, and ``adaptation_censored``,
+    the share of switches where that never comes; ``track_loss_rate`` and ``track_loss_time`` (median of the tracks
+    lost) of ten steps in a row with a pseudorange rate further than the aperture from the combined prediction, from the
+    first change of motion on. Those from ``adaptation_time`` on need the records of a bank: references have none.
 
-    ``misleading_information`` is the share of steps whose error lies outside the region of the reported covariance that
-    an honest one leaves once in a thousand steps. ``innovation_correlation``, of the root of the normalised innovation
+    ``misleading_information`` is the share of steps whose error lies outside a region of the reported covariance; with
+    a correct covariance it is one in a thousand. ``innovation_correlation``, of the root of the normalised innovation
     squared from one step to the next, is zero where innovations are white. A test of the sum of that square over 20
     steps, at the risk of one in a thousand, gives ``fault_detection_time`` of the first fault of a sensor,
-    ``fault_missed``, the share of those that it does not find while they last, and ``false_alarm_rate``, the share of
-    steps before any fault. Who models a fault is not surprised by it: its filter gives no alarm where it needs none.
+    ``fault_missed``, the share of faults that it does not detect while they last, and ``false_alarm_rate``, the share
+    of steps before any fault. A filter that models a fault has no unexpected innovations, and so no alarm.
     """
     if not gathered.each:
         return []

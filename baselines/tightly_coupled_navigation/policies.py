@@ -1,4 +1,4 @@
-"""Policies of TightlyCoupledNavigation, and what they are compared with.
+"""Policies of TightlyCoupledNavigation, and the table of its baselines.
 
 The paper is Moroz, adaptive multi-hypothesis measurer of an inertial-satellite navigation system; readings are
 those of the task.
@@ -29,13 +29,15 @@ from .references import KnownMode, KnownModeBound
 
 
 class MultiHypothesis(PaperAction):
-    """The paper's algorithm, steps 1 to 8: nothing added to Bayes' rule."""
+    """The paper's algorithm, steps 1 to 8: no evidence added to Bayes' rule."""
 
     control = "evidence"
 
 
 def chain(stay: float) -> tuple[tuple[float, ...], ...]:
-    """Transition matrix of the hypotheses that stays with one probability and leaves for all others alike."""
+    """Return the transition matrix of the hypotheses: each stays with one probability, and all others are equally
+    likely next.
+    """
     leave = (1.0 - stay) / (len(HYPOTHESES) - 1)
     return tuple(
         tuple(stay if i == j else leave for j in range(len(HYPOTHESES))) for i in range(len(HYPOTHESES))
@@ -45,7 +47,7 @@ def chain(stay: float) -> tuple[tuple[float, ...], ...]:
 class Sticky(MultiHypothesis):
     """The paper's algorithm over a chain that leaves a hypothesis once in 100 s, not once in 5 s.
 
-    The chain belongs to the bank, so an evaluation sets the task's ``transition``; elsewhere set it yourself.
+    The chain belongs to the bank, so an evaluation sets the task's ``transition``; elsewhere the user sets it.
     """
 
     task_keywords: ClassVar[dict[str, Any]] = {"transition": chain(0.9999)}
@@ -54,13 +56,13 @@ class Sticky(MultiHypothesis):
 class FixedRobust(ConstantPolicy):
     """The paper's probabilities over a robust update, always; accelerometers are left out while they repeat themselves.
 
-    The robust update makes nothing of an outlier, nor of a manoeuvre that begins; see ``HuberBank``.
+    The robust update ignores an outlier, and also a manoeuvre that begins; see ``HuberBank``.
 
     Args:
-        model: in which it acts.
-        accelerometers: action that makes them noisier throughout, at the whole reach (`noise_reach` of one).
+        model: the environment's model for the policy.
+        accelerometers: constant action that raises their noise, at the whole reach (`noise_reach` of one).
         pseudoranges: strength of the robust update of these, 0 to 1.
-        rates: likewise of their rates.
+        rates: strength of the robust update of their rates, 0 to 1.
     """
 
     control = "robust"
@@ -77,19 +79,18 @@ class NisAdaptive(Policy):
     """Innovation-based adaptation of the noise, under the paper's probabilities.
 
     Where the short average of the normalised innovation squared exceeds ``threshold`` under every hypothesis,
-    the model and the sensors disagree. An excess of the pseudoranges is put down to these. Rates that disagree
-    may be noisy, or right while the accelerometers stick: ``rates`` and ``accelerometers`` say how much of the
-    rates' excess goes to either. Accelerometers that disagree may be wrong, or the first to feel a manoeuvre:
-    ``own`` says how much of their excess goes to them. With these three at zero it is nearly the constant
-    action ``base``.
+    the model and the sensors disagree. An excess of the pseudoranges is attributed to these. Rates that disagree may be
+    noisy, or right while the accelerometers stick: ``rates`` and ``accelerometers`` give the parts of the rates' excess
+    that go to either. Accelerometers that disagree may be wrong, or the first to measure a manoeuvre: ``own`` gives the
+    part of their excess that goes to them. With these three at zero it is nearly the constant action ``base``.
 
     Args:
-        model: in which it acts.
-        threshold: of the average per observation; 1 is what a consistent filter has.
+        model: the environment's model for the policy.
+        threshold: threshold of the average per observation; a consistent filter has 1.
         rates: power of the rates' excess in their own variance.
         accelerometers: power of the rates' excess in the variance of the accelerometers.
         own: power of the accelerometers' excess in their own variance.
-        base: what is always added to the action of the accelerometers.
+        base: constant part of the action of the accelerometers.
     """
 
     control = "gain"
@@ -114,7 +115,7 @@ class NisAdaptive(Policy):
         self.base = base
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Turn excesses into logarithms of factors."""
+        """Return the logarithms of factors for the excesses."""
         nis = self.average_nis(observation).reshape(len(observation), -1, len(HYPOTHESES)).min(axis=2)
         ranges, rates, forces, attitude = numpy.log(numpy.maximum(nis.T / self.threshold, 1.0)) / self.nats
         action = [
@@ -126,7 +127,7 @@ class NisAdaptive(Policy):
         return numpy.clip(numpy.stack(action, axis=1), -1.0, 1.0), None
 
 
-# --- what can be tuned
+# --- tunable values
 
 
 HYPOTHESES_ON_FAULTS = {
@@ -136,13 +137,13 @@ HYPOTHESES_ON_FAULTS = {
         "prior of the training distribution.",
     ),
     "fault-hypotheses-vague": Variant(
-        FaultHypotheses, "The same with one vague prior for everything that may come.", prior=VAGUE
+        FaultHypotheses, "The bank over motion and faults with one vague prior for all flights.", prior=VAGUE
     ),
 }
 
 
 def _tunable_hypotheses(name: str, prior: FaultPrior) -> Tunable:
-    """Each candidate runs alone: values make tables."""
+    """Return the tunable values; each candidate runs alone, since values determine tables."""
     found = tunable(
         HYPOTHESES_ON_FAULTS[name],
         leg=(1.0, prior.leg, 10.0),
@@ -170,7 +171,7 @@ BASELINES = Baselines(
         "fixed-robust": FixedRobust,
         "stuck-exclusion": Variant(
             FixedRobust,
-            "The paper's algorithm without accelerometers that repeat their last reading: they are left out meanwhile.",
+            "The paper's algorithm without accelerometers while they repeat their last reading.",
             pseudoranges=0.0,
             rates=0.0,
         ),
@@ -197,7 +198,7 @@ BASELINES = Baselines(
     tunable=TUNABLE,
     fallback="stuck-exclusion",
     alarm=SensorAlarm,
-    # Those that tell most: a policy takes seconds here, and the quick benchmark has two minutes for everything.
+    # The most informative ones: a policy takes seconds here, and the quick benchmark has two minutes in all.
     benchmark=(
         "multi-hypothesis",
         "nis-adaptive",

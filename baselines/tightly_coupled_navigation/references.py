@@ -14,14 +14,14 @@ from ...filters import extended_kalman, gnss_ins, range_errors
 from ...filters.ordered_sums import ordered_sum
 from ...filters.packed_covariance import diagonal, pack, unpack
 
-TOLD_ACCELERATION_SIGMA = 0.01
-"""m/s^2, by which the reference doubts an acceleration that it is told: its covariance stays invertible."""
-TOLD_INCREMENT_SIGMA = 1e-3
-"""m/s, likewise of steady increments of the velocity on the fixed courses."""
+KNOWN_ACCELERATION_SIGMA = 0.01
+"""Standard deviation of a given acceleration in the reference, m/s^2, so that its covariance stays invertible."""
+KNOWN_INCREMENT_SIGMA = 1e-3
+"""Standard deviation of steady increments of the velocity on the fixed courses, m/s."""
 
 
 class KnownModeState(NamedTuple):
-    """Memory of both; n = 17 + S states (``filters/range_errors.py``)."""
+    """State of reference and bound; n = 17 + S states (``filters/range_errors.py``)."""
 
     mean: Array
     """``(n, N)``."""
@@ -32,18 +32,19 @@ class KnownModeState(NamedTuple):
 
 
 class _KnownMode:
-    """Models that the true hypothesis chooses step by step, and sensors whose state is known.
+    """Base of reference and bound: the true hypothesis selects the models step by step, and the state of the sensors is
+    known.
 
-    From the step on which a manoeuvre begins, the acceleration has nothing to do with the past; it is told. A manoeuvre
+    From the step on which a manoeuvre begins, the acceleration is independent of the past; it is given. A manoeuvre
     that follows another one, or that the task announces by a jump, takes its new acceleration at the end of a
-    step; on the course "kinematic" the first one is there from the beginning of its step. Of coloured errors of the
-    pseudoranges standard deviation and correlation time are told; they are states.
+    step; on the course "kinematic" the first one is there from the beginning of its step. Standard deviation and
+    correlation time of coloured errors of the pseudoranges are given; the errors are states.
     """
 
     traceable = True
     disturbances = ("stuck", "noisy", "hidden", "no_rates", "coloured", "reflections", "ramp", "aperture")
     knows_acceleration: float = 0.0
-    """Standard deviation of what it is told of it, m/s^2."""
+    """Standard deviation of the given acceleration, m/s^2."""
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         self.task = task
@@ -51,7 +52,7 @@ class _KnownMode:
         self.size: int = gnss_ins.SIZE + task.satellites
 
     def start(self, initial: Initial, truth: Truth) -> KnownModeState:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         mean, covariance = range_errors.start(
             initial.mean,
             initial.covariance,
@@ -61,12 +62,12 @@ class _KnownMode:
         return KnownModeState(mean, pack(covariance), truth.mode)
 
     def reset_acceleration(self, track: KnownModeState, lanes: Array, acceleration: Array) -> KnownModeState:
-        """Track with an acceleration that is told, in some lanes."""
+        """Return the track with a given acceleration in some lanes."""
         xp, a = self.task.xp, gnss_ins.ACCELERATION
         new = numpy.zeros(self.size)
         new[a] = 1.0
         keep = self.task.constant(pack(numpy.outer(1.0 - new, 1.0 - new)))[:, None]
-        told = self.task.constant(pack(self.knows_acceleration**2 * numpy.diag(new)))[:, None]
+        known = self.task.constant(pack(self.knows_acceleration**2 * numpy.diag(new)))[:, None]
         return track._replace(
             mean=xp.concat(
                 [
@@ -75,11 +76,11 @@ class _KnownMode:
                     track.mean[a.stop :],
                 ]
             ),
-            covariance=xp.where(lanes, track.covariance * keep + told, track.covariance),
+            covariance=xp.where(lanes, track.covariance * keep + known, track.covariance),
         )
 
     def predict_track(self, truth: Truth, track: KnownModeState, noises: Array) -> KnownModeState:
-        """Prediction to the present measurement.
+        """Return the prediction to the present measurement.
 
         Args:
             truth: at that measurement.
@@ -89,7 +90,7 @@ class _KnownMode:
         xp, task, T = self.task.xp, self.task, self.task.common.T
         jumped = truth.jumped > 0.0
         at_once = (truth.mode == SINGER) & (track.mode != SINGER) & ~jumped
-        # What begins with a jump at the end of this step is the next leg.
+        # A jump at the end of this step begins the next leg.
         _, push = task.world.course.leg_at(truth.legs, truth.step + truth.jumped)
         track = self.reset_acceleration(track, at_once, push)
         # A jump ends a step that was moved by the hypothesis before it.
@@ -119,7 +120,7 @@ class _KnownMode:
         return self.reset_acceleration(track, jumped, push)
 
     def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
-        """Readings of a state and the rows of their Jacobian there."""
+        """Return the readings of a state and the rows of their Jacobian there."""
         return range_errors.observe(
             state,
             measurement.satellite_position,
@@ -129,32 +130,34 @@ class _KnownMode:
         )
 
     def process_noises(self, models: Sequence[gnss_ins.AxisModel]) -> Array:
-        """Covariances of the process noise, ``(n, n, M)``."""
+        """Return the covariances of the process noise, ``(n, n, M)``."""
         noises, known = numpy.zeros((self.size, self.size, len(models))), gnss_ins.SIZE
         for i, model in enumerate(models):
             noises[:known, :known, i] = gnss_ins.process_noise(model, self.task.common)
         return self.task.constant(noises)
 
     def sensors(self, measurement: Measurement, truth: Truth) -> tuple[list[Array], list[Array]]:
-        """True variance of every reading, and one where it says something."""
+        """Return the true variance of every reading, and its availability: one where it contains information, else
+        zero.
+        """
         nominal, forces = self.task.sensor_variance, self.task.sensors[2].readings
         variance = [nominal[j] * truth.noise_factor[j] ** 2 for j in range(len(nominal))]
         available = [measurement.available[j] for j in range(len(nominal))]
-        # A reading that is held was already used when it was new.
+        # The reading of a stuck sensor was used when it was new.
         for j in range(forces.start, forces.stop):
             available[j] = available[j] * (1.0 - truth.disturbances["stuck"].now)
         return variance, available
 
 
 class KnownMode(_KnownMode):
-    """One extended Kalman filter that is told the draw of the episode: legs, faults, and how noisy everything is.
+    """One extended Kalman filter that is given the draw of the episode: legs, faults, and all noise levels.
 
-    Rest keeps the bank's small regularising noise, so that the reported covariance stays invertible; so does straight
-    flight on the fixed courses, where it has steady increments and no noise.
+    At rest, and in straight flight on the fixed courses, which has steady increments and no noise, the bank's small
+    regularising noise remains, so that the reported covariance stays invertible.
     """
 
     kind = "reference"
-    knows_acceleration = TOLD_ACCELERATION_SIGMA
+    knows_acceleration = KNOWN_ACCELERATION_SIGMA
     knows = (
         "the true hypothesis at every step, when and with which acceleration a manoeuvre begins, the true noise of "
         "every sensor, when the accelerometers stick, by how much pseudoranges are off for reflections and drifts, and "
@@ -164,7 +167,7 @@ class KnownMode(_KnownMode):
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         super().__init__(task)
         p = task.parameters
-        increment = p.true_increment_sigma if p.course == "random" else TOLD_INCREMENT_SIGMA
+        increment = p.true_increment_sigma if p.course == "random" else KNOWN_INCREMENT_SIGMA
         rest, _, singer = task.models
         line = gnss_ins.constant_velocity_model(p.sampling_interval, increment, p.reset_acceleration_sigma)
         self.noises: Array = self.process_noises((rest, line, singer))
@@ -192,7 +195,7 @@ class KnownMode(_KnownMode):
 
 
 class KnownModeBound(_KnownMode):
-    """Posterior Cramér-Rao bound of an estimator that is told the hypothesis and how manoeuvres begin.
+    """Posterior Cramér-Rao bound of an estimator that is given the hypothesis and the beginnings of manoeuvres.
 
     The covariance recursion of the motion that generates the truth, along the true states: no motion noise
     at rest, that of the increments on random straight flight (none on the fixed courses, whose increments are
@@ -217,7 +220,7 @@ class KnownModeBound(_KnownMode):
     def update(
         self, memory: KnownModeState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, KnownModeState]:
-        """Bound after this measurement: the diagonal of the covariance."""
+        """Return the bound after this measurement: the diagonal of the covariance."""
         xp = self.task.xp
         track = self.predict_track(truth, memory, self.noises)
         state = xp.concat([truth.state, truth.disturbances["coloured"].level])

@@ -1,4 +1,4 @@
-"""What UavAutopilot is compared with."""
+"""Baselines of UavAutopilot."""
 
 from .policies import BASELINES
 

@@ -1,7 +1,7 @@
-"""Estimators of UavAutopilot: the settled filter, and some that learn the noise of sensors and gusts in flight.
+"""Estimators of UavAutopilot: the settled filter, and some that estimate the noise of sensors and gusts in flight.
 
-Each closes the loop and flies its own truth. No action can do what the latter do: it scales the whole process noise,
-and a noisier sensor asks for another change of the filter than stronger gusts do. Equation numbers are those of
+Each closes the loop and flies its own truth. No action is equivalent to the latter: an action scales the whole process
+noise, but a noisier sensor requires another change of the filter than stronger gusts. Equation numbers are those of
 ``filters/noise_adaptation.py``, for the settled filter those of the task's paper.
 """
 
@@ -25,7 +25,7 @@ from ..table import Variant
 
 
 class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
-    """The nominal filter with the constant gain that it settles to; a missing reading changes nothing."""
+    """The nominal filter with its settled, constant gain; it ignores missing readings."""
 
     def __init__(self, task: UavAutopilot) -> None:
         super().__init__(task)
@@ -34,11 +34,11 @@ class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
         self.settled: Array = task.constant(steady.posterior)[:, :, None]
 
     def start(self, initial: Start) -> Initial:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
     def update(self, state: Initial, given: FilterInput) -> Initial:
-        """Equations (10), (11) with the gain of the algebraic Riccati equation."""
+        """Apply equations (10), (11) with the gain of the algebraic Riccati equation."""
         measurement = given.measurement
         predicted = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         innovation = measurement.reading - self.task.readings_of(predicted)
@@ -48,26 +48,26 @@ class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
 
 
 class SensorAware(NamedTuple):
-    """One filter and what it thinks of the sensors."""
+    """State of one filter with its estimate of the sensors' noise."""
 
     mean: Array
     """``(n, N)``."""
     covariance: Array
     """Packed."""
     noise: tuple[Any, ...]
-    """Memory of each sensor's noise."""
+    """Memory of the estimate of each sensor's noise."""
 
 
 class Step(NamedTuple):
-    """One measurement taken in."""
+    """Result of the update with one measurement."""
 
     filter: SensorAware
     log_likelihood: Array
-    """Of the readings, ``(N,)``."""
+    """Log-likelihood of the readings, ``(N,)``."""
     nis: Array
-    """Their normalised innovation squared, ``(N,)``."""
+    """Normalised innovation squared of the readings, ``(N,)``."""
     correction: Array
-    """Of the mean, ``(n, N)``."""
+    """Correction of the mean, ``(n, N)``."""
     carried: Array
     """Packed covariance predicted without the disturbance."""
 
@@ -81,7 +81,7 @@ class AdaptiveState(NamedTuple):
     """``(n, n, N)``."""
     likelihood: Likelihood
     memory: Any
-    """What the filter remembers, the filters of an IMM with it."""
+    """Memory of the filter, with the filters of an IMM."""
 
 
 class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
@@ -101,7 +101,7 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         self.n: int = len(model.F)
 
     def start_filter(self, initial: Start) -> SensorAware:
-        """Filter where everyone starts, with sensors as stated."""
+        """Return a filter at the initial estimate with the stated sensor noise."""
         zero = 0.0 * initial.mean[0]
         noise = tuple(self.sensor_noise.start(zero + R) for R in self.task.sensor_variances)
         return SensorAware(initial.mean, packed_covariance.pack(initial.covariance), noise)
@@ -109,7 +109,7 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
     def predict_and_update(
         self, before: SensorAware, measurement: Measurement, factor: Array | float
     ) -> Step:
-        """Predict with a factor on the disturbance's covariance, and take in one sensor after the other."""
+        """Predict with a factor on the disturbance's covariance, and update with one sensor after the other."""
         predicted = self.xp.matmul(self.F, before.mean) + self.B * measurement.control
         carried = self.xp.matmul(self.propagator, before.covariance) + self.other
         mean, covariance = predicted, carried + factor * self.scaled
@@ -134,16 +134,16 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         )
 
     def start(self, initial: Start) -> AdaptiveState:
-        """Start where everyone starts."""
+        """Start from the initial estimate."""
         unknown = Likelihood.unknown(initial.mean[0])
         return AdaptiveState(initial.mean, initial.covariance, unknown, self.first_memory(initial))
 
     def first_memory(self, initial: Start) -> Any:
-        """What is remembered at the start."""
+        """Return the memory at the start."""
         return self.start_filter(initial)
 
     def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
-        """One measurement, gusts as designed."""
+        """Update with one measurement, with gusts as designed."""
         after, log_likelihood, nis, *_ = self.predict_and_update(state.memory, given.measurement, 1.0)
         likelihood = likelihood_of(given.measurement, log_likelihood, nis, self.xp)
         return AdaptiveState(
@@ -158,7 +158,7 @@ class AdaptiveGusts(AdaptiveKalman):
     """
 
     limits: ClassVar[tuple[float, float]] = (1.0 / 16.0, 16.0)
-    """Of the factor on the disturbance's covariance: the range of ``random``."""
+    """Limits of the factor on the disturbance's covariance: the range of ``random``."""
 
     def __init__(
         self, task: UavAutopilot, rule: type[MeasurementNoise], gust_memory: float, **values: float
@@ -169,12 +169,12 @@ class AdaptiveGusts(AdaptiveKalman):
         self.last: int = packed_covariance.position(self.n, self.n - 1, self.n - 1)
 
     def first_memory(self, initial: Start) -> tuple[SensorAware, adaptation.Level]:
-        """Gusts as designed."""
+        """Return the memory with gusts as designed."""
         one = 0.0 * initial.mean[0] + 1.0
         return self.start_filter(initial), adaptation.Level(one, self.gust_memory * one)
 
     def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
-        """One measurement, and the factor for the next."""
+        """Update with one measurement, and estimate the factor for the next."""
         (before, level), measurement = state.memory, given.measurement
         after, log_likelihood, nis, correction, carried = self.predict_and_update(
             before, measurement, level.value
@@ -195,14 +195,14 @@ class GustModels(NamedTuple):
 
     filters: tuple[SensorAware, ...]
     probabilities: Array
-    """``(M, N)``."""
+    """Probabilities of the levels, ``(M, N)``."""
 
 
 class GustInteractingMultipleModel(AdaptiveKalman):
     """IMM over three levels of the gusts, in each the sensors' noise by variational Bayes.
 
-    One filter that estimates both takes the one noise for the other: a large innovation fits either. The models
-    differ in how their innovations hang together over time, which their likelihoods tell.
+    One filter that estimates both confuses the noises: a large innovation fits either. The models differ in the
+    correlation of their innovations over time, to which their likelihoods respond.
     """
 
     def __init__(
@@ -219,12 +219,12 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         self.transition = task.constant([[stay if i == j else change for j in range(3)] for i in range(3)])
 
     def first_memory(self, initial: Start) -> GustModels:
-        """All where everyone starts, as likely."""
+        """Return all filters at the initial estimate, with equal probabilities."""
         third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
         return GustModels((self.start_filter(initial),) * 3, third)
 
     def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
-        """One IMM cycle; each model keeps its own opinion of the sensors."""
+        """Run one IMM cycle; each model has its own estimate of the sensors' noise."""
         xp, memory, measurement = self.xp, state.memory, given.measurement
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
         mean, covariance = imm.mix(*self.stack_filters(memory.filters), prediction.mixing)
@@ -247,7 +247,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         return AdaptiveState(*combined, likelihood, after)
 
     def stack_filters(self, filters: tuple[SensorAware, ...]) -> tuple[Array, Array]:
-        """Means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""
+        """Return the means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""
         xp = self.xp
         covariances = [packed_covariance.unpack(f.covariance, self.n) for f in filters]
         return xp.stack([f.mean for f in filters], axis=1), xp.stack(covariances, axis=2)
@@ -277,4 +277,4 @@ ESTIMATORS: dict[str, Any] = {
     "gust-imm": GustInteractingMultipleModel,
     "steady-kalman": SteadyKalman,
 }
-"""By their names in the table."""
+"""Estimators by their names in the table."""

@@ -1,4 +1,4 @@
-"""Metrics of the loop of UavAutopilot, beside those of the estimate."""
+"""Metrics of the loop of UavAutopilot, in addition to those of the estimate."""
 
 import math
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import xarray
 
 FALSE_ALARMS = 0.02
-"""False alarms that an episode of consistent innovations may have on average, which sets the limit of the alarm."""
+"""Mean number of false alarms in an episode of consistent innovations, which determines the limit of the alarm."""
 
 
 def _task(evaluation: "xarray.Dataset") -> UavAutopilot:
@@ -30,7 +30,7 @@ def _task(evaluation: "xarray.Dataset") -> UavAutopilot:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return what the metrics need of each episode; nothing of a bound, and of a reference no innovation."""
+    """Return the terms of the metrics for each episode; none for a bound, and no innovations for a reference."""
     if "output" not in run or numpy.isnan(run["output"].values).all():
         return MetricInputs()
     task, slices = _task(run), slices_of(run)
@@ -66,11 +66,11 @@ def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: nump
 
     The alarm is Page's cumulative sum of the log-likelihood ratio of innovations with ``LARGER`` times their variance
     (E. S. Page, Continuous inspection schemes, Biometrika 41 (1954), 100-115), its limit by G. Lorden, Annals of
-    Mathematical Statistics 42 (1971), 1897-1908, as in :mod:`..alarm`. What counts is the first time that noise is
-    raised in an episode that does not begin with it.
+    Mathematical Statistics 42 (1971), 1897-1908, as in :mod:`..alarm`. The onset is the first time that noise is raised
+    in an episode that does not begin with raised noise.
 
     Args:
-        nis: normalised innovation squared, NaN where nothing was received, ``(episodes, time)``.
+        nis: normalised innovation squared, NaN where no reading was received, ``(episodes, time)``.
         degrees: its degrees of freedom.
         raised: whether noise is raised.
 
@@ -98,14 +98,14 @@ def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: nump
 
 
 def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
-    """Mean product of neighbours, and mean square, ``(episodes, 2)``; NaN where there are no neighbours."""
+    """Return the mean product of neighbours and the mean square, ``(episodes, 2)``; NaN without neighbours."""
     if values.shape[1] < 2:
         return numpy.full((len(values), 2), math.nan)
     return numpy.stack([(values[:, 1:] * values[:, :-1]).mean(axis=1), (values**2).mean(axis=1)], axis=1)
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Measures of the loop, beside those of the estimate.
+    """Return the measures of the loop.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
     measurement, mean over the window. ``tracking_rmse``: root mean square of output minus command.
@@ -167,7 +167,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
 
 
 def _variance(averaged: Arrays, of: str, episodes: int) -> numpy.ndarray:
-    """Unbiased variance across episodes at each time, of the data and of every resample."""
+    """Return the unbiased variance across episodes at each time, of the data and of every resample."""
     biased = averaged[f"{of}_square"] - averaged[of] ** 2
     return numpy.asarray(biased * (episodes / max(episodes - 1, 1)))
 

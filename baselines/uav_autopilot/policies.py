@@ -1,4 +1,4 @@
-"""Policies of UavAutopilot, and the table of all it is compared with.
+"""Policies of UavAutopilot, and the table of its baselines.
 
 Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 """
@@ -23,7 +23,7 @@ from .references import KnownNoiseBound, Matched, TrueState
 
 
 class Kalman(PaperAction):
-    """The paper's filter, equations (10)-(12): the process noise is what the design says."""
+    """The paper's filter, equations (10)-(12), with the process noise of the design."""
 
     control = "gain"
 
@@ -31,16 +31,16 @@ class Kalman(PaperAction):
 class InnovationAdaptive(Policy):
     """Process noise scaled by a window of normalised innovations squared (NIS).
 
-    The logarithm of the factor is the last one, ``memory`` of it kept, plus ``weights`` times the logarithm
+    The logarithm of the factor is ``memory`` times the last one, plus ``weights`` times the logarithm
     of the innovations' mean square of each sensor over an exponential window; the mean square of a
-    consistent filter is one. Without weights of their own all sensors count alike with positive sign, the
-    textbook's rule: innovations larger than predicted mean that the model is trusted too much. It cannot
-    tell gusts from a noisier sensor, for which the right answer is the opposite; tuned weights can.
+    consistent filter is one. By default all sensors have the same positive weight, the textbook's rule: innovations
+    larger than predicted mean that the model is trusted too much. It cannot distinguish gusts from a noisier sensor,
+    which requires the opposite action; tuned weights can.
 
     Args:
-        model: whose observation it reads.
+        model: the environment's model for the policy.
         window: effective length of the window, measurements.
-        memory: share of the last factor's logarithm that is kept, 0 to 1.
+        memory: factor on the last logarithm, 0 to 1.
         offset: logarithm (base 10) of the factor when the innovations are as predicted.
         weights: decades of the factor per decade of each sensor's mean square.
     """
@@ -70,7 +70,7 @@ class InnovationAdaptive(Policy):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Update the window and scale the noise."""
         squared = self.innovation(observation) ** 2
-        # A window starts where a consistent filter would be.
+        # A window starts with the mean square of a consistent filter.
         mean = numpy.where(start[:, None], 1.0, 1.0 if state is None else state)
         mean = mean + self.forget * self.available(observation) * (squared - mean)
         # One column after the other in memory: the last bit of the product depends on it.
@@ -112,7 +112,7 @@ BANKS: dict[str, Any] = {
 
 
 def _tunable_bank(name: str, prior: LevelPrior) -> Tunable:
-    """Each candidate runs alone: values make tables."""
+    """Return the tunable values; each candidate runs alone, since values determine tables."""
     found = tunable(
         BANKS[name],
         log10_gust_change=(-3.5, math.log10(prior.gust_change), -1.0),

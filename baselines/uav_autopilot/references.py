@@ -16,7 +16,7 @@ from ...filters import packed_covariance
 
 
 class TrueState:
-    """The autopilot gets the state itself: no estimator feeds this loop better."""
+    """The true state as the estimate: no estimator is better for this loop."""
 
     kind = "reference"
     traceable = True
@@ -27,19 +27,19 @@ class TrueState:
         self.task = task
 
     def start(self, initial: Start, truth: Truth) -> Array:
-        """Covariance of the start, which is reported for ever: the error is zero, and that has no density."""
+        """Return the covariance of the start, which is reported at all times: the error is zero and has no density."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Array]:
-        """Put the truth in place of the estimate."""
+        """Replace the estimate by the truth."""
         return truth.state, memory, memory
 
 
 class _KnownNoise:
-    """The covariance (12) of the true plant with the noise as it is now, and with the coloured errors of the sensors.
+    """The covariance (12) of the true plant with the present noise and the coloured errors of the sensors.
 
     A coloured error is a further coordinate of the state, which its sensor reads together with its own; its decay and
-    its noise are told (A. E. Bryson and L. J. Henrikson, "Estimation using sampled data containing sequentially
+    its noise are given (A. E. Bryson and L. J. Henrikson, "Estimation using sampled data containing sequentially
     correlated noise", Journal of Spacecraft and Rockets 5 (1968), 662-665, by augmentation).
     """
 
@@ -55,7 +55,7 @@ class _KnownNoise:
         errors = m if task.parameters.sensor_coloured[1] else 0
         pack, size = packed_covariance.pack, n + errors
         self.rows = [(i, n + k) if errors else (i,) for k, i in enumerate(task.measured)]
-        """Coordinates that each sensor reads the sum of."""
+        """Coordinates whose sum each sensor measures."""
 
         def enlarge(matrix: numpy.ndarray) -> numpy.ndarray:
             return numpy.pad(matrix, (0, errors))
@@ -71,7 +71,7 @@ class _KnownNoise:
         placed = numpy.zeros((size * (size + 1) // 2, errors))
         placed[self.diagonal[n:], range(errors)] = 1.0
         self.placed: Array = task.constant(placed)
-        """Where the variances of the errors stand in the packed triangle."""
+        """Return the places of the errors' variances in the packed triangle."""
         self.initial_covariance: Array = task.constant(
             pack(enlarge(numpy.diag(numpy.square(task.parameters.value("initial_sigmas")))))[:, None]
         )
@@ -82,7 +82,7 @@ class _KnownNoise:
         self.size: int = size
 
     def start_covariance(self, truth: Truth) -> Array:
-        """Packed covariance of the start: the gust starts at the level of the first part."""
+        """Return the packed covariance of the start: the gust starts at the level of the first part."""
         covariance = self.initial_covariance * (1.0 + self.gust * (truth.level**2 - 1.0))
         if self.size == self.n:
             return covariance
@@ -91,11 +91,11 @@ class _KnownNoise:
         return covariance + self.xp.matmul(self.placed, stationary)
 
     def decays(self, truth: Truth) -> Array:
-        """What is left of each coordinate's deviation beside what F says, ``(size, N)``."""
+        """Return the decay of each coordinate in addition to F, ``(size, N)``."""
         return self.xp.concat([self.xp.ones_like(truth.state), truth.disturbances["coloured"].process.decay])
 
     def predict_covariance(self, covariance: Array, truth: Truth) -> Array:
-        """Packed covariance predicted with the disturbance of the interval before this measurement."""
+        """Return the packed covariance predicted with the disturbance of the interval before this measurement."""
         predicted = self.xp.matmul(self.propagator, covariance)
         noise = truth.level**2 * self.scaled + self.other
         if self.size > self.n:
@@ -107,7 +107,7 @@ class _KnownNoise:
     def update_covariance(
         self, mean: Array, covariance: Array, measurement: Measurement, truth: Truth
     ) -> packed_covariance.PackedUpdate:
-        """Take in the readings without their constant errors, with the noise of this measurement."""
+        """Update with the readings without their constant errors, with the noise of this measurement."""
         return packed_covariance.update_coordinates(
             mean,
             covariance,
@@ -118,14 +118,14 @@ class _KnownNoise:
         )
 
     def sensor_variances(self, truth: Truth) -> Array:
-        """Variance of each sensor's white noise at this measurement, ``(m, N)``."""
+        """Return the variance of each sensor's white noise at this measurement, ``(m, N)``."""
         return self.variances * truth.sensor_level**2
 
 
 class Matched(_KnownNoise):
-    """The Kalman filter of the true plant and noise: the posterior mean of whoever is told the draw of the episode.
+    """The Kalman filter of the true plant and noise: the posterior mean given the draw of the episode.
 
-    The regulator behind it is that of everybody: it goes on believing the nominal actuator.
+    Its regulator is that of all competitors, designed for the nominal actuator.
     """
 
     kind = "reference"
@@ -135,12 +135,12 @@ class Matched(_KnownNoise):
     )
 
     def start(self, initial: Start, truth: Truth) -> Initial:
-        """Start where everyone starts, with the true covariance, packed."""
+        """Start from the initial estimate, with the true covariance, packed."""
         mean = self.xp.concat([initial.mean, 0.0 * truth.disturbances["bias"]])[: self.size]
         return Initial(mean, self.start_covariance(truth))
 
     def predict(self, measurement: Measurement, truth: Truth, memory: Initial) -> Initial:
-        """Equations (10), (12) with the disturbance as it is; the covariance is packed."""
+        """Apply equations (10), (12) with the true disturbance; the covariance is packed."""
         mean = self.xp.matmul(self.F, memory.mean) + self.B * measurement.control
         if self.size > self.n:
             mean = self.decays(truth) * mean
@@ -149,7 +149,7 @@ class Matched(_KnownNoise):
     def update(
         self, memory: Initial, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, Initial, Likelihood]:
-        """Equations (12), (11) with the noise of this measurement."""
+        """Apply equations (12), (11) with the noise of this measurement."""
         n = self.n
         updated = self.update_covariance(*self.predict(measurement, truth, memory), measurement, truth)
         covariance = packed_covariance.unpack(updated.covariance, self.size)[:n, :n]
@@ -158,21 +158,21 @@ class Matched(_KnownNoise):
 
 
 class KnownNoiseBound(_KnownNoise):
-    """Covariance of the best estimate for an estimator that is told plant and noise: the Riccati recursion.
+    """Covariance of the best estimator that is given plant and noise: the Riccati recursion.
 
-    Linear and Gaussian with a known control, so it is the posterior Cramer-Rao bound, it is attained, and it
-    does not depend on the control: the filters of all policies face the same bound.
+    The problem is linear and Gaussian with a known control. So this is the posterior Cramer-Rao bound, it is attained,
+    and it does not depend on the control: the filters of all policies have the same bound.
     """
 
     kind = "bound"
     knows: str = Matched.knows
 
     def start(self, initial: Start, truth: Truth) -> Array:
-        """Covariance of the state's own distribution at the start, packed."""
+        """Return the covariance of the state's own distribution at the start, packed."""
         return self.start_covariance(truth)
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
-        """Bound after this measurement."""
+        """Return the bound after this measurement."""
         zero = self.xp.zeros_like(self.xp.concat([truth.state, truth.disturbances["bias"]])[: self.size])
         predicted = self.predict_covariance(memory, truth)
         after = self.update_covariance(zero, predicted, measurement, truth).covariance

@@ -14,7 +14,7 @@ class Stationary(NamedTuple):
     output_variance: float
     control_variance: float
     cost: float
-    """In the task's unit."""
+    """Mean cost, in the task's unit."""
 
 
 def stationary(task: UavAutopilot, name: str) -> Stationary | None:
@@ -22,8 +22,8 @@ def stationary(task: UavAutopilot, name: str) -> Stationary | None:
 
     Returns:
         None where the loop is not linear with constant coefficients (levels that change, dropouts, actions
-        that depend on the data), where sensors have coloured or constant errors, where the true actuator differs
-        from the believed one, or where the loop is unstable.
+        that depend on the data), where sensors have coloured or constant errors, where the true actuator differs from
+        the nominal one, or where the loop is unstable.
     """
     p, d = task.parameters, task.design
     nominal = ((1.0, 1.0),)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from ..baselines.advice import FittedLog, advise, fit_all
-from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of, write_advised
+from ..baselines.fitted_filters import SUFFIX, families_of, log_setup, own_family, write_advised
 from ..baselines.onboard import judge_onboard
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
@@ -60,7 +60,7 @@ def price_words(price: Mapping[str, int] | None) -> str:
 
 def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any], Mapping[str, int] | None]:
     """Return what says what an update of a competitor costs in C, by its name and what makes it."""
-    parameters = setup_of(problem, recording).parameters
+    parameters = log_setup(problem, recording).parameters
 
     def price(name: str, maker: Any) -> Mapping[str, int] | None:
         from ..exports.c_source import price_of

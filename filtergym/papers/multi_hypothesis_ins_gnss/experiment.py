@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...baselines.tightly_coupled_navigation.metrics import lasting, switches
+from ...baselines.tightly_coupled_navigation.metrics import find_lasting, switches
 from ...baselines.tightly_coupled_navigation.policies import chain
 from ...baselines.tightly_coupled_navigation.references import KnownMode
 from ...envs.contract.model import Episode, Model
@@ -270,7 +270,7 @@ class Loss(NamedTuple):
 
 def loss(run: Run, motion: int) -> Loss:
     """Return the loss of track after the motion that begins on a step."""
-    outside = lasting(run.outside[:, motion - 1 :])
+    outside = find_lasting(run.outside[:, motion - 1 :])
     lost = outside.any(axis=1)
     if not lost.any():
         return Loss(0.0, numpy.nan, numpy.nan, numpy.nan)

@@ -451,9 +451,9 @@ def _fits(advice: Advice) -> Iterator[str]:
 
 def _dearer(advice: Advice) -> Iterator[str]:
     """What the likeliest would bring, where something cheaper is as good."""
-    if advice.dearer is None or math.isnan(advice.dearer[1].value):
+    if advice.likeliest is None or math.isnan(advice.likeliest[1].value):
         return
-    name, gain = advice.dearer
+    name, gain = advice.likeliest
     costs = _operations(advice, name, advice.advised.name)
     yield (
         f"{name} is likelier where filters were chosen: it would bring {_interval(gain, '+.3f')} nats per measurement"

@@ -94,7 +94,7 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
         everything = (*ranked_names(problem), *known.smoothers, *known.references, *known.bounds)
     else:
         tuned = problem.tuned_policies if horizon <= LONG else []
-        won = [name for name in tuned if problem.tuned_values.has_won(name.removesuffix("-tuned"))]
+        won = [name for name in tuned if problem.tuned_values.is_improved(name.removesuffix("-tuned"))]
         telling = known.benchmark or known.names
         own = (f"{name}-tuned" if f"{name}-tuned" in won else name for name in telling)
         everything = (*own, *won, *learned_names(problem.id))
