@@ -254,7 +254,7 @@ def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) 
 
 
 def _minari_name(text: str) -> str:
-    """Letters, digits and hyphens, which Minari takes for a name."""
+    """Return the letters, digits and hyphens, which Minari takes for a name."""
     return re.sub(r"[^\w-]+", "-", text).strip("-")
 
 
@@ -274,7 +274,7 @@ def _datasets_in(folder: Path) -> Iterator[None]:
 
 
 def _buffers(episodes: Sequence[Transitions]) -> list[Any]:
-    """Episodes in Minari's form."""
+    """Return the episodes in Minari's form."""
     from minari.data_collector import EpisodeBuffer
 
     return [

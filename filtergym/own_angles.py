@@ -93,7 +93,9 @@ def _warn(text: str) -> None:
 
 
 def _jumping_rows(function: VectorFunction, given: numpy.ndarray, n: int) -> dict[int, str]:
-    """Units of the turns by which rows of a function jump along a component of the state, by their numbers."""
+    """Return the units of the turns by which rows of a function jump along a component of the state, by their
+    numbers.
+    """
     found: dict[int, str] = {}
     for place in range(n):
         for step, count in STEPS:

@@ -79,7 +79,8 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
 def _sensor_noise(
     blocks: Sequence[NoiseBlock], around: Surroundings, timed: bool
 ) -> numpy.ndarray | VectorFunction:
-    """R of blocks: a matrix where all of them are, else a function of the state, the interval and the inputs.
+    """Return the R of blocks: a matrix where all of them are, else a function of the state, the interval and the
+    inputs.
 
     Raises:
         ValueError: for a block that is no covariance, cannot be traced, or takes an argument that does not exist.
@@ -211,7 +212,7 @@ def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 
 
 def _sources(what: str, given: Any) -> Mapping[str, Any]:
-    """Covariances of the sources of noise by their names; a single one has none.
+    """Return the covariances of the sources of noise by their names; a single one has none.
 
     Raises:
         ValueError: for no source, or a name that is none.
@@ -226,7 +227,7 @@ def _sources(what: str, given: Any) -> Mapping[str, Any]:
 
 
 def _sum(parts: Sequence[Sequence[Any]]) -> list[Any]:
-    """Sum of lists, number by number."""
+    """Return the sum of lists, number by number."""
     return [sum(numbers[1:], numbers[0]) for numbers in zip(*parts, strict=True)]
 
 
@@ -263,7 +264,9 @@ def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 def _with_inputs(
     what: str, call: Callable[[Any, Any, Any], Any], timed: bool, around: Surroundings
 ) -> tuple[VectorFunction, VectorFunction | None]:
-    """Motion of state, interval and inputs, and where an input has noise the same as a function of the inputs."""
+    """Return the motion of state, interval and inputs, and where an input has noise the same as a function of the
+    inputs.
+    """
     n, p = len(around.mean), len(around.inputs)
     further = int(timed)  # the interval stands between state and inputs, or nothing does
     of_state = lambda v: call(v[:n], v[n] if timed else None, v[n + further :])  # noqa: E731
@@ -302,7 +305,7 @@ def further_arguments(function: Any) -> tuple[str, ...]:
 
 
 def arguments(function: Any) -> tuple[str, ...]:
-    """Names of the arguments of a function; empty for what is none, or does not show them."""
+    """Return the names of the arguments of a function; empty for what is none, or does not show them."""
     if not callable(function):
         return ()
     try:
@@ -358,7 +361,7 @@ def trace(what: str, function: Function, size: int, answers: int | None, given: 
 
 
 def _entries(matrix: Any) -> list[Any]:
-    """Numbers of a matrix, or of a list of its rows, row by row."""
+    """Return the numbers of a matrix, or of a list of its rows, row by row."""
     try:
         return [entry for row in matrix for entry in row]
     except TypeError:

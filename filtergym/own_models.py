@@ -347,7 +347,9 @@ class _EstimatedReward:
 
 
 def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:
-    """Median over some episodes of the cost of the filter as written, to two digits; 1 where that is no unit."""
+    """Return the median over some episodes of the cost of the filter as written, to two digits; 1 where that is no
+    unit.
+    """
     model: Any = Model(cls(parameters), cls.paper_policy.control)
     episodes, measurements = TRIED
     share = min(1.0, SMALL / cls.definition.world[0].f.size) ** 3

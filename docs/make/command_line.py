@@ -32,12 +32,12 @@ def command_line_markdown() -> str:
 
 
 def _general_options(program: Any) -> list[Any]:
-    """Options before the command; what the shell's completion brings is none of ours."""
+    """Return the options before the command; what the shell's completion brings is none of ours."""
     return [parameter for parameter in program.params if parameter.name in ("version", "no_cache")]
 
 
 def _options(parameters: list[Any], function: Callable[..., Any]) -> list[str]:
-    """Table of a command's arguments and options."""
+    """Return the table of a command's arguments and options."""
     annotations = {name: p.annotation for name, p in inspect.signature(function).parameters.items()}
     rows = []
     for parameter in parameters:
@@ -52,7 +52,7 @@ def _options(parameters: list[Any], function: Callable[..., Any]) -> list[str]:
 
 
 def _kind(annotation: Any) -> str:
-    """Word for the values that an option takes."""
+    """Return the word for the values that an option takes."""
     if hasattr(annotation, "__metadata__"):
         annotation = annotation.__origin__
     if get_origin(annotation) is UnionType:

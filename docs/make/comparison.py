@@ -35,7 +35,7 @@ class Comparison(NamedTuple):
 
 
 def compared_policies(measured: BenchmarkRecords) -> list[str]:
-    """Names that the page shows, of those in the records, in the order of its columns.
+    """Return the names that the page shows, of those in the records, in the order of its columns.
 
     Learned agents; what costs least of all others in the training distribution, of any control and kind; the paper's
     algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
@@ -56,7 +56,7 @@ def compared_policies(measured: BenchmarkRecords) -> list[str]:
 
 
 def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
-    """Records of one scenario over all times, as the tables look for them."""
+    """Return the records of one scenario over all times, as the tables look for them."""
     return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
 
 
@@ -72,7 +72,7 @@ def _cells(name: str, records: Sequence[Record]) -> list[str]:
 
 
 def summary(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Best of every origin on the training distribution of each environment, and the reference."""
+    """Return the best of every origin on the training distribution of each environment, and the reference."""
     rows = []
     for problem, every in found:
         reference, learned = problem.baselines.score_reference, pretrained_agents(problem.id)
@@ -133,7 +133,9 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Whose covariance does not fit the errors on the training distribution, of all ranked but random actions."""
+    """Return the whose covariance does not fit the errors on the training distribution, of all ranked but random
+    actions.
+    """
     rows = []
     for measured in found:
         records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
@@ -150,7 +152,7 @@ def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
-    """Tables of one environment: cost against the paper's algorithm, and the physical error.
+    """Return the tables of one environment: cost against the paper's algorithm, and the physical error.
 
     Args:
         measured: the environment and its records.
@@ -182,7 +184,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
     times = {s: column_of_times([record for record in records if record.scenario == s]) for s in sizes}
 
     def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
-        """Table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
+        """Return the table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
         heads = [f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in names]
         return Grid(
             title,
@@ -265,7 +267,8 @@ def _two_lines(record: Record | None, scale: float) -> str:
 
 
 def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
-    """Table over all environments, in Markdown: "best" of every origin, where agents do "harm", or "covariances".
+    """Return the table over all environments, in Markdown: "best" of every origin, where agents do "harm", or
+    "covariances".
 
     Raises:
         ValueError: for another word.
@@ -278,7 +281,7 @@ def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
 
 
 def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
-    """Sentences and tables of one environment, with the command that made the records."""
+    """Return the sentences and tables of one environment, with the command that made the records."""
     records, paper = measured.records, measured.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})

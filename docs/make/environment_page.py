@@ -25,13 +25,13 @@ PARTS_SHOWN = 4
 
 
 def field_documentation(cls: type) -> dict[str, str]:
-    """Docstrings under the fields of a NamedTuple or dataclass, in one line each, inherited ones first."""
+    """Return the docstrings under the fields of a NamedTuple or dataclass, in one line each, inherited ones first."""
     texts = (item for base in reversed(cls.__mro__) for item in field_texts(base).items())
     return {name: text.replace("``", "`") for name, text in texts}
 
 
 def measurement_class(cls: type[Task]) -> Any:
-    """NamedTuple of what the sensors of a task say: the second part of what its world returns."""
+    """Return the NamedTuple of what the sensors of a task say: the second part of what its world returns."""
     return typing.get_args(typing.get_type_hints(cls.World.advance)["return"])[1]
 
 

@@ -23,8 +23,8 @@ def draw_learning_curves(
     *,
     columns: int = 2,
 ) -> Any:
-    """Cost of validations against the paper's algorithm over training: of each algorithm the median over its runs,
-    and a band from the lowest to the highest.
+    """Return the cost of validations against the paper's algorithm over training: of each algorithm the median over
+    its runs, and a band from the lowest to the highest.
 
     Args:
         curves: algorithm -> for each of its runs the environment steps, and the relative cost differences there.
@@ -63,7 +63,7 @@ def draw_learning_curves(
 def draw_profiles(
     limits: numpy.ndarray, profiles: Mapping[str, numpy.ndarray], title: str, *, columns: int = 2
 ) -> Any:
-    """Share of training runs with a score above each limit, with pointwise 95 % bands.
+    """Return the share of training runs with a score above each limit, with pointwise 95 % bands.
 
     Args:
         limits: of the score, ``(limits,)``.
@@ -97,7 +97,7 @@ def draw_differences(
     *,
     columns: int = 2,
 ) -> Any:
-    """Dots with intervals: cost of policies against the paper's algorithm, scenario by scenario.
+    """Return the dots with intervals: cost of policies against the paper's algorithm, scenario by scenario.
 
     Args:
         differences: scenario -> policy -> difference in percent, lower and upper end of its interval.
@@ -163,7 +163,8 @@ LEARNED = "kalman-net", "KalmanNet"
 def draw_public_problems(
     rows: Sequence[Mapping[str, Any]], drives: Mapping[str, Sequence[float]], *, columns: int = 2
 ) -> Any:
-    """Dots with intervals: the mean squared error of filters on KalmanNet's problems; and of each of NCLT's drives.
+    """Return the dots with intervals: the mean squared error of filters on KalmanNet's problems; and of each of NCLT's
+    drives.
 
     Args:
         rows: of the records, all with ``problem``, ``name``, ``mse_db``, ``low_db`` and ``high_db``.
@@ -201,7 +202,7 @@ def draw_public_problems(
 
 @in_print
 def draw_update_times(rows: Sequence[Sequence[str]], *, columns: int = 2) -> Any:
-    """Bars of the time that an update takes, the quickest first; those of other libraries are grey.
+    """Return the bars of the time that an update takes, the quickest first; those of other libraries are grey.
 
     Args:
         rows: of the record: what is updated, in quotes where it is ours, and the median in microseconds.

@@ -137,7 +137,7 @@ def round_number(value: float | None) -> float | None:
 
 
 def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
-    """JSON in lines; what holds nothing nested, or lies deeper, stands in one."""
+    """Return the JSON in lines; what holds nothing nested, or lies deeper, stands in one."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     if depth == 0 or not any(isinstance(each, (dict, list)) for each in inside):
         return json.dumps(value, ensure_ascii=False)
@@ -226,7 +226,7 @@ def _same_cost(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _best(scenario: Mapping[str, Any]) -> str:
-    """Name of whom the others are compared with."""
+    """Return the name of whom the others are compared with."""
     [name] = {
         key.partition(" ")[2]
         for each in scenario["competitors"].values()
@@ -277,7 +277,7 @@ def read_benchmark(name: str, folder: Path = FOLDER) -> tuple[BenchmarkRecords, 
 
 
 def recorded_environments(kind: str = BENCHMARK, folder: Path = FOLDER) -> list[str]:
-    """Short names of all environments with a record of that kind, in the catalogue's order."""
+    """Return the short names of all environments with a record of that kind, in the catalogue's order."""
     names = map(bare_name, catalogue())
     return [name for name in names if record_file(f"{kind}/{name}", folder).is_file()]
 

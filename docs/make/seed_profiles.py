@@ -71,7 +71,8 @@ def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] =
 
 
 def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndarray:
-    """Weights of runs (1), and those of every resample within environments, ``(1 + resamples, sum of counts)``.
+    """Return the weights of runs (1), and those of every resample within environments, ``(1 + resamples, sum of
+    counts)``.
 
     Args:
         counts: runs of each environment.
@@ -82,7 +83,7 @@ def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndar
 
 
 def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.ndarray:
-    """Mean of the middle half of weighted scores (2), ``(n,)``.
+    """Return the mean of the middle half of weighted scores (2), ``(n,)``.
 
     Args:
         scores: ``(runs,)``.
@@ -98,7 +99,9 @@ def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.n
 def performance_profile(
     scores: numpy.ndarray, weights: numpy.ndarray, limits: numpy.ndarray
 ) -> numpy.ndarray:
-    """Share of runs with a score above each limit (2), ``(n, limits)``; arguments as of :func:`interquartile_mean`."""
+    """Return the share of runs with a score above each limit (2), ``(n, limits)``; arguments as of
+    :func:`interquartile_mean`.
+    """
     found: numpy.ndarray = weights @ (scores[:, None] > limits)
     return found
 

@@ -189,7 +189,7 @@ def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
 
 
 def _algorithm(run: TrainingRun) -> str:
-    """Name of a run's algorithm, with what is around the agent."""
+    """Return the name of a run's algorithm, with what is around the agent."""
     around = f" on {run.residual_to}" if run.residual_to else ""
     return run.algorithm + around + (" gated" if run.gated else "")
 
@@ -205,7 +205,7 @@ def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
 
 
 def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
-    """Picture of the validations of every algorithm, 1 or 2 columns of a paper wide.
+    """Return the picture of the validations of every algorithm, 1 or 2 columns of a paper wide.
 
     Args:
         data: of a record of training seeds, or what :func:`runs_data` has of runs.
@@ -225,7 +225,7 @@ def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
 
 
 def default_opponents(problem: Problem) -> list[str]:
-    """Names that runs are compared with: paper, strong policies, untuned and tuned, references."""
+    """Return the names that runs are compared with: paper, strong policies, untuned and tuned, references."""
     known = problem.baselines
     untuned = [name for name in known.tunable if name != known.best_constant]
     names = [problem.paper, *known.compared, *untuned, *problem.tuned_policies, *known.references]
@@ -433,7 +433,9 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
 def comparison_grids(
     problem: Problem, runs: Sequence[Trained], comparisons: Sequence[Comparison]
 ) -> list[Grid]:
-    """Tables of one scenario: every run and opponent; the spread of each algorithm; medians and opponents."""
+    """Return the tables of one scenario: every run and opponent; the spread of each algorithm; medians and
+    opponents.
+    """
     first = comparisons[0]
     paper, references = problem.paper, problem.baselines.references
     found = {(c.policy, c.statistic, c.against, c.metric, c.component): c for c in comparisons}
@@ -633,7 +635,7 @@ def _percent(values: Sequence[float | None]) -> str:
 
 
 def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[Trained], origin: str) -> str:
-    """Tables, the first shown and the others folded, and the commands that made them and the runs."""
+    """Return the tables, the first shown and the others folded, and the commands that made them and the runs."""
     lines: list[str] = []
     for i, grid in enumerate(grids):
         table = markdown_table(grid.header, grid.rows)

@@ -48,7 +48,7 @@ def _cache() -> str:
 
 
 def _libraries() -> Iterator[tuple[str, str]]:
-    """Versions of what is needed, and of each extra, or what of it is not there."""
+    """Return the versions of what is needed, and of each extra, or what of it is not there."""
     requirements = [Requirement(text) for text in importlib.metadata.requires(PACKAGE) or ()]
     extras = importlib.metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()
     for extra in ("", *(name for name in extras if name not in DEVELOPMENT)):

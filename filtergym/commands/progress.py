@@ -83,7 +83,7 @@ class ProgressLines:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as one says them: ``42 s``, ``3 min 20 s``, ``2 h 5 min``."""
+    """Return the seconds as one says them: ``42 s``, ``3 min 20 s``, ``2 h 5 min``."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def complete_environment(incomplete: str) -> list[str]:
-    """Environment ids; without ``filtergym/`` where that is how a word begins."""
+    """Return the environment ids; without ``filtergym/`` where that is how a word begins."""
     from ..envs.engine.catalogue import catalogue
 
     ids = list(catalogue())
@@ -45,7 +45,7 @@ def import_environments(given: Any) -> Any:
 
 
 def _environments_of(ctx: typer.Context) -> list[str]:
-    """Ids of the environment that the words so far name, or of all if they name none."""
+    """Return the ids of the environment that the words so far name, or of all if they name none."""
     from ..envs.engine.catalogue import catalogue, task_class
 
     named = ctx.params.get("environment")
@@ -58,7 +58,7 @@ def _environments_of(ctx: typer.Context) -> list[str]:
 
 
 def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Names of the environment's scenarios."""
+    """Return the names of the environment's scenarios."""
     from ..envs.engine.catalogue import catalogue
 
     names = dict.fromkeys(name for id in _environments_of(ctx) for name in catalogue()[id].scenarios)
@@ -66,7 +66,7 @@ def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Names of the environment's scenarios that agents may be trained on."""
+    """Return the names of the environment's scenarios that agents may be trained on."""
     from ..envs.engine.catalogue import catalogue
 
     scenarios = [own for id in _environments_of(ctx) for own in catalogue()[id].scenarios.values()]
@@ -75,7 +75,9 @@ def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]
 
 
 def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Names of the environment's policies, estimators, references and bounds, tuned ones, and shipped agents."""
+    """Return the names of the environment's policies, estimators, references and bounds, tuned ones, and shipped
+    agents.
+    """
     from ..baselines.problem import problem_of
     from ..names import shipped_names
 
@@ -220,7 +222,7 @@ class Output(Console):
 
 
 def output_width() -> int | None:
-    """Width of what is printed, in characters; None: that of the terminal, or what COLUMNS says."""
+    """Return the width of what is printed, in characters; None: that of the terminal, or what COLUMNS says."""
     said = os.environ.get("COLUMNS", "")
     terminal = sys.stdout is not None and sys.stdout.isatty()
     return None if terminal or (said.isdigit() and int(said) > 0) else PAGE_WIDTH

@@ -68,7 +68,7 @@ class FilterText:
         self.update, self.update_source = self._update()
 
     def _parameters(self, *parts: str) -> list[Parameter]:
-        """Parameters that point to structs; ``const`` is what is only read."""
+        """Return the parameters that point to structs; ``const`` is what is only read."""
         return [
             Parameter(
                 f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *",
@@ -78,7 +78,7 @@ class FilterText:
         ]
 
     def _rows(self, part: str, name: str = "", qualifier: str = "const ") -> Rows:
-        """Numbers of a struct one after the other: it has no members of another kind."""
+        """Return the numbers of a struct one after the other: it has no members of another kind."""
         pointer = f"(({qualifier}{self.scalar.name} *){name or part})"
         return Rows(pointer, self.structs[part].numbers)
 
@@ -191,7 +191,7 @@ class FilterText:
         return f"{source.functions}\n{function_text('int', f'{own}_update', parameters, body)}", source
 
     def _guard(self) -> list[str]:
-        """Statements that leave the state alone where the estimate is no finite number."""
+        """Return the statements that leave the state alone where the estimate is no finite number."""
         zero = literal(0.0, self.scalar)
         C = len(self.components)
         mean, covariance = ("", "") if C == 1 else ("[i]", "[i][j]")
@@ -211,7 +211,7 @@ class FilterText:
         ]
 
     def _taken(self) -> str:
-        """Statement that returns whether there was a measurement."""
+        """Return the statement that returns whether there was a measurement."""
         own, zero = self.name.upper(), literal(0.0, self.scalar)
         there = [
             p for p in self.structs["measurement"].places.values() if re.fullmatch(r"available(\[\d+\])*", p)
@@ -245,7 +245,7 @@ class FilterText:
     # --- files
 
     def header(self, notes: Sequence[str] = ()) -> str:
-        """Text of the header."""
+        """Return the text of the header."""
         own, scalar, structs = self.name, self.scalar, self.structs
         guard = f"{own.upper()}_H"
         listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
@@ -306,7 +306,7 @@ class FilterText:
         return "\n".join(text)
 
     def source(self) -> str:
-        """Text of the source."""
+        """Return the text of the source."""
         parts = [
             comment(
                 "See the header. A loop goes over the members of array operations, k is the member; where they lie is "

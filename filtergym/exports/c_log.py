@@ -93,7 +93,7 @@ class LogText(FilterText):
         self.log_columns: Mapping[str, str] = columns or {}
 
     def columns(self, part: str) -> list[str]:
-        """Names of the columns of a table, in the order of the rows of an argument."""
+        """Return the names of the columns of a table, in the order of the rows of an argument."""
         names = self.structs[part].columns
         begin = "initial_" if part == "initial" else ""
         return [f"{begin}{names[row]}" for row in sorted(names)]
@@ -111,7 +111,7 @@ class LogText(FilterText):
         return (kinds[kind], int(place)) if kind in kinds else ("other", 0)
 
     def fill(self, received: str, held: str, interval: str, others: Sequence[str] = ()) -> str:
-        """Statements that make a measurement ``given`` of a plain row.
+        """Return the statements that make a measurement ``given`` of a plain row.
 
         Args:
             received: expression of the first number that is received; the others follow it.
@@ -135,8 +135,8 @@ class LogText(FilterText):
     # --- the program
 
     def log_program(self, request: "ExportRequest") -> str:
-        """Text of a program that reads a log of the user; empty where its rows are no plain rows, and no filter was
-        advised for a table.
+        """Return the text of a program that reads a log of the user; empty where its rows are no plain rows, and no
+        filter was advised for a table.
         """
         if self.plain_rows is not None:
             return self._plain_log(self.plain_rows, request.keywords.get("sampling_interval"))
@@ -158,7 +158,7 @@ class LogText(FilterText):
         needed: int,
         limits: Mapping[str, float],
     ) -> str:
-        """Text of the program.
+        """Return the text of the program.
 
         Args:
             about: how a track starts, for the comment.
@@ -192,7 +192,7 @@ class LogText(FilterText):
         return f"{text}{READER}\n{follow}"
 
     def _plain_log(self, rows: PlainRows, interval: float | None) -> str:
-        """Text of the program for rows that are measurements as they stand.
+        """Return the text of the program for rows that are measurements as they stand.
 
         Args:
             rows: how they are.
@@ -213,7 +213,9 @@ class LogText(FilterText):
         return self._log(about, follow, names, len(names), limits)
 
     def _plot_log(self, rows: PlotRows, log: LogSetup) -> str:
-        """Text of the program for plots, as they were read when a filter was advised; empty for other logs."""
+        """Return the text of the program for plots, as they were read when a filter was advised; empty for other
+        logs.
+        """
         names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
         measured = {*self.structs["measurement"].columns.values()}
         second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), None)
@@ -256,7 +258,8 @@ class LogText(FilterText):
         return self._log(about, follow, columns, 2, limits)
 
     def _regular_log(self, numbers: Mapping[str, float], log: LogSetup) -> str:
-        """Text of the program for rows at one rate, as they were read when a filter was advised; empty for other logs.
+        """Return the text of the program for rows at one rate, as they were read when a filter was advised; empty for
+        other logs.
 
         Args:
             numbers: that the reading needs.
@@ -282,12 +285,12 @@ class LogText(FilterText):
         return self._log(about, follow, columns, rows.needed, {"UNEVEN": UNEVEN, **rows.limits})
 
     def _assign(self, part: str, values: Mapping[str, str], indent: str) -> str:
-        """Statements that give every number of a struct its value, zero where none is named."""
+        """Return the statements that give every number of a struct its value, zero where none is named."""
         columns = sorted(self.structs[part].columns.items())
         return f"\n{indent}".join(f"given[{row}] = {values.get(name, '0.0')};" for row, name in columns)
 
     def _plot_start(self) -> str:
-        """Statements that make the ``initial`` estimate of two plots, as the reader does."""
+        """Return the statements that make the ``initial`` estimate of two plots, as the reader does."""
         values = {"mean_0": "p[0]", "mean_1": "p[1]"}
         values |= {f"mean_{i + 2}": f"(p[{i}] - p0[{i}]) / lasted" for i in range(2)}
         for i in range(2):
@@ -315,7 +318,7 @@ class RegularReading(NamedTuple):
 
 
 def _with_others(first: list[str], columns: Mapping[str, str]) -> list[str]:
-    """Names of columns, and of all others of a log: these say which rows supply each other."""
+    """Return the names of columns, and of all others of a log: these say which rows supply each other."""
     return [*first, *(name for name in columns if name not in (*first, "time", RECORDING))]
 
 

@@ -50,7 +50,7 @@ for (i = 0; i < {units}; ++i) {{
 
 
 def memory_size(network: "LearnedPolicy") -> int:
-    """Numbers that a network remembers."""
+    """Return the numbers that a network remembers."""
     arrays = network.arrays
     if "gru_memory_weight" in arrays:
         return int(arrays["gru_memory_weight"].shape[1])
@@ -58,7 +58,7 @@ def memory_size(network: "LearnedPolicy") -> int:
 
 
 def network_operations(network: "LearnedPolicy") -> int:
-    """Multiplications and additions of a network's layers; its activations are not counted."""
+    """Return the multiplications and additions of a network's layers; its activations are not counted."""
     sizes = {key: int(values.size) for key, values in network.arrays.items()}
     return sum(2 * size for key, size in sizes.items() if "weight" in key) + sum(
         size for key, size in sizes.items() if "bias" in key
@@ -66,12 +66,12 @@ def network_operations(network: "LearnedPolicy") -> int:
 
 
 def scratch_size(network: "LearnedPolicy") -> int:
-    """Numbers that a network holds on the stack while it answers."""
+    """Return the numbers that a network holds on the stack while it answers."""
     return _width(network) * (3 if memory_size(network) else 2)
 
 
 def _width(network: "LearnedPolicy") -> int:
-    """Numbers of its widest layer, or of what it is shown."""
+    """Return the numbers of its widest layer, or of what it is shown."""
     outputs = [len(values) for key, values in network.arrays.items() if "weight" in key]
     return max([len(network.arrays["observation_mean"]), *outputs])
 
@@ -139,7 +139,7 @@ def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[s
 
 
 def _answer(network: "LearnedPolicy", count: int, scalar: Scalar) -> list[str]:
-    """Statements that make an action of the last layer."""
+    """Return the statements that make an action of the last layer."""
     if network.output == "argmax":
         return [
             "{",

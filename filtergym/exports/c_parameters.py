@@ -16,7 +16,7 @@ from .traced_filter import DERIVED, FreeParameters, Member
 
 
 def parameter_members(declared: Sequence[Declared]) -> list[Member]:
-    """Members of the struct, with what each is, its default and its limits."""
+    """Return the members of the struct, with what each is, its default and its limits."""
     found = []
     for one in declared:
         values = [f"{value:.6g}" for value in one.values]
@@ -41,7 +41,7 @@ def _limit_words(limits: ParameterLimits) -> list[tuple[str, float | None]]:
 
 
 def parameter_words(free: FreeParameters) -> str:
-    """Sentences about the struct."""
+    """Return the sentences about the struct."""
     text = (
         "Parameters, given at the start of a track. They have the names and limits of filtergym."
         if free.declared
@@ -145,12 +145,12 @@ def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
 
 
 def _stated(free: FreeParameters, scalar: Scalar) -> range:
-    """Rows that are stated where nothing is chosen; of float all, which the filter has from double."""
+    """Return the rows that are stated where nothing is chosen; of float all, which the filter has from double."""
     return free.stated if scalar is DOUBLE else range(len(free.usual))
 
 
 def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused: str) -> list[str]:
-    """Statements that refuse pairs that do not ascend, and rows of probabilities that do not sum to one."""
+    """Return the statements that refuse pairs that do not ascend, and rows of probabilities that do not sum to one."""
     checks, row = [], 0
     for one in free.declared:
         rows = [f"parameters->{struct.places[row + i]}" for i in range(len(one.values))]
@@ -176,7 +176,7 @@ def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused
 
 
 def _value(one: Declared, scalar: Scalar) -> str:
-    """Default of a member as C writes it."""
+    """Return the default of a member as C writes it."""
 
     def braces(part: numpy.ndarray) -> str:
         if part.ndim == 0:
@@ -187,7 +187,7 @@ def _value(one: Declared, scalar: Scalar) -> str:
 
 
 def _limits(one: Declared, scalar: Scalar) -> tuple[float, float]:
-    """Limits that a kind of number has."""
+    """Return the limits that a kind of number has."""
     if scalar is DOUBLE:
         return one.low, one.high
     largest = float(numpy.finfo(scalar.dtype).max)

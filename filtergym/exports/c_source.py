@@ -76,7 +76,7 @@ class Writer(LogText):
         self.limit: float = WORST[scalar.name]
 
     def rows(self) -> str:
-        """Text of a header that fills structs from rows of numbers, for main.c and the test."""
+        """Return the text of a header that fills structs from rows of numbers, for main.c and the test."""
         own, real = self.name, self.scalar.name
         text = [
             comment("Structs from rows of a table."),
@@ -92,7 +92,7 @@ class Writer(LogText):
         return "\n".join(text)
 
     def main(self) -> str:
-        """Text of a program that reads a table of measurements and writes one of estimates."""
+        """Return the text of a program that reads a table of measurements and writes one of estimates."""
         C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
         initial, measurement = self.columns("initial"), self.columns("measurement")
         given = self.table_columns()
@@ -135,7 +135,7 @@ class Writer(LogText):
         )
 
     def table_columns(self) -> list[str]:
-        """Names of the columns of the table that main.c reads."""
+        """Return the names of the columns of the table that main.c reads."""
         rows = self.plain_rows
         if rows is None:
             return [*self.columns("initial"), *self.columns("measurement")]
@@ -144,7 +144,7 @@ class Writer(LogText):
         return [*map(identifier, ["recording", *timed, *rows.received, *rows.held]), *own]
 
     def _layout(self) -> str:
-        """Functions of main.c that say where in a row everything is."""
+        """Return the functions of main.c that say where in a row everything is."""
         rows = self.plain_rows
         if rows is None:
             return INITIAL_IN_ROW.format()
@@ -161,7 +161,7 @@ class Writer(LogText):
         return INITIAL_OF_MODEL.format(estimate=", ".join(map(literal, self.initial_estimate)), fill=fill)
 
     def test(self) -> str:
-        """Text of a program that compares the filter with the vectors."""
+        """Return the text of a program that compares the filter with the vectors."""
         return TEST.format(
             own=self.name,
             upper=self.name.upper(),
@@ -171,7 +171,7 @@ class Writer(LogText):
         )
 
     def vectors(self, replayed: Replay) -> str:
-        """Text of the vectors of the test."""
+        """Return the text of the vectors of the test."""
         E, T = min(VECTORS[0], replayed.initial.shape[1]), min(VECTORS[1], len(replayed.measurements))
         arrays = {
             "initials": replayed.initial[:, :E].T,
@@ -189,7 +189,7 @@ class Writer(LogText):
         return "\n".join(text)
 
     def table(self, replayed: Replay) -> str:
-        """Text of a table of measurements, as main.c reads it."""
+        """Return the text of a table of measurements, as main.c reads it."""
         lines = [",".join(self.table_columns())]
         if self.plain_rows is not None:
             for episode in range(replayed.initial.shape[1]):
@@ -204,7 +204,7 @@ class Writer(LogText):
         return "\n".join([*lines, ""])
 
     def _plain_row(self, row: Sequence[float]) -> list[str]:
-        """Cells of a measurement in a table with the columns of a log, without its first one."""
+        """Return the cells of a measurement in a table with the columns of a log, without its first one."""
         found: dict[str, list[str]] = {"interval": [], "received": [], "held": [], "other": []}
         there = [
             value > 0.0
@@ -289,7 +289,7 @@ def files_of(writer: Writer, replayed: Replay, notes: Sequence[str] = ()) -> dic
 
 
 def _about(request: ExportRequest, writer: Writer, precision: str, command: str) -> list[str]:
-    """Paragraphs that say what the filter is."""
+    """Return the paragraphs that say what the filter is."""
     own, maker = writer.name, request.maker
     described = maker if isinstance(maker, type) else getattr(maker, "func", None) and maker
     first = (getattr(described, "__doc__", None) or "").strip().split("\n\n")[0].replace("`", "")

@@ -62,7 +62,7 @@ class _Graph:
 
 
 def _normalise(graph: _Graph, arrays: dict[str, numpy.ndarray]) -> str:
-    """Observation less its mean over its scale, cut at the limit."""
+    """Return the observation less its mean over its scale, cut at the limit."""
     limit = [graph.constant(n, v) for n, v in (("low", -OBSERVATION_LIMIT), ("high", OBSERVATION_LIMIT))]
     mean, scale = (graph.constant(n, arrays[n]) for n in ("observation_mean", "observation_scale"))
     centred = graph.node("Sub", ["observation", mean])

@@ -100,7 +100,7 @@ def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str)
 
 
 def _arguments(maker: Any) -> dict[str, Any]:
-    """Arguments that a competitor is made with, and the fields of its prior."""
+    """Return the arguments that a competitor is made with, and the fields of its prior."""
     given: dict[str, Any] = {}
     while isinstance(maker, functools.partial):
         maker, given = maker.func, {**maker.keywords, **given}
@@ -111,8 +111,8 @@ def _arguments(maker: Any) -> dict[str, Any]:
 
 
 def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
-    """Value of a tuning that an untuned filter has, and of a logarithm whose it is: what a search starts from may have
-    fewer digits.
+    """Return the value of a tuning that an untuned filter has, and of a logarithm whose it is: what a search starts
+    from may have fewer digits.
     """
     is_log = name.startswith("log10_")
     size = arguments.get(name.removeprefix("log10_"))
@@ -148,7 +148,7 @@ def _of_task(parameters: Any) -> Iterator[Declared]:
 
 
 def _kinds(hint: Any) -> set[Any]:
-    """Types of the numbers and words that a value is made of."""
+    """Return the types of the numbers and words that a value is made of."""
     inside = typing.get_args(hint)
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) in (tuple, typing.Union):
         return {kind for part in inside for kind in _kinds(part)}
@@ -178,7 +178,7 @@ class ParameterGraph(Graph):
         self.ends: dict[int, tuple[float, float] | None] = {}
 
     def rows(self, nodes: Sequence[int]) -> set[int]:
-        """Rows of the parameters that expressions depend on."""
+        """Return the rows of the parameters that expressions depend on."""
         inputs = [self.arguments[node] for node in self.live(nodes) if self.operations[node] == "input"]
         return {row for argument, row in inputs if argument == PARAMETER}
 
@@ -213,8 +213,8 @@ class ParameterGraph(Graph):
             return ({**OPERATIONS, **FUNCTIONS}[operation])(*parts)
 
     def settle(self, node: int, use: str) -> Any:
-        """Value of an expression that must be plain: of a branch it becomes a condition, else its parameters stay what
-        they are; None where it depends on more than parameters.
+        """Return the value of an expression that must be plain: of a branch it becomes a condition, else its
+        parameters stay what they are; None where it depends on more than parameters.
         """
         found = self.value(node)
         if found is None:
@@ -310,7 +310,7 @@ def traced_functions(graph: ParameterGraph) -> Iterator[None]:
 
 
 def expressions(declared: Declared, first: int, graph: Graph) -> Any:
-    """Nested tuples of traced numbers in place of a parameter, whose first number has a row."""
+    """Return the nested tuples of traced numbers in place of a parameter, whose first number has a row."""
     nodes = [graph.input(PARAMETER, first + i) for i in range(len(declared.values))]
 
     def nested(part: numpy.ndarray) -> Any:
@@ -322,7 +322,9 @@ def expressions(declared: Declared, first: int, graph: Graph) -> Any:
 
 
 def with_parameters(parameters: Any, values: Mapping[str, Any]) -> Any:
-    """Parameters of a task with others, which are not checked, and without what was computed of the former ones."""
+    """Return the parameters of a task with others, which are not checked, and without what was computed of the
+    former ones.
+    """
     changed = object.__new__(type(parameters))
     for field in dataclasses.fields(parameters):
         object.__setattr__(changed, field.name, values.get(field.name, getattr(parameters, field.name)))

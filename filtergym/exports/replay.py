@@ -57,7 +57,9 @@ class Replay(NamedTuple):
         return numpy.sqrt(numpy.maximum(variance, 0.0))
 
     def largest_difference(self, mean: numpy.ndarray) -> float:
-        """Largest difference of other means ``(T, C, E)`` to the competitor's, in its standard deviations."""
+        """Return the largest difference of other means ``(T, C, E)`` to the competitor's, in its standard
+        deviations.
+        """
         with numpy.errstate(all="ignore"):
             difference = numpy.abs(mean - self.mean) / self.sigma
         same = (mean == self.mean) | (numpy.isnan(mean) & numpy.isnan(self.mean))
@@ -80,7 +82,7 @@ def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _rows(part: Any, count: int) -> numpy.ndarray:
-    """Numbers of nested tuples of arrays ``(..., N)`` row by row, of the first lanes, ``(rows, count)``."""
+    """Return the numbers of nested tuples of arrays ``(..., N)`` row by row, of the first lanes, ``(rows, count)``."""
     arrays = [numpy.asarray(array, dtype=float) for array in leaves(part)]
     return numpy.concatenate([array.reshape(-1, array.shape[-1])[:, :count] for array in arrays])
 
@@ -191,7 +193,9 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
 
 
 def _answered(network: _Network | None) -> Any:
-    """Rows of what a network has answered; where nothing is decided the answer that was held is not looked at."""
+    """Return the rows of what a network has answered; where nothing is decided the answer that was held is not
+    looked at.
+    """
     if network is None or network.answer is None:
         return collections.defaultdict(float)
     return network.answer
@@ -200,7 +204,7 @@ def _answered(network: _Network | None) -> Any:
 def _interpret_update(
     traced: TracedFilter, dtype: Any, given: dict[int, Any], network: _Network | None
 ) -> list[numpy.ndarray]:
-    """Results of an update in NumPy."""
+    """Return the results of an update in NumPy."""
 
     def read(argument: int, row: int) -> Any:
         return (_answered(network) if argument == ANSWER else given[argument])[row]
@@ -258,5 +262,5 @@ class _Code:
 
 
 def mean_rows(traced: TracedFilter) -> slice:
-    """Rows of the estimate that are its mean."""
+    """Return the rows of the estimate that are its mean."""
     return slice(0, sum(member.name == "mean" for member in traced.estimate))

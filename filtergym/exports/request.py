@@ -57,7 +57,9 @@ def request_export(
 
 
 def _own_name(problem: Problem, name: str | Path) -> str:
-    """Name of a competitor; of a file its own, without folder and ending, and without that of the environment."""
+    """Return the name of a competitor; of a file its own, without folder and ending, and without that of the
+    environment.
+    """
     text = str(name)
     for ending in file_endings():
         if text.endswith(ending):

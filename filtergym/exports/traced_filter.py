@@ -147,7 +147,7 @@ class FilterSteps:
         return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
 
     def due_nodes(self, state: Any, graph: Graph) -> list[int]:
-        """Expression of whether the network is asked at a measurement."""
+        """Return the expression of whether the network is asked at a measurement."""
         assert self.decider is not None
         if self.decider.interval == 1:
             return [graph.constant(True)]
@@ -167,7 +167,7 @@ def clear_missing(task: Task, measurement: Any) -> Any:
 
 
 def count_answers(network: "LearnedPolicy") -> int:
-    """Numbers of an action."""
+    """Return the numbers of an action."""
     return 1 if network.output == "argmax" else len(network.layers[-1][1])
 
 
@@ -300,7 +300,7 @@ def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
 
 
 def nodes_of(part: Any) -> list[int]:
-    """Expressions of all numbers."""
+    """Return the expressions of all numbers."""
     return [node for array in leaves(part) for node in namespace.asarray(array).nodes.ravel().tolist()]
 
 
@@ -321,7 +321,7 @@ def fill(part: Any, nodes: Sequence[int], graph: Graph) -> Any:
 
 
 def one_lane(part: Any) -> Any:
-    """Nested tuples of arrays ``(..., N)`` with the first lane alone, ``(..., 1)``."""
+    """Return the nested tuples of arrays ``(..., N)`` with the first lane alone, ``(..., 1)``."""
     return map_arrays(lambda array: array[..., :1], part)
 
 
@@ -347,7 +347,7 @@ class _Classes:
         self.fixed = {c: value for c, value in values.items() if value is not None}
 
     def nodes(self) -> list[int]:
-        """Expressions of the members before an update."""
+        """Return the expressions of the members before an update."""
         return [
             self.graph.constant(self.fixed[c]) if c in self.fixed else self.graph.input(STATE, c)
             for c in self.members
@@ -562,7 +562,7 @@ class _Nodes(NamedTuple):
 
 
 def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
-    """Constants of a filter that stand where expressions of the same filter with free parameters stand."""
+    """Return the constants of a filter that stand where expressions of the same filter with free parameters stand."""
     one, other, found = plain.graph, free.graph, dict[int, float]()
     waiting = list(zip(plain.wanted, free.wanted, strict=True))
     seen = set(waiting)
@@ -638,7 +638,7 @@ class _Derived:
         return list(found | dict.fromkeys(node for node in wanted if kinds[node] == 1))
 
     def program(self) -> StraightLineProgram:
-        """Program from the parameters to these expressions."""
+        """Return the program from the parameters to these expressions."""
         graph = self.graph
         numbers = [graph.node("number", node) if graph.logical[node] else node for node in self.nodes]
         return program(graph, [ProgramResult(DERIVED, row, node) for row, node in enumerate(numbers)])
@@ -656,7 +656,7 @@ class _Derived:
 
 
 def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Declared], dict[int, int]]:
-    """Parameters of which a row is used, and the rows that theirs become."""
+    """Return the parameters of which a row is used, and the rows that theirs become."""
     declared, first = list[Declared](), 0
     moved: dict[int, int] = {}
     for one in free:
@@ -671,7 +671,7 @@ def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Dec
 def _live_members(
     graph: Graph, classes: Sequence[int], after: Sequence[int], wanted: Sequence[int]
 ) -> list[int]:
-    """Members that some result depends on, now or later."""
+    """Return the members that some result depends on, now or later."""
 
     def read(nodes: Sequence[int]) -> set[int]:
         inputs = (node for node in graph.live(nodes) if graph.operations[node] == "input")

@@ -100,7 +100,7 @@ def _shown(advice: Advice) -> list[str]:
 
 
 def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]]:
-    """Parameters of a fitted filter in words; intervals where they were computed."""
+    """Return the parameters of a fitted filter in words; intervals where they were computed."""
     tunable, found, profiles = advice.tunables[name], advice.fits[name], advice.profiles.get(name, {})
     for key, value in found.values.items():
         interval = profiles[key].interval if key in profiles else None
@@ -210,7 +210,7 @@ def _onboard(advice: Advice, episode: int, rows: int, step: int) -> dict[str, An
 
 
 def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
-    """Innovations of a competitor, scaled so that their squares sum to the NIS: of deviation one each."""
+    """Return the innovations of a competitor, scaled so that their squares sum to the NIS: of deviation one each."""
     if "prediction_error" not in run or "nis" not in run:
         return {}
     groups = run["measured_group"].values
@@ -243,7 +243,7 @@ def _mean_nis(run: xarray.Dataset, name: str, seconds: numpy.ndarray) -> dict[st
 
 
 def _profiles(advice: Advice) -> Iterator[dict[str, Any]]:
-    """Likelihood of every parameter of the fitted filter, the others adapted."""
+    """Return the likelihood of every parameter of the fitted filter, the others adapted."""
     name = advice.fitted.name
     for key, profile in advice.profiles[name].items():
         plain = key.removeprefix("log10_")

@@ -47,17 +47,17 @@ def _hash(script: str) -> str:
 
 
 def pack(values: Any) -> str:
-    """JSON, compressed, in characters that mean nothing in HTML; the same bytes every time."""
+    """Return the JSON, compressed, in characters that mean nothing in HTML; the same bytes every time."""
     return pack_text(json.dumps(values, allow_nan=False, separators=(",", ":")))
 
 
 def pack_text(text: str) -> str:
-    """Text, compressed likewise."""
+    """Return the text, compressed likewise."""
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
 def mark_code(text: str) -> markupsafe.Markup:
-    """Words between backticks as code, everything escaped."""
+    """Return the words between backticks as code, everything escaped."""
     parts = re.split(r"`([^`]*)`", text)
     pieces = [
         markupsafe.Markup("<code>{}</code>").format(part) if i % 2 else markupsafe.escape(part)

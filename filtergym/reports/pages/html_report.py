@@ -114,7 +114,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
 
 
 def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
-    """Header and rows of every competitor, lowest cost first; smoothers, references and bounds last."""
+    """Return the header and rows of every competitor, lowest cost first; smoothers, references and bounds last."""
     records = result.records
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     shown = main_components(records)

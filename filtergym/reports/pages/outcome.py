@@ -218,7 +218,7 @@ def _high(record: Record) -> float:
 
 
 def _percent(share: float) -> str:
-    """Per cent in two digits, or in three where that is nearly all."""
+    """Return the per cent in two digits, or in three where that is nearly all."""
     percent = 100.0 * share
     digits = 1 if abs(percent) < 9.95 or 99.0 <= percent < 100.0 else 0
     return f"{percent:,.{digits}f}"

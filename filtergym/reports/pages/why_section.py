@@ -45,7 +45,7 @@ def why_section(result: Result) -> list[dict[str, Any]]:
 
 
 def _row(result: Result, reason: Reason, against: bool) -> tuple[str, str, list[str]]:
-    """Name of a cause, when it holds, and its numbers."""
+    """Return the name of a cause, when it holds, and its numbers."""
     numbers = [
         with_interval(reason.measurements, 100.0, negligible=0.005),
         with_interval(reason.share, 100.0, negligible=0.005),

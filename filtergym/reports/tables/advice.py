@@ -220,7 +220,7 @@ def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
 
 
 def _label(advice: Advice, one: JudgedFilter) -> str:
-    """Name of a filter, and what it is here."""
+    """Return the name of a filter, and what it is here."""
     role = "fitted" if one.fitted else "rival" if one.name == advice.rival else ""
     role = "advised" if one is advice.advised else role
     return f"{one.name} ({role})" if role else one.name
@@ -287,7 +287,7 @@ def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interv
 
 
 def verdict(advice: Advice) -> str:
-    """First sentence."""
+    """Return the first sentence."""
     one, rival = advice.fitted, advice.rival
     judged = sum(span.last - span.first for span in advice.share.judged)
     where = (
@@ -376,12 +376,12 @@ def _onboard(advice: Advice) -> Iterator[str]:
 
 
 def parameter_name(key: str) -> str:
-    """Name of a parameter in words, of the name under which it is searched."""
+    """Return the name of a parameter in words, of the name under which it is searched."""
     return key.removeprefix("log10_").replace("_", " ")
 
 
 def parameter_size(key: str, value: float) -> float:
-    """Value of a parameter, of that which is searched."""
+    """Return the value of a parameter, of that which is searched."""
     return float(10.0**value) if key.startswith("log10_") else float(value)
 
 

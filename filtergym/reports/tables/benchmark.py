@@ -79,7 +79,7 @@ def _horizon(cls: Any, scenario: str) -> int:
 
 
 def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[str, ...]:
-    """Names that a cell compares, the paper's algorithm first.
+    """Return the names that a cell compares, the paper's algorithm first.
 
     Quick: the telling ones, tuned where that has won and episodes are not long; others that are tuned; shipped agents.
     Full: every policy and estimator as it is, those that were tuned, shipped agents, smoothers, references, bounds.
@@ -116,7 +116,7 @@ def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
 def without_smoothers_of_closed_loops(
     problem: Problem, names: Sequence[str], scenario: Any
 ) -> tuple[str, ...]:
-    """Names of those that can run in a scenario: in a closed loop nothing can be smoothed."""
+    """Return the names of those that can run in a scenario: in a closed loop nothing can be smoothed."""
     smoothers = {*names} & {*problem.baselines.smoothers}
     if not smoothers or not make_task(problem.task, scenario).closes_loop:
         return tuple(names)

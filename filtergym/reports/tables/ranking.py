@@ -29,7 +29,7 @@ def find_record(
 
 
 def ranking(records: Sequence[Record]) -> list[Record]:
-    """Geometric mean of the cost of every ranked competitor of one environment and scenario, lowest first.
+    """Return the geometric mean of the cost of every ranked competitor of one environment and scenario, lowest first.
 
     Those that are as good as equal to the lowest stand in the order of the records, which is the catalogue's: a filter
     comes before what is made of it.
@@ -125,7 +125,7 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
 
 
 def _share(share: float) -> str:
-    """Per cent of the resamples, of which there are a thousand."""
+    """Return the per cent of the resamples, of which there are a thousand."""
     return f"{100.0 * share:.1f} % of cases" if share >= 0.001 else "less than 0.1 % of cases"
 
 
@@ -195,7 +195,7 @@ def remarks(results: Sequence[Result]) -> list[str]:
 
 
 def _harms(result: Result) -> list[tuple[float, str]]:
-    """Learned agents that cost significantly more than the paper's algorithm: how much, and in words."""
+    """Return the learned agents that cost significantly more than the paper's algorithm: how much, and in words."""
     return [
         (r.value or 0.0, f"`{r.policy}` in {result.short} `{r.scenario}`, {with_interval(r, 100.0)} %")
         for r in result.records

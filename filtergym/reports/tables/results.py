@@ -237,7 +237,7 @@ def serialise_track(track: xarray.Dataset | None) -> dict[str, Any] | None:
 
 
 def serialise_datasets(result: Result) -> dict[str, Any]:
-    """Curves and track as JSON can say them."""
+    """Return the curves and track as JSON can say them."""
     return {
         "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
         "track": serialise_track(result.track),

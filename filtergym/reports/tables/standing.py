@@ -75,7 +75,7 @@ def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool =
 
 
 def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
-    """Name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
+    """Return the name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
     problem, known = run.problem, run.problem.baselines
     makers = {
         name: problem.competitor(name)

@@ -27,7 +27,7 @@ OWN_ROW = ">"
 
 
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
-    """Value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``.
+    """Return the value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``.
 
     Args:
         record: with ``value``, ``low`` and ``high``; or None.
@@ -54,7 +54,9 @@ HEADLINE = "geometric_cost_difference"
 
 
 def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
-    """Share of lost tracks with its interval, %, and the difference of the mean cost to the paper's algorithm, %."""
+    """Return the share of lost tracks with its interval, %, and the difference of the mean cost to the paper's
+    algorithm, %.
+    """
     lost, means = (
         found.get((*scenario, name, metric, "", "all"))
         for metric in ("lost_tracks", "relative_cost_difference")
@@ -104,7 +106,9 @@ def score_text(record: Any) -> str:
 
 
 def main_components(records: Sequence[Any]) -> list[str]:
-    """Components that a table shows: groups such as "position" where there are any, else the first three."""
+    """Return the components that a table shows: groups such as "position" where there are any, else the first
+    three.
+    """
     first = records[0]
     names = [
         r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
@@ -132,7 +136,9 @@ def rank_competitors(records: Sequence[Any]) -> list[tuple[str, str, str]]:
 
 
 def cost_title(paper: str) -> str:
-    """Title of the column of costs against the paper's algorithm of this name; a long name has a line of its own."""
+    """Return the title of the column of costs against the paper's algorithm of this name; a long name has a line of
+    its own.
+    """
     return f"cost vs{' ' if len(paper) < 10 else chr(10)}{paper or 'paper'}, %"
 
 
@@ -195,7 +201,7 @@ RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
 def _cost_columns(
     records: Sequence[Any], found: Mapping[Any, Any], paper: str
 ) -> tuple[dict[str, Any], list[str]]:
-    """Columns on cost, consistency and time, and the sentences that explain them."""
+    """Return the columns on cost, consistency and time, and the sentences that explain them."""
     columns: dict[str, Callable[[str], str]] = {
         cost_title(paper): lambda name: with_interval(
             found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
@@ -235,7 +241,7 @@ def _cost_columns(
 
 
 def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: bool) -> dict[str, Any]:
-    """Columns of the RMSE of the main components."""
+    """Return the columns of the RMSE of the main components."""
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
 
     def rmse(component: str, name: str) -> str:
@@ -253,7 +259,9 @@ def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: 
 def _tables_below_each_other(
     draw: Callable[..., Table], costs: Columns, errors: Columns, width: int
 ) -> list[Table]:
-    """Costs in one table and errors below, each in a table of its own where they do not fit beside each other."""
+    """Return the costs in one table and errors below, each in a table of its own where they do not fit beside each
+    other.
+    """
     costs, errors = dict(costs), dict(errors)
     table = first_fitting([draw(costs, False, compact) for compact in (False, True)], width)
     if table is None:
@@ -316,7 +324,7 @@ def competitors_table(
 
 
 def _widest(table: Table) -> int:
-    """Columns that a table takes where nothing is folded."""
+    """Return the columns that a table takes where nothing is folded."""
     return Measurement.get(_MEASURING, _MEASURING.options, table).maximum
 
 

@@ -86,7 +86,7 @@ def worst_figures(
 
 
 def _titles(one: WorstTrack, phrases: Mapping[str, str]) -> tuple[str, str]:
-    """Seed and main cause, and cost, of an episode."""
+    """Return the seed and main cause, and cost, of an episode."""
     against = "" if one.ratio is None else f",\n{one.ratio:.3g} times {one.opponent}"
     cause = phrases.get(one.causes[0], one.causes[0]) if one.causes else "under no cause in particular"
     return f"episode {one.seed}\nmostly {cause}", f"mean cost {one.cost:.3g}{against}"
