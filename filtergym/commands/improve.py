@@ -1,4 +1,4 @@
-"""Commands that search for something better: tuned values and trained agents."""
+"""Commands that search for better filters: tuned parameters and trained agents."""
 
 from pathlib import Path
 from typing import Annotated
@@ -55,7 +55,7 @@ def tune_policy(
     cluster: Cluster = None,
     recording: Annotated[
         str | None,
-        typer.Option(help="What sensors really said, NetCDF or tables (CSV): fit an estimator to it."),
+        typer.Option(help="Measurements of real sensors, NetCDF or tables (CSV): fit an estimator to them."),
     ] = None,
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
@@ -151,9 +151,7 @@ def train(
     residual_to: Annotated[
         str, typer.Option(metavar="POLICY", help="Policy of the environment that the agent corrects.")
     ] = "",
-    gated: Annotated[
-        bool, typer.Option("--gated", help="The agent acts only where an alarm says that something is wrong.")
-    ] = False,
+    gated: Annotated[bool, typer.Option("--gated", help="The agent acts only after an alarm.")] = False,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     compare: Annotated[
@@ -161,13 +159,13 @@ def train(
         typer.Option(help="Say at the end how the best agent stands against paper, classical and reference."),
     ] = True,
 ) -> None:
-    """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
+    """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint from which --resume continues.
 
-    A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one, with --resume or --seeds, also
-    takes --trust. One of bptt, kalman-net or student cannot.
+    A checkpoint of Stable-Baselines3 can execute code when it is loaded: resuming one, with --resume or --seeds, also
+    needs --trust. One of bptt, kalman-net or student cannot.
 
-    Settings go before those of --config, and these before the shipped hyperparameters. --resume goes on with the
-    settings of the run, and refuses others.
+    --set overrides --config, and --config the shipped hyperparameters. --resume continues with the settings of the run,
+    and refuses others.
 
     Example: filtergym train filtergym/ManeuveringTarget-v0 --algo ppo --steps 1000000 --out runs/ppo
 

@@ -1,4 +1,4 @@
-"""Commands that measure: what there is, and how it compares on the same noise."""
+"""Commands that evaluate, record, benchmark and animate competitors on the same noise."""
 
 from pathlib import Path
 from typing import Annotated
@@ -137,8 +137,8 @@ def evaluate_policies(
     recording: Annotated[
         str | None,
         typer.Option(
-            help="In place of a scenario: what sensors really said, NetCDF, tables (CSV) or logs of receivers (.pos, "
-            ".nmea): a file, a folder, or a pattern in quotes."
+            help="In place of a scenario: measurements of real sensors, NetCDF, tables (CSV) or logs of receivers "
+            "(.pos, .nmea): a file, a folder, or a pattern in quotes."
         ),
     ] = None,
     truth: TruthOption = None,
@@ -164,7 +164,7 @@ def evaluate_policies(
         bool,
         typer.Option(
             "--isolated",
-            help="Run every module:Class in a process of its own, which is told the measurements and nothing else.",
+            help="Run every module:Class in a process of its own, which receives the measurements only.",
         ),
     ] = False,
     time_limit: Annotated[
@@ -297,7 +297,7 @@ def record_scenario(
     ] = False,
     backend: Backend = "auto",
 ) -> None:
-    """Record what the sensors say in episodes of the simulation, with the truth or, for competitors, without.
+    """Record the measurements of simulated episodes, with the truth or, for competitors, without.
 
     Example: filtergym record filtergym/ManeuveringTarget-v0 --scenario paper --episodes 20 --out plots.nc
     """

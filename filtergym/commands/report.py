@@ -1,4 +1,4 @@
-"""Commands on what is known already: one page of results, and a paper's experiments again."""
+"""Commands on existing results: one page of them, and a paper's experiments again."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,11 +23,11 @@ def make(
 ) -> None:
     """Make one self-contained page of results, to open offline and to send: tables, figures, a track to look at.
 
-    What the files say is shown and never executed, so that one may open what somebody else has sent.
+    The page shows the content of the files and executes nothing, so that files from others are safe to open.
 
     Example: filtergym report results --out report.html
     """
-    report_maker()  # what it lacks is said before anything else
+    report_maker()  # reports missing packages before any work
     writable_file(out)
     found, settings = read_all_results(results)
     print_outcome(found)

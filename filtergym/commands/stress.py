@@ -1,4 +1,4 @@
-"""Command that runs filters through everything that happens to measurements in the field."""
+"""The command that runs filters through the faults of measurements in the field."""
 
 from pathlib import Path
 from typing import Annotated
@@ -60,9 +60,9 @@ def stress(
     backend: Backend = "auto",
     trust: Trust = False,
 ) -> None:
-    """Crash test: run filters on measurements that are late, wrong, missing or repeated, and say what fails.
+    """Crash test: run filters on measurements that are late, wrong, missing or repeated, and report failures.
 
-    Each line says passed, degraded (how much, beside the paper's algorithm), or failed (how). Ends with exit code 1 if
+    Each line states passed, degraded (how much, beside the paper's algorithm), or failed (how). The exit code is 1 if
     anything failed.
 
     Example: filtergym stress filtergym/ManeuveringTarget-v0 kalman-imm --steps 0

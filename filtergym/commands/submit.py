@@ -1,4 +1,4 @@
-"""The commands that hand in a competitor with its results, and run again what somebody has handed in."""
+"""Commands that submit a competitor with its results, and verify the submissions of others."""
 
 from pathlib import Path
 from typing import Annotated
@@ -108,8 +108,8 @@ def verify_file(
 ) -> None:
     """Run a submission again on its own and on fresh episodes, and decide whether its numbers hold.
 
-    On the same episodes costs repeat but for rounding, whatever the processor; on fresh ones their intervals have to
-    agree. Times are not compared. A submission that holds source code needs --trust.
+    On the same episodes costs repeat up to rounding on any processor; on fresh ones their intervals must agree. Times
+    are not compared. A submission that contains source code needs --trust.
 
     Example: filtergym verify bptt.json
     """
@@ -164,7 +164,9 @@ def verify_file(
 
 
 def _results_table(title: str, protocol: Protocol, columns: dict[str, tuple[Figure, ...]]) -> Table:
-    """Cost against the paper's algorithm and consistency in every scenario, from several runs side by side."""
+    """Return the cost against the paper's algorithm and the consistency in every scenario, of several runs side by
+    side.
+    """
     [own] = protocol.environments
     held_out = f" and {protocol.held_out_episodes:,} of every other scenario" if own.held_out else ""
     table = plain_table(
@@ -198,7 +200,7 @@ def _percent(figure: Figure | None) -> str:
 
 
 def _time_line(columns: dict[str, tuple[Figure, ...]]) -> str:
-    """Say how long a measurement takes in each run, of which each may be on another machine."""
+    """Return the times of a measurement in words; each run may be from another machine."""
     times = {
         name: f.value for name, figures in columns.items() for f in figures if f.metric == TIME and f.value
     }

@@ -1,4 +1,4 @@
-"""What the commands share: the terminal, and the arguments that several of them take."""
+"""Terminal output, and the arguments that several commands share."""
 
 import ast
 import io
@@ -35,7 +35,7 @@ def complete_environment(incomplete: str) -> list[str]:
 
 
 def import_environments(given: Any) -> Any:
-    """Import the modules of environments that the command line names as ``module:id``; returns what was given."""
+    """Import the modules of environments that the command line names as ``module:id``; return the ids unchanged."""
     from ..envs.engine.catalogue import import_task
 
     for word in [given] if isinstance(given, str) else given or ():
@@ -45,7 +45,7 @@ def import_environments(given: Any) -> Any:
 
 
 def _environments_of(ctx: typer.Context) -> list[str]:
-    """Return the ids of the environment that the words so far name, or of all if they name none."""
+    """Return the environment id of the words so far, or all ids if they contain none."""
     from ..envs.engine.catalogue import catalogue, task_class
 
     named = ctx.params.get("environment")
@@ -87,7 +87,7 @@ def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def one_of(*words: str) -> Callable[[str], list[str]]:
-    """Return what completes one of a few words."""
+    """Return a function that completes one of a few words."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in words if word.startswith(incomplete)]
@@ -194,17 +194,17 @@ Split = Annotated[
 
 
 PAGE_WIDTH = 100
-"""Columns of what is printed into a file, and of sentences in a wide terminal."""
+"""Columns of output into a file, and of sentences in a wide terminal."""
 
 
 class Output(Console):
-    """Standard output that never stops the work: where it takes no more, the rest is not printed."""
+    """Standard output whose failure does not stop the work: the rest is then not printed."""
 
     refusal: OSError | None = None
-    """Why it took no more; None also where the reader of a pipe has left, who wanted no more."""
+    """Error that ended the output; None also where the reader of a pipe has closed it."""
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print, unless standard output takes no more."""
+        """Print, unless standard output has failed."""
         try:
             super().print(*objects, **options)
         except OSError as error:
@@ -212,7 +212,7 @@ class Output(Console):
             self._end()
 
     def on_broken_pipe(self) -> None:
-        """Go on without a reader."""
+        """Continue without a reader."""
         self._end()
 
     def _end(self) -> None:
@@ -222,10 +222,10 @@ class Output(Console):
 
 
 def output_width() -> int | None:
-    """Return the width of what is printed, in characters; None: that of the terminal, or what COLUMNS says."""
-    said = os.environ.get("COLUMNS", "")
+    """Return the width of the output, in characters; None: that of the terminal, or of the variable COLUMNS."""
+    columns = os.environ.get("COLUMNS", "")
     terminal = sys.stdout is not None and sys.stdout.isatty()
-    return None if terminal or (said.isdigit() and int(said) > 0) else PAGE_WIDTH
+    return None if terminal or (columns.isdigit() and int(columns) > 0) else PAGE_WIDTH
 
 
 # No markup: names and paths are printed as they are.
@@ -233,20 +233,20 @@ console: Output = Output(width=output_width(), markup=False, emoji=False)
 
 
 def fill(sentence: str, width: int) -> str:
-    """Break a sentence into lines, no number from its unit and no interval apart."""
+    """Break a sentence into lines, with each number beside its unit and each interval whole."""
     kept = re.sub(r"\[[^\]]*\]| %| ns\b", lambda found: found[0].replace(" ", "\xa0"), sentence)
     return textwrap.fill(kept, width, break_on_hyphens=False).replace("\xa0", " ")
 
 
 def print_sentence(sentence: str, width: int = PAGE_WIDTH, bold: int = 0) -> None:
-    """Print a sentence in lines of at most so many columns, no number apart from its unit, its first letters bold."""
+    """Print a sentence in lines of at most so many columns, each number beside its unit, its first letters bold."""
     text = Text(fill(sentence, min(console.width, width)))
     text.stylize("bold", 0, bold)
     console.print(text, soft_wrap=True)
 
 
 def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
-    """Print a table, its title above and its notes below as sentences, however narrow it is."""
+    """Print a table of any width, its title above and its notes below as sentences."""
     title, notes = table.title, table.caption
     table.title = table.caption = None
     if title:
@@ -261,13 +261,13 @@ def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
 
 
 def open_output() -> None:
-    """Let a standard output of few characters, such as ASCII, escape what it has none for."""
+    """Escape characters that the encoding of standard output lacks, such as ASCII."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def close_output(*_: Any, **__: Any) -> None:
-    """Say at the end of a command what became of its standard output.
+    """Report at the end of a command that its standard output failed.
 
     Raises:
         ValueError: if it could not be written.
@@ -286,7 +286,7 @@ def check_no_recording_options(truth: Any, rename: str | None, sort: bool) -> No
 
 
 def renamed(text: str | None) -> dict[str, list[str]]:
-    """What columns of a file are by their names there, of an option such as ``t=time,pos=x``.
+    """Return the columns of a file by their names in it, from an option such as ``t=time,pos=x``.
 
     Raises:
         ValueError: for what is none.
@@ -304,7 +304,7 @@ def renamed(text: str | None) -> dict[str, list[str]]:
 
 
 def pair(option: str, text: str) -> tuple[float, float]:
-    """Turn ``48.72,2.38`` into two numbers."""
+    """Parse two numbers such as ``48.72,2.38``."""
     try:
         first, second = map(float, text.split(","))
     except ValueError:
@@ -313,7 +313,7 @@ def pair(option: str, text: str) -> tuple[float, float]:
 
 
 def whole_numbers(option: str, text: str) -> list[int]:
-    """Turn ``0-2,7`` into 0, 1, 2 and 7, each once."""
+    """Parse whole numbers such as ``0-2,7`` into 0, 1, 2 and 7, each once."""
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
@@ -328,16 +328,16 @@ def whole_numbers(option: str, text: str) -> list[int]:
 
 
 def command_line() -> str:
-    """Return the command that runs, as one would type it again."""
+    """Return the running command as a user would type it."""
     return shlex.join(["filtergym", *sys.argv[1:]])
 
 
 def parse_settings(settings: list[str] | None, task: type["Task"] | None = None) -> dict[str, Any]:
-    """Turn ``name=value`` into keywords; a value is a Python literal, or else a word.
+    """Parse ``name=value`` into keywords; a value is a Python literal, or else a word.
 
     Args:
-        settings: as they were typed; None: none.
-        task: whose parameters they must be; None: anything.
+        settings: words of the command line; None: none.
+        task: task whose parameters are allowed; None: any name.
     """
     keywords: dict[str, Any] = {}
     for setting in settings or []:

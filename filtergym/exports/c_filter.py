@@ -1,7 +1,7 @@
-"""A filter as a header and a source of C99: its structs, its two functions, and what it costs.
+"""A filter as a header and a source of C99: its structs, its two functions, and its cost.
 
-No allocation, and nothing but ``math.h``; parameters and weights are constants. Whatever a stranger's file calls its
-parts gets into the text as identifiers and comments only, see :mod:`..compiler.c_source`.
+No allocation, and no library but ``math.h``; parameters and weights are constants. Names in a file from others enter
+the text as identifiers and comments only, see :mod:`..compiler.c_source`.
 """
 
 import re
@@ -29,11 +29,11 @@ from .traced_filter import (
 )
 
 TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
-"""Names that a filter's files must not have: those of the others."""
+"""File names that a filter must not have, since other files have them."""
 
 
 def file_stem(name: str) -> str:
-    """Return what the files and functions of a filter are called."""
+    """Return the common name of the files and functions of a filter."""
     return identifier(name, TAKEN)
 
 
@@ -41,10 +41,10 @@ class FilterText:
     """A filter as text.
 
     Args:
-        name: of the competitor.
+        name: name of the competitor.
         traced: its programs.
-        scalar: kind of numbers.
-        components: what is estimated, name and unit.
+        scalar: type of the numbers.
+        components: name and unit of the estimated components.
 
     Attributes:
         about: paragraphs for the comment of the header.
@@ -68,7 +68,7 @@ class FilterText:
         self.update, self.update_source = self._update()
 
     def _parameters(self, *parts: str) -> list[Parameter]:
-        """Return the parameters that point to structs; ``const`` is what is only read."""
+        """Return the parameters that point to structs; read-only ones are ``const``."""
         return [
             Parameter(
                 f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *",
@@ -78,7 +78,7 @@ class FilterText:
         ]
 
     def _rows(self, part: str, name: str = "", qualifier: str = "const ") -> Rows:
-        """Return the numbers of a struct one after the other: it has no members of another kind."""
+        """Return the numbers of a struct one after the other; it has no members of another kind."""
         pointer = f"(({qualifier}{self.scalar.name} *){name or part})"
         return Rows(pointer, self.structs[part].numbers)
 
@@ -120,7 +120,7 @@ class FilterText:
     def _update(self) -> tuple[str, Any]:
         traced, real, own = self.traced, self.scalar.name, self.name
         state, places = self.structs["state"], self.structs["state"].places
-        given, told = self.structs["measurement"].places, self.structs["estimate"].places
+        given, reported = self.structs["measurement"].places, self.structs["estimate"].places
         inner = [Parameter(f"const {state.name} *", "state"), *self._parameters("measurement")]
         inner += [Parameter(f"{state.name} *", "next"), *self._parameters("estimate")]
         between = []
@@ -139,7 +139,7 @@ class FilterText:
         def write(argument: int, row: int) -> str:
             if argument == SHOWN:
                 return f"shown[{row}]"
-            return f"next->{places[row]}" if argument == STATE else f"estimate->{told[row]}"
+            return f"next->{places[row]}" if argument == STATE else f"estimate->{reported[row]}"
 
         read_rows = {STATE: self._rows("state"), MEASUREMENT: self._rows("measurement")}
         written = {STATE: self._rows("state", "next", ""), ESTIMATE: self._rows("estimate", qualifier="")}
@@ -191,7 +191,7 @@ class FilterText:
         return f"{source.functions}\n{function_text('int', f'{own}_update', parameters, body)}", source
 
     def _guard(self) -> list[str]:
-        """Return the statements that leave the state alone where the estimate is no finite number."""
+        """Return the statements that leave the state unchanged where the estimate is not finite."""
         zero = literal(0.0, self.scalar)
         C = len(self.components)
         mean, covariance = ("", "") if C == 1 else ("[i]", "[i][j]")
@@ -234,18 +234,17 @@ class FilterText:
 
     @property
     def network_operations(self) -> int:
-        """Operations of a network, where it is asked."""
+        """Operations of a network, where it is evaluated."""
         return 0 if self.traced.network is None else network_operations(self.traced.network)
 
     @property
     def replaced(self) -> tuple[float, ...]:
-        """Constants that the kind of number does not have."""
+        """Constants that the type of the numbers cannot represent."""
         return tuple(sorted({*self.start_source.replaced, *self.update_source.replaced}))
 
     # --- files
 
     def header(self, notes: Sequence[str] = ()) -> str:
-        """Return the text of the header."""
         own, scalar, structs = self.name, self.scalar, self.structs
         guard = f"{own.upper()}_H"
         listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
@@ -309,9 +308,9 @@ class FilterText:
         """Return the text of the source."""
         parts = [
             comment(
-                "See the header. A loop goes over the members of array operations, k is the member; where they lie is "
-                "said by tables, whose names end in at and a number. The array w holds what one loop leaves to another."
-                " A comment names the functions whose operations the loops below it have."
+                "See the header. A loop goes over the members of array operations, k is the member; tables, whose names end "
+                "in at and a number, contain their places. The array w passes values from one loop to another. A comment "
+                "names the functions whose operations the loops below it have."
             ),
             f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
             helper_functions([self.traced.start, self.traced.update], self.scalar),

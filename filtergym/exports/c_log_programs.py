@@ -1,7 +1,7 @@
-"""Programs of C that read a log as filtergym reads it, with fields for what differs from filter to filter.
+"""Programs of C that read a log as filtergym reads it, with fields for the parts that differ from filter to filter.
 
 A program is :data:`LOG`, :data:`READER` and a function ``follow``. The reader takes the whole file into rows, sorts
-them into tracks, leaves out what comes twice, and calls ``follow`` for each track, which is :data:`PLOTS`,
+them into tracks, leaves out duplicates, and calls ``follow`` for each track, which is :data:`PLOTS`,
 :data:`PLAIN_ROWS` or :data:`REGULAR_ROWS`. Their numbers and names are from :mod:`.c_log`.
 """
 
@@ -61,7 +61,7 @@ ODOMETRY = {
             row->moved[1] = half * (c * cos(d * DEGREE) + a * cos(b * DEGREE));
         }""",
 }
-"""How a displacement is made of the columns a and b of a second sensor, the first pair that a log has."""
+"""Displacement from the columns a and b of a second sensor, the first pair that a log has."""
 READ_ODOMETRY = """
 /* Makes displacements of the rows of a track, of which those that lack a number have none. */
 static int read_odometry(long n) {{
@@ -93,7 +93,7 @@ POSITIONS: dict[tuple[str, ...], str] = {
         row->p[0] = row->m[0] = a * sin(b * DEGREE);
         row->p[1] = row->m[1] = a * cos(b * DEGREE);""",
 }
-"""How a position is made of the columns a and b of a log, the first pair that it has; a third one may lack."""
+"""Position from the columns a and b of a log, the first pair that it has; a third one may be missing."""
 PROJECT = """
 /* Latitude and longitude, degrees, around which positions are metres; the altitude of a row that has none, m. */
 static double origin[3];
@@ -380,10 +380,10 @@ static int read_values(const Row *row, long i, double *found) {{
         if (row->cell[k] != row->cell[k]) found[0] = 0.0;
     return 0;
 }}"""
-"""Reads rows with positions by an INS and by a receiver; the last columns that are needed are the latter's."""
+"""Reads rows with positions by an INS and by a receiver; the last required columns are the receiver's."""
 CHECK_SIGMA = """
     if (!(row->cell[{sigma}] > 0.0)) return fail("above zero must be the standard deviation", names[{sigma}], row);"""
-"""Checks what the receiver states of its fix."""
+"""Checks the standard deviation that the receiver states."""
 READ_LOOKS = """#define FOUND 4
 
 /* Finds whether the ESM listened, what it decided for, and the difference of the bearings in degrees. */
@@ -401,4 +401,4 @@ static int read_values(const Row *row, long i, double *found) {{
     found[3] = decided ? apart - 360.0 * floor((apart + 180.0) / 360.0) : 0.0;
     return 0;
 }}"""
-"""Reads rows of a radar with what an ESM reports."""
+"""Reads rows of a radar with the reports of an ESM."""

@@ -1,4 +1,4 @@
-"""Parameters of a filter in C: their struct, their limits, and what the start of a track does with them."""
+"""Parameters of a filter in C: their struct, their limits, and their use at the start of a track."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from .traced_filter import DERIVED, FreeParameters, Member
 
 
 def parameter_members(declared: Sequence[Declared]) -> list[Member]:
-    """Return the members of the struct, with what each is, its default and its limits."""
+    """Return the members of the struct, with the meaning, default and limits of each."""
     found = []
     for one in declared:
         values = [f"{value:.6g}" for value in one.values]
@@ -63,14 +63,14 @@ def parameter_words(free: FreeParameters) -> str:
 def parameter_text(
     own: str, free: FreeParameters, scalar: Scalar, struct: Structure
 ) -> tuple[str, list[str]]:
-    """Return tables and functions of the parameters, and the statements with which start begins: they refuse what is
-    outside the limits, and derive ``own``.
+    """Return tables and functions of the parameters, and the first statements of start, which reject values outside the
+    limits and derive ``own``.
 
     Args:
         own: name of the filter.
         free: its parameters.
-        scalar: kind of numbers.
-        struct: of the parameters.
+        scalar: type of the numbers.
+        struct: struct of the parameters.
     """
     if free.derive is None:
         return "", []
@@ -132,8 +132,8 @@ def parameter_text(
 
 
 def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
-    """The program with what is as deep in the same operation as one array operation: numbers are derived one by one in
-    Python, and loops go over array operations.
+    """Return the program with equally deep equal operations as one array operation: derivation in Python is number by
+    number, but loops run over array operations.
     """
     depths: list[int] = []
     groups: dict[tuple[int, str], int] = {}
@@ -145,12 +145,14 @@ def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
 
 
 def _stated(free: FreeParameters, scalar: Scalar) -> range:
-    """Return the rows that are stated where nothing is chosen; of float all, which the filter has from double."""
+    """Return the rows that are stored where no parameter is chosen; of float all, which the filter converts from
+    double.
+    """
     return free.stated if scalar is DOUBLE else range(len(free.usual))
 
 
 def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused: str) -> list[str]:
-    """Return the statements that refuse pairs that do not ascend, and rows of probabilities that do not sum to one."""
+    """Return the statements that reject pairs that do not ascend, and rows of probabilities that do not sum to one."""
     checks, row = [], 0
     for one in free.declared:
         rows = [f"parameters->{struct.places[row + i]}" for i in range(len(one.values))]
@@ -187,7 +189,7 @@ def _value(one: Declared, scalar: Scalar) -> str:
 
 
 def _limits(one: Declared, scalar: Scalar) -> tuple[float, float]:
-    """Return the limits that a kind of number has."""
+    """Return the limits of a type of numbers."""
     if scalar is DOUBLE:
         return one.low, one.high
     largest = float(numpy.finfo(scalar.dtype).max)

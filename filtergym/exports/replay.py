@@ -1,4 +1,4 @@
-"""What an exported filter must answer: measurements of episodes, and what the competitor itself estimated of them."""
+"""Test vectors of an exported filter: measurements of episodes, and the estimates of the competitor itself."""
 
 import collections
 import copy
@@ -40,15 +40,15 @@ class Replay(NamedTuple):
     """E episodes of T measurements, every array of a structure row by row."""
 
     initial: numpy.ndarray
-    """``(rows, E)``."""
+    """Initial estimate, ``(rows, E)``."""
     measurements: numpy.ndarray
-    """``(T, rows, E)``."""
+    """Measurements, ``(T, rows, E)``."""
     mean: numpy.ndarray
-    """Of the competitor, ``(T, C, E)``."""
+    """Mean of the competitor, ``(T, C, E)``."""
     covariance: numpy.ndarray
-    """``(T, C, C, E)``."""
+    """Covariance of the competitor, ``(T, C, C, E)``."""
     components: list[tuple[str, str]]
-    """Name and unit of what is estimated."""
+    """Name and unit of the estimated components."""
 
     @property
     def sigma(self) -> numpy.ndarray:
@@ -68,13 +68,15 @@ class Replay(NamedTuple):
 
 
 def _report(model: Model, episode: Episode) -> dict[str, Any]:
-    """What a filter was given, and what it estimated."""
+    """Return the input and the estimate of a filter."""
     mean, covariance = model.mean(episode), model.covariance(episode)
     return {"measurement": episode.measurement, "mean": mean, "covariance": covariance}
 
 
 def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
-    """Of an estimator also why an episode is lost: the last valid answer is held then."""
+    """Return the input and the estimate of an estimator, and why an episode is lost: its last valid estimate is then
+    repeated.
+    """
     return {
         **_report(model, episode),
         "lost": model.filter.records(episode.filter, episode.measurement)["lost"],
@@ -90,15 +92,15 @@ def _rows(part: Any, count: int) -> numpy.ndarray:
 def replay(
     request: ExportRequest, episodes: int = 8, measurements: int | None = None
 ) -> tuple[TracedFilter, Replay]:
-    """Trace a competitor, and let it run over episodes as an evaluation does.
+    """Trace a competitor, and run it over episodes as an evaluation does.
 
     Args:
-        request: what is traced.
-        episodes: how many run.
-        measurements: of each, at most.
+        request: competitor to trace.
+        episodes: number of episodes.
+        measurements: largest number of measurements in each.
 
     Raises:
-        ValueError: for what cannot be exported, or loses every episode.
+        ValueError: for a competitor that cannot be exported, or loses every episode.
     """
     problem, name, maker, scenario, keywords = request[:5]
     kind = kind_of(maker)
@@ -132,11 +134,11 @@ def replay(
 
 
 class _Network:
-    """The network of a filter, asked as it is in an evaluation.
+    """The network of a filter, evaluated as in an evaluation.
 
     Args:
-        network: of the filter.
-        dtype: in which it computes.
+        network: network of the filter.
+        dtype: type in which it computes.
     """
 
     def __init__(self, network: "LearnedPolicy", dtype: Any) -> None:
@@ -148,7 +150,7 @@ class _Network:
         self.answer: Any = None
 
     def __call__(self, shown: Any) -> None:
-        """Answer, if this measurement is decided on."""
+        """Compute the output, if there is a decision at this measurement."""
         flag, *rest = shown
         if not numpy.all(flag):
             return
@@ -164,9 +166,9 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     the C library, where code can be compiled, else in NumPy.
 
     Args:
-        traced: to run.
-        replayed: what it is given.
-        dtype: in which everything is computed.
+        traced: filter to run.
+        replayed: its input.
+        dtype: type of the computation.
 
     Returns:
         Rows of the estimate, ``(T, rows, E)``.
@@ -193,9 +195,7 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
 
 
 def _answered(network: _Network | None) -> Any:
-    """Return the rows of what a network has answered; where nothing is decided the answer that was held is not
-    looked at.
-    """
+    """Return the rows of a network's output; without a decision the previous output is not read."""
     if network is None or network.answer is None:
         return collections.defaultdict(float)
     return network.answer
@@ -217,13 +217,13 @@ class _CompiledUpdate:
 
     Args:
         traced: the filter.
-        E: how many.
+        E: number of filters.
     """
 
     def __init__(self, traced: TracedFilter, E: int) -> None:
         code, shown = traced.update, traced.shown
         self._whole, self._before = _Code(code, E), None
-        if shown:  # what a network is shown is computed before it is asked, and once more with its answer
+        if shown:  # the network's input is computed before its output, and once more with it
             first = first_steps(code, shown)
             steps, origins = code.steps[:first], code.origins[:first]
             self._before = _Code(StraightLineProgram(steps, code.constants, code.results[:shown], origins), E)
