@@ -59,8 +59,8 @@ GROUPS: Mapping[str, Commands] = {
 MARKUP: Any = "markdown"
 """Markup of the help; with rich's own, the extra in filtergym[fast] would be read as a style."""
 REPORT = (
-    "--debug shows where it happened: if that is not in code of your own, please report it with what it shows and with "
-    "what filtergym doctor prints"
+    "--debug shows the traceback: if it ends outside your own code, please report it with the traceback and the "
+    "output of filtergym doctor"
 )
 
 
@@ -76,7 +76,7 @@ def _general(
     ] = False,
     no_cache: Annotated[
         bool,
-        typer.Option("--no-cache", help="Neither read nor keep compiled code in the user's cache folder."),
+        typer.Option("--no-cache", help="Neither read nor store compiled code in the user's cache folder."),
     ] = False,
 ) -> None:
     """Gymnasium environments for adaptive-filter benchmarking. With --debug, an error shows its traceback."""

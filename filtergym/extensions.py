@@ -50,7 +50,7 @@ def load(place: str, package: str | None = PACKAGE) -> Any:
     except ModuleNotFoundError as error:
         if error.name != path:
             raise
-        raise ValueError(f"this installation of filtergym holds no {module}") from None
+        raise ValueError(f"this installation of filtergym lacks {module}") from None
 
 
 def load_present(places: Iterable[str], package: str | None = PACKAGE) -> Iterator[Any]:

@@ -229,15 +229,15 @@ def _model_of(env: Any) -> Any:
         )
     if inner.privileged:
         raise ValueError(
-            "this environment shows what no policy may know: make it without observation='asymmetric', or show "
-            "a policy of your own observation['observation']"
+            "this environment shows the truth, which a policy may not observe: make it without observation='asymmetric', "
+            "or show a policy of your own observation['observation']"
         )
     if inner.fleet.mixes_scenarios:
         raise ValueError(
-            "a policy is made for the parameters of one scenario, and this environment flies several: make it with one"
+            "a policy is made for the parameters of one scenario, and this environment has several: make it with one"
         )
     if inner.backend == "torch":
-        raise ValueError("policies answer in NumPy arrays: make the environment with another backend")
+        raise ValueError("policies return NumPy arrays: make the environment with another backend")
     return inner.model
 
 

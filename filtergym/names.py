@@ -63,7 +63,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
         for ending in file_endings():
             # Stable-Baselines3 saves "mine" as mine.zip. Unlike a Path, this takes a name that no file can have.
             if os.path.isfile(f"{name}{ending}"):
-                raise ValueError(f"unknown policy {name!r}: a file is named whole, {name}{ending}")
+                raise ValueError(f"unknown policy {name!r}: write the whole file name, {name}{ending}")
         raise nearest("policy", name, shipped_names(problem))
     with running(name):
         holder = import_user_module(module, f"cannot load policy {name!r}")
@@ -139,9 +139,7 @@ def find_competitors(
         if name in shipped_names(problem):
             known = find_competitor(problem, name).maker
             if type(entry) is not type(known) or not bool(entry == known):
-                raise ValueError(
-                    f"{name!r} is the name of what {problem.id} has already: call your own something else"
-                )
+                raise ValueError(f"{name!r} is already a name of {problem.id}: choose another one")
     return [
         find_competitor(problem, entry, trust)._replace(name=name)
         if isinstance(entry, str | Path)
@@ -158,7 +156,9 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
     """
     for name in names:
         if name.startswith("gated:") and is_module(problem, name.removeprefix("gated:")):
-            raise ValueError(f"{name!r} acts in this process, beside the truth: an estimator can be isolated")
+            raise ValueError(
+                f"{name!r} acts in this process, beside the truth: only an estimator can be isolated"
+            )
     return [
         f"isolated:{name}" if is_module(problem, name) and not name.startswith((*PREFIXES,)) else name
         for name in names

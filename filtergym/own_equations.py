@@ -349,8 +349,8 @@ def trace(what: str, function: Function, size: int, answers: int | None, given: 
         made = VectorFunction(function, size, given)
     except NotTraceable as error:
         raise ValueError(
-            f"{what} cannot be traced ({error}): write it with NumPy's functions of the state, return a list, and let "
-            "numpy.where choose where something depends on numbers"
+            f"{what} cannot be traced ({error}): write it with NumPy's functions of the state, return a list, and use "
+            "numpy.where in place of branches on numbers"
         ) from error
     except ValueError as error:
         raise ValueError(f"{what} {error}") from error

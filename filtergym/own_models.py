@@ -248,7 +248,7 @@ def _sensors(
             raise ValueError("give the measurement by h and R, or by sensors")
         return {}
     if h is not None or R is not None or len(measured):
-        raise ValueError("sensors say h, R and names of what is measured: leave h, R and measured out")
+        raise ValueError("sensors contain h, R and the names: leave out h, R and measured")
     if not sensors:
         raise ValueError("sensors must name at least one")
     return replace_sensors(None, sensors)

@@ -26,7 +26,9 @@ def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[st
     if not isinstance(given, Mapping) or not all(isinstance(one, Sensor) for one in given.values()):
         raise ValueError(f"sensors must be a mapping from names to Sensor, got {quote_shortened(given)}")
     if {*given} & {*NOISES}:
-        raise ValueError(f"sensors cannot be called {' or '.join(NOISES)}, whose noises are others")
+        raise ValueError(
+            f"sensors cannot be called {' or '.join(NOISES)}, which are the names of other noises"
+        )
     if sensors is not None and not {*given} <= {*sensors}:
         unknown = next(name for name in given if name not in sensors)
         raise ValueError(f"sensors are {', '.join(sensors) or 'not named'}, got {unknown!r}")
@@ -76,8 +78,8 @@ def find_channels(
     for (name, one), count in zip(sensors.items(), counts, strict=True):
         if one.interval is not None and one.interval < interval * (1.0 - 1e-9):
             raise ValueError(
-                f"the sensor {name!r} is due every {one.interval:g} s, and measurements are {interval:g} s apart: let "
-                "sampling_interval be the shortest of all"
+                f"the sensor {name!r} is due every {one.interval:g} s, and measurements are {interval:g} s apart: set "
+                "sampling_interval to the shortest of all"
             )
         period = None if one.wraps is None else PERIODS[one.wraps]
         channels.append(Channel(name, first, count, one.interval, one.availability, one.gate, period))

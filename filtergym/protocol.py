@@ -111,7 +111,7 @@ def read_protocol(name: str) -> tuple[Protocol, str]:
         protocol = msgspec.toml.decode(content, type=Protocol)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise ValueError(f"{name} holds no protocol of filtergym: {reason:.300}") from error
+        raise ValueError(f"{name} contains no protocol of filtergym: {reason:.300}") from error
     _check(protocol)
     return protocol, hashlib.sha256(content.replace(b"\r\n", b"\n")).hexdigest()
 

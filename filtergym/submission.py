@@ -228,7 +228,7 @@ def _decode(path: Path, content: bytes) -> Submission:
         return msgspec.json.decode(content, type=Submission)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())  # it may quote the file
-        raise ValueError(f"{path} holds no submission of filtergym: {reason:.300}") from error
+        raise ValueError(f"{path} contains no submission of filtergym: {reason:.300}") from error
 
 
 # --- competitors
@@ -292,8 +292,8 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
     if isinstance(held, Source):
         if not trust:
             raise ValueError(
-                f"{path} holds source code, and to verify it is to execute it: read it (--source FILE writes it), and "
-                "if you trust it add --trust"
+                f"{path} contains source code, which a verification executes: read it (--source FILE writes it), "
+                "and if you trust it add --trust"
             )
         return isolate_source(held.text, held.name, f"source of {path}")
     if held.name in problem.baselines.names:
@@ -302,8 +302,8 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
         raise nearest("competitor", held.name, problem.baselines.names)
     if kind_of(found) not in RANKED:
         raise ValueError(
-            f"{path} names a {kind_of(found)}, which may know more than the sensors measure: only policies and estimators "
-            "can be submitted"
+            f"{path} names a {kind_of(found)}, which may know more than the sensors measure: only policies and "
+            "estimators can be submitted"
         )
     return found
 

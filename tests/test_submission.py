@@ -556,7 +556,7 @@ def test_a_truncated_file_is_refused(honest, command, tmp_path):
     path = tmp_path / "half.json"
     for share in (0.0, 0.99):
         path.write_bytes(content[: int(share * len(content))])
-        assert "holds no submission of filtergym" in refused(command, path)
+        assert "contains no submission of filtergym" in refused(command, path)
 
 
 def test_what_is_packed_or_large_is_refused(command, tmp_path):

@@ -111,11 +111,11 @@ def advise_on_log(
         ),
     ],
     environment: Annotated[
-        str, typer.Option(help="Environment whose measurements they are; NetCDF names its own.")
+        str, typer.Option(help="Environment of the measurements; a NetCDF file names its own.")
     ] = "filtergym/ManeuveringTarget-v0",
     out: Annotated[
         Path | None,
-        typer.Option(help=f"File for the advised filter, *{SUFFIX}; evaluate, online and export take it."),
+        typer.Option(help=f"File for the advised filter, *{SUFFIX}, for evaluate, online and export."),
     ] = None,
     report: Annotated[
         Path | None,
@@ -135,7 +135,7 @@ def advise_on_log(
     ] = None,
     settings: Parameters = None,
     noise: Annotated[bool, typer.Option(help="Fit the scale of the measurement noise, too.")] = True,
-    seed: Annotated[int, typer.Option(help="Of the starts of the fits.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the starts of the fits.")] = 0,
     speeds: Speeds = "0.01,1000",
     agents: Annotated[
         bool, typer.Option("--agents", help="Compare the shipped learned agents, too; it takes longer.")

@@ -420,8 +420,8 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
     for record in records:
         if record.metric == "missing" and record.value:
             yield (
-                f"{record.policy}: {100.0 * record.value:.3g} % of the measurements have no row in the file; the last "
-                "estimate before each, or the initial one, is held"
+                f"{record.policy}: {100.0 * record.value:.3g} % of the measurements have no row in the file; each "
+                "repeats the estimate before it, or the initial one"
             )
 
 
@@ -439,8 +439,8 @@ def departure_lines(
     typical = data.typical if learned and isinstance(data, Recording) else {}
     for name in typical.keys() - keywords.keys():
         yield (
-            f"{name} is {typical[name]:g}, the median of what the log states: agents are shown deviations over it, and "
-            f"costs count in its square; --set {name}=VALUE names another"
+            f"{name} is {typical[name]:g}, the median of what the log states: agents observe deviations over it, and "
+            f"costs have its square as unit; --set {name}=VALUE sets another"
         )
     for agent in learned:
         for departure in load_present(DEPARTURES):

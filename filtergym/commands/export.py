@@ -56,7 +56,7 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; onnx, the "
+            help="Format: safetensors, an agent's arrays; c, a whole filter as C99; onnx, the "
             "network of an agent.",
             autocompletion=one_of(*FORMS),
         ),
@@ -69,14 +69,15 @@ def export(
         ),
     ] = None,
     single: Annotated[
-        bool, typer.Option("--float", help="Of C: float in place of double; refused where it is wrong.")
+        bool,
+        typer.Option("--float", help="Of C: float in place of double; an error where its results are wrong."),
     ] = False,
     scenario: ScenarioName = None,
     recording: Annotated[
         Path | None,
         typer.Option(
             help="In place of a scenario: a log, NetCDF or a table (CSV), whose parameters the filter has and whose "
-            "measurements it is tried on. What was fitted to a second sensor needs one that has it."
+            "measurements it is compared on. A filter with a second sensor needs a log of both."
         ),
     ] = None,
     speeds: Speeds = "1,1000",

@@ -48,7 +48,7 @@ def tune_policy(
     policy: Annotated[str, typer.Option(help="Policy to tune.", autocompletion=complete_policy)],
     budget: Annotated[int, typer.Option(help="Environment steps to spend.")] = 4_000_000,
     scenario: TrainingScenario = None,
-    seed: Annotated[int, typer.Option(help="Of the training episodes and the search.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the training episodes and the search.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the tuned values.")] = FOLDER,
     backend: Backend = "auto",
     jobs: Jobs = 1,
@@ -119,7 +119,7 @@ def train(
     steps: Annotated[int | None, typer.Option(help="Environment steps in all.")] = None,
     envs: Annotated[int | None, typer.Option(help="Environments side by side.")] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Of the training episodes and the network; default: 0.")
+        int | None, typer.Option(help="Seed of the training episodes and the network; default: 0.")
     ] = None,
     seeds: Annotated[
         str | None,
@@ -128,7 +128,7 @@ def train(
             "skipped, unfinished ones resumed."
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")] = False,
     validate_every: Annotated[
         int | None, typer.Option(help="Environment steps between validations; default: a twentieth.")
     ] = None,
@@ -156,7 +156,9 @@ def train(
     cluster: Cluster = None,
     compare: Annotated[
         bool,
-        typer.Option(help="Say at the end how the best agent stands against paper, classical and reference."),
+        typer.Option(
+            help="Report at the end how the best agent compares with paper, classical and reference."
+        ),
     ] = True,
 ) -> None:
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint from which --resume continues.
@@ -177,10 +179,12 @@ def train(
     trainer = trainer_of(algo)
     if seeds is not None and (seed is not None or resume):
         raise ValueError(
-            "--seeds names every seed, and goes on with runs by itself: leave out --seed and --resume"
+            "--seeds names every seed, and continues runs by itself: leave out --seed and --resume"
         )
     if seeds is None and not (jobs == 1 and cluster is None):
-        raise ValueError("a run is trained in one process: --jobs and --cluster share the runs of --seeds")
+        raise ValueError(
+            "a single run is trained in one process: --jobs and --cluster share the runs of --seeds"
+        )
     keywords, hyperparameters = parse_settings(set_ or [])
     if reward is not None:
         keywords["reward"] = reward

@@ -157,7 +157,7 @@ def evaluate_policies(
         bool,
         typer.Option(
             "--strict",
-            help="Stop where an estimator's answer is not finite or no covariance; default: the episode is lost.",
+            help="Stop at an estimate that is not finite or has no covariance; default: the episode is lost.",
         ),
     ] = False,
     isolated: Annotated[
@@ -170,7 +170,7 @@ def evaluate_policies(
     time_limit: Annotated[
         float,
         typer.Option(
-            help="For each answer of programs, isolated estimators and, on Linux with --jobs 1, any module:Class, s."
+            help="Limit for each estimate of programs, isolated estimators and, on Linux with --jobs 1, any module:Class, s."
         ),
     ] = 10.0,
     memory_limit: Annotated[
@@ -184,7 +184,7 @@ def evaluate_policies(
     why: Annotated[
         list[str] | None,
         typer.Option(
-            help="Whose cost is explained; repeat for several; default: yours, the first --policy, else the paper's "
+            help="Competitor whose cost is explained; repeat for several; default: yours, the first --policy, else the paper's "
             "algorithm.",
             autocompletion=complete_policy,
         ),
@@ -195,12 +195,12 @@ def evaluate_policies(
             help="Of flights in latitude and longitude: those of the radar, degrees, such as 48.72,2.38."
         ),
     ] = None,
-    longest_gap: Annotated[float, typer.Option(help="Of flights: longest gap that is not cut, s.")] = 60.0,
+    longest_gap: Annotated[
+        float, typer.Option(help="Of flights: longest gap at which a flight is not cut, s.")
+    ] = 60.0,
     speeds: Annotated[
         str,
-        typer.Option(
-            help="Of flights and recordings: speeds that are possible, m/s, from the lowest to the highest."
-        ),
+        typer.Option(help="Of flights and recordings: lowest and highest possible speed, m/s."),
     ] = "1,1000",
     smoothing: Annotated[
         float,
@@ -217,7 +217,7 @@ def evaluate_policies(
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
     if isolated and trust:
-        raise ValueError("--trust lets code run here, and --isolated does not: leave one of them out")
+        raise ValueError("--trust runs code in this process, and --isolated does not: leave one of them out")
     if protocol is not None:
         check_options(ctx)
         isolating = isolate_names if isolated else None
@@ -292,7 +292,7 @@ def record_scenario(
         typer.Option(
             "--blind",
             help="Without the truth, for programs outside Python: measurements.csv, start.csv and measurements.nc. "
-            "What they estimate is judged by filtergym evaluate --policy file:ESTIMATES.",
+            "filtergym evaluate --policy file:ESTIMATES evaluates their estimates.",
         ),
     ] = False,
     backend: Backend = "auto",
@@ -318,7 +318,7 @@ def record_scenario(
     write_blind(out, recording, experiment.make_task())
     chosen = [f"--scenario {scenario}"] * (scenario is not None) + [f"--set {one}" for one in settings or []]
     judged = f"--episodes {episodes} --seed {seed} --split {split} --policy file:ESTIMATES.csv"
-    console.print(f"{episodes} episodes in {out}; what estimates them is judged by", soft_wrap=True)
+    console.print(f"{episodes} episodes in {out}; to evaluate estimates of them:", soft_wrap=True)
     console.print(f"  filtergym evaluate {' '.join([environment, *chosen, judged])}", soft_wrap=True)
 
 
@@ -347,12 +347,10 @@ def write_offline(
         list[str] | None,
         typer.Option("--set", help="Parameter of the task, reward or dtype, name=value; repeat for several."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of data sets; default: where Minari keeps them.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of data sets; default: that of Minari.")] = None,
     namespace: Annotated[
         str | None,
-        typer.Option(help="What names begin with; default: filtergym/maneuvering-target and the like."),
+        typer.Option(help="Beginning of the names; default: filtergym/maneuvering-target and the like."),
     ] = None,
     trust: Trust = False,
 ) -> None:
@@ -415,7 +413,7 @@ def benchmark(
     """
     if policy:
         raise ValueError(
-            f"benchmark runs what is shipped, and --policy {policy[0]} names another competitor: filtergym evaluate "
+            f"benchmark runs shipped competitors only, and --policy {policy[0]} names another: filtergym evaluate "
             f"--protocol filtergym-1 --policy {policy[0]} runs it in every environment, and filtergym evaluate "
             f"ENVIRONMENT --policy {policy[0]} in one"
         )
@@ -456,9 +454,7 @@ def benchmark(
     console.print()
     make_report(results, settings_of(options.command), out / REPORT)
     console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
-    print_sentence(
-        "what the environments are, and who competes in them: filtergym list, docs/environments.md"
-    )
+    print_sentence("environments and their competitors: filtergym list, docs/environments.md")
     console.print()
     print_headline(results)
 

@@ -126,7 +126,7 @@ def _table(found: ProtocolResult) -> Table:
         "machine, of world and competitor."
     )
     if not found.complete:
-        table.caption += "\nNot all environments were entered: there is no number over all of them."
+        table.caption += "\nNot all environments were entered: there is no number over all."
     return table
 
 

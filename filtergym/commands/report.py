@@ -17,7 +17,7 @@ from .terminal import Cluster, Formats, Jobs, console, one_of, progress_bar
 def make(
     results: Annotated[
         list[Path],
-        typer.Argument(help="Files of results, or folders that hold one; several make one report."),
+        typer.Argument(help="Files of results, or folders that contain one; several make one report."),
     ],
     out: Annotated[Path, typer.Option(help="HTML file.")] = Path(REPORT),
 ) -> None:

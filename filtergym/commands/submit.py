@@ -49,7 +49,7 @@ def submit(
             autocompletion=complete_policy,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="File that is handed in, .json.")],
+    out: Annotated[Path, typer.Option(help="File of the submission, .json.")],
     protocol: Annotated[
         str,
         typer.Option(
@@ -58,7 +58,7 @@ def submit(
             autocompletion=one_of(FROZEN, TRIAL),
         ),
     ] = FROZEN,
-    title: Annotated[str | None, typer.Option(help="Of the competitor; default: the name.")] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the competitor; default: the name.")] = None,
     author: Annotated[str, typer.Option(help="Who hands it in.")] = "-",
     jobs: Jobs = 1,
 ) -> None:
@@ -116,7 +116,7 @@ def verify_file(
     if source is not None:
         held = read_submission(file)[0].competitor
         if not isinstance(held, Source):
-            raise ValueError(f"{file} holds no source code")
+            raise ValueError(f"{file} contains no source code")
         write_text(source, held.text)
         console.print(f"source code in {source}, its class {held.name}", soft_wrap=True)
         return

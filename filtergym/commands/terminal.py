@@ -125,9 +125,9 @@ Trust = Annotated[
         "--trust", help="Load files and modules that can execute code: you made them, or know who did."
     ),
 ]
-Control = Annotated[str | None, typer.Option(help="Demand this control.")]
+Control = Annotated[str | None, typer.Option(help="Control of all policies.")]
 TrainedControl = Annotated[
-    str | None, typer.Option(help="What the agent steers; default: the environment's first.")
+    str | None, typer.Option(help="Control of the agent; default: the environment's first.")
 ]
 Parameters = Annotated[
     list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
@@ -136,27 +136,25 @@ TruthOption = Annotated[
     Path | None,
     typer.Option(
         "--truth",
-        help="Of a recording in tables: the truth in a file of its own (CSV, .pos), matched by time; a note says how "
-        "much of it has one.",
+        help="Of a recording in tables: the truth in a file of its own (CSV, .pos), matched by time; a note reports "
+        "the share of measurements with a truth.",
     ),
 ]
 RenameOption = Annotated[
     str | None,
     typer.Option(
         "--rename",
-        help="What columns of a table are, where they have other names: 't=time,pos=x'. One column may be several: "
+        help="Meaning of renamed columns of a table: 't=time,pos=x'. One column may be several: "
         "'accuracy=sigma_x,accuracy=sigma_y'; 'speed=-' ignores one.",
     ),
 ]
 SortOption = Annotated[bool, typer.Option("--sort", help="Sort the rows of a table by time.")]
-TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
-Speeds = Annotated[
-    str, typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest.")
-]
+TruthOffset = Annotated[float, typer.Option(help="Offset that is added to the times of --truth, s.")]
+Speeds = Annotated[str, typer.Option(help="Of recordings: lowest and highest possible speed, m/s.")]
 Backend = Annotated[
     str,
     typer.Option(
-        help="What computes the steps: auto, compiled (with filtergym[fast]) or numpy.",
+        help="Implementation of the steps: auto, compiled (with filtergym[fast]) or numpy.",
         autocompletion=one_of("auto", "compiled", "numpy"),
     ),
 ]

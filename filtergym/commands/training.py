@@ -87,7 +87,7 @@ def open_runs(
         run = training_run.open_run(folder, asked, begun)
         if begun and not run.is_complete and options.algorithm not in THROUGH_THE_FILTER:
             training_run.check_trust(
-                f"{folder} goes on from a checkpoint that is loaded with pickle", session.trust
+                f"{folder} continues from a checkpoint that is loaded with pickle", session.trust
             )
         found.append(_training(run, replace(session, folder=folder, resume=begun)))
     return found
@@ -184,7 +184,7 @@ def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> N
     agents = [best_agent(training.folder) for training in opened]
     trust = opened[0].session.trust
     if any(agent.suffix != ".safetensors" for agent in agents) and not trust:
-        console.print("an agent that plain arrays cannot hold is compared with --trust only")
+        console.print("an agent that is not stored as plain arrays is compared with --trust only")
         return
     names = [str(training.folder) for training in opened]
     found = standing.measure_standing(runs[0], dict(zip(names, agents, strict=True)), trust)

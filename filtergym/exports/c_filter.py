@@ -245,10 +245,11 @@ class FilterText:
     # --- files
 
     def header(self, notes: Sequence[str] = ()) -> str:
+        """Return the text of the header."""
         own, scalar, structs = self.name, self.scalar, self.structs
         guard = f"{own.upper()}_H"
         listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
-        remembered = f"{self.scalar.name} network[{self.memory}]; /* what the network remembers */"
+        remembered = f"{self.scalar.name} network[{self.memory}]; /* memory of the network */"
         memory = [remembered] if self.memory else []
         timed = "interval" in structs["measurement"].places.values()
         predicts = (
@@ -266,8 +267,8 @@ class FilterText:
             ),
             "update": (
                 f"Takes in a measurement: {predicts}, and updates. The members of the measurement state what was "
-                "received, as in the environment. Returns what became of it; the state stays as it was where a "
-                "measurement is rejected or refused, and the estimate is then of no use.",
+                "received, as in the environment. Returns the result; the state stays as it was where a "
+                "measurement is rejected or refused, and the estimate is then invalid.",
                 ("state", "measurement", "estimate"),
             ),
         }
@@ -278,21 +279,21 @@ class FilterText:
             struct_text(structs["initial"], scalar, "The estimate at the start of a track."),
             struct_text(structs["parameters"], scalar, parameter_words(self.traced.free)),
             *([f"extern const {own}_parameters {own}_defaults;\n"] if self.traced.free.declared else []),
-            struct_text(structs["measurement"], scalar, "What the sensors say at one time."),
-            struct_text(structs["estimate"], scalar, f"What is estimated of it. Components: {listed}."),
+            struct_text(structs["measurement"], scalar, "Measurement of the sensors at one time."),
+            struct_text(structs["estimate"], scalar, f"Estimate. Components: {listed}."),
             struct_text(
                 structs["state"],
                 scalar,
-                "What is kept from one measurement to the next, one struct for each track; members are named by what "
-                "leads to them in the filter. Copy it to save it.",
+                "State between two measurements, one struct for each track; members are named by the attributes that "
+                "lead to them in the filter. Copy it to save it.",
                 memory,
             ),
         ]
         statuses = ("TAKEN", "MISSED", "REJECTED", "REFUSED")
         text.append(
             comment(
-                "What became of a measurement: taken in; missed, nothing was received; rejected, the estimate would be "
-                f"no number; refused, {refused}."
+                "Result of a measurement: taken in; missed, nothing was received; rejected, the estimate would not be "
+                f"finite; refused, {refused}."
             )
             + "\nenum { "
             + ", ".join(f"{own.upper()}_{name} = {i}" for i, name in enumerate(statuses))
@@ -308,9 +309,9 @@ class FilterText:
         """Return the text of the source."""
         parts = [
             comment(
-                "See the header. A loop goes over the members of array operations, k is the member; tables, whose names end "
-                "in at and a number, contain their places. The array w passes values from one loop to another. A comment "
-                "names the functions whose operations the loops below it have."
+                "See the header. A loop goes over the members of array operations, k is the member; tables, whose names "
+                "end in at and a number, contain their places. The array w passes values from one loop to another. A "
+                "comment names the functions whose operations the loops below it have."
             ),
             f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
             helper_functions([self.traced.start, self.traced.update], self.scalar),

@@ -303,7 +303,7 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
         *([meaning] if (meaning := array_meanings(request.problem.task).measurement) else []),
         f"Made by: {command}" if command else "Made by filtergym.",
         "",
-        "No allocation, nothing but math.h. Compare it with the filter that was judged:",
+        "No allocation, nothing but math.h. Compare it with the evaluated filter:",
         f"    cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test",
         "Estimates from a table of measurements:",
         f"    cc -std=c99 -O2 main.c {own}.c -lm -o run && ./run measurements.csv",
@@ -329,10 +329,10 @@ def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
         f"{figures.difference:.1e} of the standard deviations that it reports.",
     ]
     if figures.test:
-        notes.append(f"Compiled where it was made: {figures.test}.")
+        notes.append(f"Compiled on export: {figures.test}.")
     if figures.replaced:
         listed = ", ".join(f"{value:g}" for value in figures.replaced)
-        notes.append(f"Constants that float does not have, replaced by the nearest that it has: {listed}.")
+        notes.append(f"Constants that float cannot represent, replaced by the nearest ones: {listed}.")
     return notes
 
 
