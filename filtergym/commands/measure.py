@@ -170,7 +170,8 @@ def evaluate_policies(
     time_limit: Annotated[
         float,
         typer.Option(
-            help="Limit for each estimate of programs, isolated estimators and, on Linux with --jobs 1, any module:Class, s."
+            help="Limit for each estimate of programs, isolated estimators and, on Linux with --jobs 1, any "
+            "module:Class, s."
         ),
     ] = 10.0,
     memory_limit: Annotated[
@@ -184,7 +185,8 @@ def evaluate_policies(
     why: Annotated[
         list[str] | None,
         typer.Option(
-            help="Competitor whose cost is explained; repeat for several; default: yours, the first --policy, else the paper's "
+            help="Competitor whose cost is explained; repeat for several; default: yours, the first --policy, else the "
+            "paper's "
             "algorithm.",
             autocompletion=complete_policy,
         ),

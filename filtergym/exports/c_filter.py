@@ -309,8 +309,8 @@ class FilterText:
         """Return the text of the source."""
         parts = [
             comment(
-                "See the header. A loop goes over the members of array operations, k is the member; tables, whose names "
-                "end in at and a number, contain their places. The array w passes values from one loop to another. A "
+                "See the header. A loop goes over the members of array operations, k is the member; tables, whose "
+                "names end in at and a number, contain their places. The array w passes values from loop to loop. A "
                 "comment names the functions whose operations the loops below it have."
             ),
             f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
