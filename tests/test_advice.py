@@ -352,9 +352,9 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
     assert found.rival == found.advised.name == "true"
     lines = list(advice_lines(found, []))
     assert lines[0].startswith(
-        "Take true, as it is shipped: nothing that was fitted predicts better beyond chance"
+        "Take true, as it is shipped: no fitted filter predicts better beyond chance"
     )
-    assert any(line.startswith(f"Of what was fitted {found.fitted.name} comes closest") for line in lines)
+    assert any(line.startswith(f"Of the fitted filters {found.fitted.name} comes closest") for line in lines)
     for high, sure in ((-0.1, True), (0.1, False)):
         fitted = found.fitted._replace(relative_error=IntervalEstimate(-0.2, -0.3, high))
         said = next(iter(advice_lines(found._replace(fitted=fitted), [])))

@@ -27,7 +27,7 @@ STRONGEST = 4
 
 
 class Comparison(NamedTuple):
-    """What the page shows of one environment."""
+    """The shown results of one environment."""
 
     environment: str
     grids: list[Grid]
@@ -35,11 +35,11 @@ class Comparison(NamedTuple):
 
 
 def compared_policies(measured: BenchmarkRecords) -> list[str]:
-    """Return the names that the page shows, of those in the records, in the order of its columns.
+    """Return the names on the page, among those in the records, in the order of its columns.
 
-    Learned agents; what costs least of all others in the training distribution, of any control and kind; the paper's
+    Learned agents; the cheapest of all others in the training distribution, of any control and kind; the paper's
     algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
-    stand in the records. On a narrow screen only the first columns are seen without scrolling.
+    are in the records. A narrow screen shows only the first columns without scrolling.
     """
     problem, records = measured
     known, paper = problem.baselines, measured.paper
@@ -56,12 +56,12 @@ def compared_policies(measured: BenchmarkRecords) -> list[str]:
 
 
 def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
-    """Return the records of one scenario over all times, as the tables look for them."""
+    """Return the records of one scenario over all times, by competitor, metric and component."""
     return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Cost against the paper's algorithm, lost tracks, means, ANEES and time of a competitor in one scenario."""
+    """Return cost against the paper's algorithm, lost tracks, means, ANEES and time of a competitor in one scenario."""
     values = _by_name(records)
     return [
         with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),
@@ -72,7 +72,9 @@ def _cells(name: str, records: Sequence[Record]) -> list[str]:
 
 
 def summary(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Return the best of every origin on the training distribution of each environment, and the reference."""
+    """Return a table of the best of every origin on the training distribution of each environment, and the
+    reference.
+    """
     rows = []
     for problem, every in found:
         reference, learned = problem.baselines.score_reference, pretrained_agents(problem.id)
@@ -109,7 +111,7 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def harm(found: Sequence[BenchmarkRecords]) -> Grid:
-    """The scenario in which each learned agent stands worst against the paper's algorithm."""
+    """Return a table of the scenario in which each learned agent is worst against the paper's algorithm."""
     rows = []
     for problem, records in found:
         for name in pretrained_agents(problem.id):
@@ -133,8 +135,8 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Return the whose covariance does not fit the errors on the training distribution, of all ranked but random
-    actions.
+    """Return a table of the competitors whose covariance does not fit the errors on the training distribution, of all
+    ranked but random actions.
     """
     rows = []
     for measured in found:
@@ -156,10 +158,10 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
 
     Args:
         measured: the environment and its records.
-        width: of the figure, 1 or 2 columns of a paper.
+        width: width of the figure, 1 or 2 columns of a paper.
 
     Raises:
-        ValueError: if the paper's algorithm, or what is compared with it, is not among the records.
+        ValueError: if the paper's algorithm, or its opponents, are not among the records.
     """
     problem, records = measured
     cls, known = problem.task, problem.baselines
@@ -259,7 +261,7 @@ def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
 
 
 def _two_lines(record: Record | None, scale: float) -> str:
-    """Value above interval, so that columns stay narrow."""
+    """Return the value above its interval, so that columns stay narrow."""
     # Percentages to a hundredth: what is smaller is rounding.
     negligible = 0.005 if scale == 100.0 else 0.0
     shown = with_interval(record, scale, negligible=negligible)
@@ -281,7 +283,7 @@ def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
 
 
 def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
-    """Return the sentences and tables of one environment, with the command that made the records."""
+    """Return the sentences and tables of one environment, with the command of the records."""
     records, paper = measured.records, measured.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})

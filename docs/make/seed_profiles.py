@@ -37,13 +37,13 @@ Scores = Mapping[str, Mapping[str, numpy.ndarray]]
 
 
 def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] = ()) -> Scores:
-    """Return the scores of all runs in the environments that every algorithm has runs in.
+    """Return the scores of all runs in the environments in which every algorithm has runs.
 
-    What is around an agent, a gate or a policy that it corrects, is not told apart.
+    Agents are not distinguished by a gate or by a policy that they correct.
 
     Args:
-        records: of training seeds; the scores are those of their first scenario, the training distribution.
-        algorithms: whose; default: all.
+        records: records of training seeds; the scores are those of their first scenario, the training distribution.
+        algorithms: names of algorithms; default: all.
 
     Raises:
         ValueError: if there is no such algorithm, or no environment that all of them have.
@@ -76,7 +76,7 @@ def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndar
 
     Args:
         counts: runs of each environment.
-        resamples: of the bootstrap.
+        resamples: number of resamples of the bootstrap.
     """
     each = [Bootstrap(count, resamples, seed).weights for seed, count in enumerate(counts)]
     return numpy.concatenate(each, axis=1) / len(counts)
@@ -87,7 +87,7 @@ def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.n
 
     Args:
         scores: ``(runs,)``.
-        weights: that sum up to one, ``(n, runs)``.
+        weights: weights that sum to one, ``(n, runs)``.
     """
     order = numpy.argsort(scores)
     ends = numpy.cumsum(weights[:, order], axis=1)

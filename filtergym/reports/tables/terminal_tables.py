@@ -188,9 +188,9 @@ def results_tables(
 Columns = Mapping[str, Callable[[str], str]]
 """Cells of each competitor, by the title of the column."""
 COST_NOTE = (
-    "cost is the geometric mean of the ratios of the episodes' costs, which no single episode owns; means that of the "
-    "mean costs, which few lost tracks may rule. A track is lost where an episode's mean cost is beyond the bound of "
-    "the environment."
+    "cost is the geometric mean of the ratios of the episodes' costs, which no single episode dominates; means "
+    "that of the mean costs, which few lost tracks may dominate. A track is lost where an episode's mean cost is "
+    "beyond the bound of the environment."
 )
 MEAN_COST_NOTE = "cost is the mean cost of a measurement."
 RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."

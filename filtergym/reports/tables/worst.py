@@ -70,7 +70,7 @@ def opponent_in(records: Sequence[Record], name: str) -> str:
 def worst_figures(
     worst: Mapping[str, Sequence[WorstTrack]], phrases: Mapping[str, str], columns: int
 ) -> Iterator[tuple[str, Any]]:
-    """Draw the worst episodes of each competitor: the name of a file, and the figure.
+    """Draw the worst episodes of each competitor; yield the name of a file, and the figure.
 
     Args:
         worst: episodes from :func:`find_worst`.

@@ -40,7 +40,7 @@
     return `rgba(${r},${g},${b},0.16)`;
   };
 
-  // --- lines with bands; those that nobody can tell apart are drawn once, with all their names
+  // --- lines with bands; indistinguishable ones are drawn once, with all their names
 
   function together(lines, of, [bottom, top], log) {
     const kept = [], at = (y) => log ? Math.log10(y) : y;
@@ -66,7 +66,7 @@
     return [low, high > low ? high : low + 1];
   }
 
-  // A band tells something where it is narrow on the axis; wide ones hide each other and the lines.
+  // A band is informative where it is narrow on the axis; wide ones hide each other and the lines.
   function isNarrow({ low, high }, [bottom, top], log) {
     const at = (y) => Math.min(Math.max(log ? Math.log10(Math.max(y, 1e-30)) : y, bottom), top);
     const widths = high.map((y, i) => y === null || low[i] === null ? 0 : at(y) - at(low[i]));
@@ -128,7 +128,7 @@
       const names = curves.words("policy"), share = curves.numbers("share");
       const drawn = traces(lines, [], (line) => ({ mid: curves.row("error_exceeded", names.indexOf(line.name), i) }), null, true);
       for (const trace of drawn) [trace.x, trace.y, trace.hovertemplate] = [trace.y, share, "%{y:.3g} of measurements above %{x:.4g}" + trace.hovertemplate.slice(trace.hovertemplate.indexOf("<extra>"))];
-      // Tiny errors are told apart by nobody.
+      // Tiny errors are indistinguishable.
       const sizes = drawn.flatMap(({ x }) => x.filter((size, k) => size > 0 && share[k] < 0.9)), largest = Math.max(...drawn.flatMap(({ x }) => x));
       const range = [Math.log10(Math.min(...sizes) || 1), Math.log10(largest || 1) + 0.05];
       return [drawn, layout({ xaxis: { title: { text: `error of ${words(name)}, ${plain(curves.words("unit")[i])}` }, ...logarithmic, range }, yaxis: { title: { text: "share of measurements above" }, type: "log", exponentformat: "power", dtick: 1 } })];
@@ -153,7 +153,7 @@
           const varies = (line) => { const values = curves.row(variable, curves.words("policy").indexOf(line.name), ...indices).filter((y) => y !== null); return values.some((y) => Math.abs(y - values[0]) > 1e-6); };
           return { moving: cell.lines.filter(varies).length, choice: [title, () => overTime(cell, variable, indices, title, axis)] };
         }));
-      // What nobody moves is no picture; what most of them move comes first.
+      // An action that no competitor changes has no picture; the one that most change comes first.
       return found.filter(({ moving }) => moving).sort((a, b) => b.moving - a.moving).map(({ choice }) => choice);
     },
   };
@@ -180,7 +180,7 @@
         marker: { color: style.color, size: single ? 8 : 7, symbol: { learned: "diamond", reference: "square-open", estimator: "triangle-up", yours: "cross" }[line.origin] || "circle" },
         error_x: { type: "data", symmetric: false, array: high, arrayminus: low, color: style.color, thickness: 1.2, width: 0 } };
     });
-    // Beyond three times the paper's cost a point is on the edge: near zero is where they are told apart.
+    // Beyond three times the paper's cost a point is on the edge: near zero is where they differ visibly.
     const ends = drawn.flatMap(({ x, error_x }) => x.flatMap((value, i) => [value - error_x.arrayminus[i], value + error_x.array[i]]));
     const range = [Math.max(-100, Math.min(...ends, 0) * 1.05 - 3), Math.min(200, Math.max(...ends, 5) * 1.05 + 3)];
     const beyond = drawn.filter(({ x }) => x.some((value) => value > range[1])).map(({ name }) => name);
@@ -199,7 +199,7 @@
 
   function frontOf(points, paper) {
     const ranked = points.filter(([, origin]) => origin !== "reference"), reference = points.find(([, origin]) => origin === "reference");
-    // Beyond twice the paper's cost is nobody on the front.
+    // Beyond twice the paper's cost no competitor is on the front.
     const most = Math.min(100, Math.max(5, ...ranked.map(([, , , cost]) => cost)));
     const top = Math.max(most, ...ranked.filter(([, origin]) => origin === "yours").map(([, , , cost]) => cost)), shown = ranked.filter(([, , , cost]) => cost <= top);
     const steps = shown.filter(([, , , , , on]) => on).sort((a, b) => a[2] - b[2]), times = shown.map(([, , time]) => time);
@@ -401,7 +401,7 @@
   const linked = location.hash && document.getElementById(location.hash.slice(1));
   if (linked && linked.matches("details.cell")) linked.open = true;
 
-  // A table that is wider than its place says so.
+  // A table that is wider than its place is marked.
   const places = new ResizeObserver((seen) => seen.forEach(({ target }) => target.classList.toggle("scrolls", target.scrollWidth > target.clientWidth + 1)));
   for (const place of document.querySelectorAll(".table")) places.observe(place);
 
