@@ -1,5 +1,5 @@
 # Two commands do everything on a machine with Python >= 3.11: `make benchmark` and `make test`.
-# What Python has compiled of the sources serves the other processes and the next run.
+# Compiled Python files serve the other processes and the next run.
 unexport PYTHONDONTWRITEBYTECODE
 PYTHON ?= python3
 # Processes of `make benchmark`; each takes up to half a GB.
@@ -36,10 +36,10 @@ DISTRIBUTIONS := build/distributions
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
 
-test: $(VENV)/.dev  ## run the tests of code, without what only whole programs show
+test: $(VENV)/.dev  ## run the tests of code, without tests of whole programs
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not claims"
 
-claims: $(VENV)/.dev  ## test what is said of results: tables, rankings, limits, records
+claims: $(VENV)/.dev  ## test the statements on results: tables, rankings, limits, records
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "claims and not slow"
 
 test-slow: $(VENV)/.dev  ## run whole programs: pages, recipes, reproductions, a browser, clusters

@@ -486,7 +486,7 @@ def test_source_runs_only_when_it_is_trusted(trap, edited, command):
         content["competitor"]["text"] = SPRING.format(str(trap)) + MINE
 
     path = edited("source", spring)
-    assert "holds source code, and to verify it is to execute it" in refused(command, path)
+    assert "contains source code, which a verification executes" in refused(command, path)
     code, shown, _ = command("verify", path, "--source", "read_me.py")
     assert code == 0
     assert "its class Mine" in shown

@@ -3,7 +3,7 @@
     filtergym list inverted_pendulum:mine/InvertedPendulum-v0
     filtergym evaluate inverted_pendulum:mine/InvertedPendulum-v0 --policy kalman --policy matching --policy known-gusts
 
-Gusts push the pendulum, sometimes hard and sometimes hardly, and nobody says when. A sensor reads the angle. The
+Gusts of unknown, changing strength push the pendulum. A sensor reads the angle. The
 torque follows from the estimate, so the loop is closed; the action scales the process noise of the filter.
 """
 
@@ -65,7 +65,7 @@ class Truth(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What the sensor says, and the torque that is known because it was commanded."""
+    """The sensor's reading, and the torque, which is known because it was commanded."""
 
     angle: Array
     """rad, ``(1, N)``; its variance is ``angle_sigma`` squared."""
@@ -81,7 +81,7 @@ class PendulumWorld(World[Task, Truth, Measurement]):
     normals = 2
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Nearly upright and nearly at rest; everyone starts at zero."""
+        """Start nearly upright and nearly at rest; all estimates start at zero."""
         p, xp = self.parameters, self.xp
         levels = xp.stack(
             [draws.log_uniform(name, p.gust_levels) for name in ("level before", "level after")]
@@ -124,7 +124,7 @@ class Filter(NamedTuple):
     mean: Array
     """Predicted with the nominal noise after ``predict``, estimated after ``act``, ``(2, N)``."""
     covariance: Array
-    """Likewise, ``(2, 2, N)``; predicted without process noise."""
+    """Covariance of the mean, ``(2, 2, N)``; predicted without process noise."""
     nis: Array
     """Normalised innovation squared, with the process noise of the last action, ``(N,)``."""
     innovation: Array
@@ -141,16 +141,21 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What the agent is shown."""
+        """Return the observation blocks of the agent."""
         decades = self.parameters.noise_decades * math.log(10.0)
         return (
             Block("innovation", lambda f, _: f.innovation, "innovation over its sigma", shown=SIGNED_LOG),
             Block("nis", lambda f, _: f.nis, "normalised innovation squared", shown=LOG1P),
-            Block("last_action", lambda f, _: self.xp.log(f.scale) / decades, "action applied before", shown=ACTION),
+            Block(
+                "last_action",
+                lambda f, _: self.xp.log(f.scale) / decades,
+                "action applied before",
+                shown=ACTION,
+            ),
         )
 
     def start(self, initial: Initial) -> Filter:
-        """Start where everyone starts."""
+        """Start at the common initial estimate."""
         zero = 0.0 * initial.mean[0]
         return Filter(initial.mean, initial.covariance, zero, zero, zero + 1.0)
 
@@ -164,7 +169,7 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         return Filter(mean, covariance, innovation * innovation, innovation, state.scale)
 
     def act(self, state: Filter, measurement: Measurement, action: Array) -> Filter:
-        """Update with the process noise that the action asks for."""
+        """Update with the process noise of the action."""
         task = self.task
         scale = self.xp.exp(
             self.parameters.noise_decades * math.log(10.0) * self.xp.clip(action[0], -1.0, 1.0)
@@ -235,7 +240,7 @@ class Matching(Policy):
 
 
 class KnownGusts:
-    """The Kalman filter that is told the strength of the gusts."""
+    """The Kalman filter that knows the strength of the gusts."""
 
     kind = "reference"
     knows = "the factor on the gusts at every moment"
@@ -244,7 +249,7 @@ class KnownGusts:
         self.task = task
 
     def start(self, initial: Initial, truth: Truth) -> Initial:
-        """Start where everyone starts."""
+        """Start at the common initial estimate."""
         return initial
 
     def update(self, memory: Initial, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Initial]:
