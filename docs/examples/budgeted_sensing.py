@@ -239,9 +239,7 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
             for table, result in zip(track, (steady, thrust), strict=True):
                 end = place + table.probability.shape[0]
                 found = AgedHypotheses(result.mean, result.covariance, weights[place:end])
-                after.append(
-                    AgedHypotheses(*(xp.where(seen, a, b) for a, b in zip(found, table, strict=True)))
-                )
+                after.append(AgedHypotheses(*(xp.where(seen, a, b) for a, b in zip(found, table, strict=True))))
                 place = end
             tracks.append(Track(*after))
         return self._together(tuple(tracks), xp.where(looked > 0.0, 0.0 * state.waited, state.waited))

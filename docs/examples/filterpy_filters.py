@@ -77,19 +77,10 @@ class Unscented(FilterpyEstimator):
 def coordinated_turn(x, T):
     """The state after T seconds of a turn at constant rate; (sin wT)/w and (1 - cos wT)/w without dividing by zero."""
     _, vx, _, vy, w = x
-    along, across = (
-        T * numpy.sinc(w * T / numpy.pi),
-        T * numpy.sin(w * T / 2) * numpy.sinc(w * T / (2 * numpy.pi)),
-    )
+    along, across = T * numpy.sinc(w * T / numpy.pi), T * numpy.sin(w * T / 2) * numpy.sinc(w * T / (2 * numpy.pi))
     c, s = numpy.cos(w * T), numpy.sin(w * T)
     return numpy.array(
-        [
-            x[0] + along * vx - across * vy,
-            c * vx - s * vy,
-            x[2] + across * vx + along * vy,
-            s * vx + c * vy,
-            w,
-        ]
+        [x[0] + along * vx - across * vy, c * vx - s * vy, x[2] + across * vx + along * vy, s * vx + c * vy, w]
     )
 
 

@@ -146,12 +146,7 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         return (
             Block("innovation", lambda f, _: f.innovation, "innovation over its sigma", shown=SIGNED_LOG),
             Block("nis", lambda f, _: f.nis, "normalised innovation squared", shown=LOG1P),
-            Block(
-                "last_action",
-                lambda f, _: self.xp.log(f.scale) / decades,
-                "action applied before",
-                shown=ACTION,
-            ),
+            Block("last_action", lambda f, _: self.xp.log(f.scale) / decades, "action applied before", shown=ACTION),
         )
 
     def start(self, initial: Initial) -> Filter:

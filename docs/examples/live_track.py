@@ -15,18 +15,14 @@ filter.start(
 plots = [(4.0, 20_310.0, 30_640.0), (8.0, 19_550.0, 30_830.0), (12.0, None, None), (15.9, 18_160.0, 31_120.0)]
 for time, x, y in plots:
     estimate = filter.update(time, x=x, y=y)  # a scan that missed the target has neither
-    print(
-        f"{time:5.1f} s  x {estimate['position_x']:.0f} m ± {estimate.sigma[0]:.0f}, NIS {estimate.nis:.2f}"
-    )
+    print(f"{time:5.1f} s  x {estimate['position_x']:.0f} m ± {estimate.sigma[0]:.0f}, NIS {estimate.nis:.2f}")
 
 print("in five seconds:", filter.predict(20.9))
 
 state = pickle.dumps(filter.save())  # to a file, or to another process
 again = filtergym.online("filtergym/ManeuveringTarget-v0", "kalman-imm-turn", sampling_interval=4.0)
 again.restore(pickle.loads(state))
-assert (
-    again.update(20.0, x=17_480.0, y=31_300.0).mean == filter.update(20.0, x=17_480.0, y=31_300.0).mean
-).all()
+assert (again.update(20.0, x=17_480.0, y=31_300.0).mean == filter.update(20.0, x=17_480.0, y=31_300.0).mean).all()
 
 # Many tracks side by side: the tracks are the last axis, and a new one takes the place of another.
 many = filtergym.online("filtergym/ManeuveringTarget-v0", "imm", tracks=2)

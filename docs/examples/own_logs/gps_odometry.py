@@ -12,9 +12,7 @@ Drone = filtergym.state_space(
     diffusion=np.diag([0, 0, 1.0, 1.0]),
     sensors={
         "gps": Sensor([[1, 0, 0, 0], [0, 1, 0, 0]], np.diag([25.0, 25.0]), interval=1.0, names=("x", "y")),
-        "odometry": Sensor(
-            [[0, 0, 1, 0], [0, 0, 0, 1]], np.diag([0.25, 0.25]), interval=0.1, names=("x", "y")
-        ),
+        "odometry": Sensor([[0, 0, 1, 0], [0, 0, 0, 1]], np.diag([0.25, 0.25]), interval=0.1, names=("x", "y")),
     },
     mean=[0, 0, 0, 0],
     covariance=np.diag([100.0, 100.0, 25.0, 25.0]),

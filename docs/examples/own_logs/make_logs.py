@@ -41,9 +41,7 @@ def level_gauge(rng, days=10):
     offset = rng.normal(0.0, 0.05) + np.cumsum(rng.normal(0.0, 0.03 / np.sqrt(1440), n))  # 3 cm after a day
     times = np.cumsum(rng.exponential(600.0, 3 * n // 10).astype(int) // 60 + 1)
     times = times[times < n]
-    dipped = np.array(
-        [(k // 720) != (k_before // 720) for k, k_before in zip(times[1:], times, strict=False)]
-    )
+    dipped = np.array([(k // 720) != (k_before // 720) for k, k_before in zip(times[1:], times, strict=False)])
     stick = np.where(np.append(False, dipped), level[times] + rng.normal(0.0, 0.01, len(times)), np.nan)
     return {
         "time": times * dt, "gauge": level[times] + offset[times] + rng.normal(0.0, 0.02, len(times)), "stick": stick,
@@ -113,12 +111,7 @@ def late_vision(rng, seconds=20, dt=0.01):
     }  # fmt: skip
 
 
-MACHINES = {
-    "gps_odometry": gps_odometry,
-    "level_gauge": level_gauge,
-    "pitch_roll": pitch_roll,
-    "battery": battery,
-}
+MACHINES = {"gps_odometry": gps_odometry, "level_gauge": level_gauge, "pitch_roll": pitch_roll, "battery": battery}
 MACHINES["late_vision"] = late_vision
 JUDGED = 10
 
@@ -133,7 +126,9 @@ def write_logs(folder, machines=MACHINES):
                 log = MACHINES[name](np.random.default_rng([seed, len(name)]))
                 lines = lines or [",".join(["recording", *log])]
                 rows = zip(*(column.tolist() for column in log.values()), strict=True)
-                lines += [",".join([str(seed), *("" if x != x else f"{x:.9g}" for x in row)]) for row in rows]
+                lines += [
+                    ",".join([str(seed), *("" if x != x else f"{x:.9g}" for x in row)]) for row in rows
+                ]
             (folder / f"{file}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -13,11 +13,7 @@ def begin(hello, initial):
     models = []
     for _ in range(2):
         model = KalmanFilter(4, 2)
-        model.x, model.P, model.H = (
-            numpy.array(initial["mean"]),
-            numpy.array(initial["covariance"]),
-            numpy.eye(2, 4),
-        )
+        model.x, model.P, model.H = numpy.array(initial["mean"]), numpy.array(initial["covariance"]), numpy.eye(2, 4)
         models.append(model)
     imm = IMMEstimator(models, (0.5, 0.5), numpy.array([[0.9, 0.1], [0.1, 0.9]]))
 
