@@ -541,9 +541,9 @@ def test_what_is_told_the_truth_is_refused(edited, command):
     def name(content):
         content["competitor"]["name"] = "known-turn"
 
-    assert "holds a reference" in refused(command, edited("shipped", name))
+    assert "names a reference" in refused(command, edited("shipped", name))
     assert (
-        "holds a reference"
+        "names a reference"
         in command("submit", ID, "known-turn", "--protocol", "trial", "--out", "x.json")[2]
     )
 
@@ -563,13 +563,13 @@ def test_what_is_packed_or_large_is_refused(command, tmp_path):
     packed = tmp_path / "bomb.json"
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("../../outside.py", b"0" * 10_000_000)
-    assert "holds no submission" in refused(command, packed)
+    assert "contains no submission" in refused(command, packed)
     large = tmp_path / "large.json"
     with large.open("wb") as file:
         file.truncate(100 * MOST_BYTES)  # takes no room on the disk
     assert "is larger than 8 MB" in refused(command, large)
     (tmp_path / "deep.json").write_bytes(b'{"card":' + b'{"title":' * 100_000)
-    assert "holds no submission" in refused(command, tmp_path / "deep.json")
+    assert "contains no submission" in refused(command, tmp_path / "deep.json")
     (tmp_path / "named.json").write_text(json.dumps({"x" * 10_000: 0}))
     assert len(refused(command, tmp_path / "named.json")) < 1000
     assert "there is no file" in refused(command, tmp_path / "none.json")
@@ -594,7 +594,7 @@ def test_damaged_files_end_in_a_sentence(honest, tmp_path):
 
 @pytest.mark.parametrize("title", ["\x1b[2J", "<script>", "[x](y)", "", "x" * 81, "a\n"])
 def test_a_title_is_words(title, edited, command):
-    assert "holds no submission" in refused(command, edited("agent", lambda c: c["card"].update(title=title)))
+    assert "contains no submission" in refused(command, edited("agent", lambda c: c["card"].update(title=title)))
     if title:  # without one it is the name
         code, _, errors = command(
             "submit", ID, "imm", "--protocol", "trial", "--out", "x.json", "--title", title
