@@ -230,8 +230,7 @@ def _model_of(env: Any) -> Any:
     if inner.privileged:
         raise ValueError(
             "this environment shows the truth, which a policy may not observe: make it without "
-            "observation='asymmetric', "
-            "or show a policy of your own observation['observation']"
+            "observation='asymmetric', or show a policy of your own observation['observation']"
         )
     if inner.fleet.mixes_scenarios:
         raise ValueError(

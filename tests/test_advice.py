@@ -492,4 +492,4 @@ def test_starts_that_disagree_and_parameters_at_a_limit_are_said(advice):
         interval = fitting.Interval(*ends, value == low, value == high)
         found = two_hills._replace(values=values, at_limit=at_limit)
         line = next(parameter_lines(tunable, found, {"log10_acceleration": interval}))
-        assert f"at the {side} limit of the search, the log says {bound}" in line
+        assert f"at the {side} limit of the search, the log supports {bound}" in line

@@ -289,7 +289,7 @@ def test_what_an_estimator_raises_is_told_with_its_own_line(command, monkeypatch
 
 def test_a_name_that_is_taken_is_refused():
     for name in ("imm", "kalman-imm", "known-turn", "imm-tuned", "bptt"):
-        with pytest.raises(ValueError, match=f"'{name}' is the name of what {ID} has already"):
+        with pytest.raises(ValueError, match=f"'{name}' is already a name of {ID}"):
             filtergym.evaluate(ID, {name: Start}, episodes=2, horizon=3)
 
 
