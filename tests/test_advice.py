@@ -351,9 +351,7 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
     found = advise(FittedLog(PROBLEM, recording), {**shipped, "true": true})
     assert found.rival == found.advised.name == "true"
     lines = list(advice_lines(found, []))
-    assert lines[0].startswith(
-        "Take true, as it is shipped: no fitted filter predicts better beyond chance"
-    )
+    assert lines[0].startswith("Take true, as it is shipped: no fitted filter predicts better beyond chance")
     assert any(line.startswith(f"Of the fitted filters {found.fitted.name} comes closest") for line in lines)
     for high, sure in ((-0.1, True), (0.1, False)):
         fitted = found.fitted._replace(relative_error=IntervalEstimate(-0.2, -0.3, high))

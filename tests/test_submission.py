@@ -594,7 +594,9 @@ def test_damaged_files_end_in_a_sentence(honest, tmp_path):
 
 @pytest.mark.parametrize("title", ["\x1b[2J", "<script>", "[x](y)", "", "x" * 81, "a\n"])
 def test_a_title_is_words(title, edited, command):
-    assert "contains no submission" in refused(command, edited("agent", lambda c: c["card"].update(title=title)))
+    assert "contains no submission" in refused(
+        command, edited("agent", lambda c: c["card"].update(title=title))
+    )
     if title:  # without one it is the name
         code, _, errors = command(
             "submit", ID, "imm", "--protocol", "trial", "--out", "x.json", "--title", title
