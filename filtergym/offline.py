@@ -36,7 +36,7 @@ from .reports.tables.terminal_tables import plain_table
 CHUNK = 256
 """Number of episodes that are simulated side by side, and stored in memory until they are written."""
 RANDOM = "random"
-OF_THE_FACE = ("reward", "dtype")
+ENVIRONMENT_KEYWORDS = ("reward", "dtype")
 """Keywords of ``gymnasium.make`` that are no parameters of the task, and change the agent's observation or reward."""
 
 
@@ -129,7 +129,7 @@ class DatasetPlan(NamedTuple):
     """Policies, one for each data set."""
     names: list[str]
     """Names of the policies."""
-    of_the_face: dict[str, Any]
+    environment_keywords: dict[str, Any]
     """Keywords of ``gymnasium.make`` beside those of the policies."""
 
     @property
@@ -149,7 +149,7 @@ class DatasetPlan(NamedTuple):
         with whole_files(root) as waiting, _datasets_in(waiting):
             found = [self._write_one(i, name, progress or (lambda _: None)) for i, name in enumerate(names)]
             written = [entry for entry, _ in found]
-            _tell_scores(written, [dataset for _, dataset in found])
+            _store_scores(written, [dataset for _, dataset in found])
             for space in waiting.rglob("namespace_metadata.json"):
                 if (root / space.relative_to(waiting)).exists():  # it may say what the user has written there
                     space.unlink()
@@ -158,12 +158,12 @@ class DatasetPlan(NamedTuple):
     def _write_one(self, i: int, name: str, progress: Progress) -> tuple[DatasetSummary, Any]:
         """Write the data set of a policy; return its summary, and the data set."""
         policy, stepping, id = self.names[i], self.policies[i], self.experiment.task.id
-        made_with = {**stepping.keywords, **self.of_the_face}
+        made_with = {**stepping.keywords, **self.environment_keywords}
         dataset: Any = None
         returns: list[float] = []
         for first in range(0, len(self.seeds), CHUNK):
             seeds = self.seeds[first : first + CHUNK]
-            part = transitions_of(id, stepping, seeds, progress, **self.of_the_face)
+            part = transitions_of(id, stepping, seeds, progress, **self.environment_keywords)
             returns += [float(episode.rewards.sum()) for episode in part]
             if dataset is None:
                 about = self._description(policy, stepping.control)
@@ -211,20 +211,22 @@ def plan_datasets(
         except ValueError as error:
             raise ValueError(f"{error}, or take the split test for data to be judged on") from error
     parameters = dict(experiment.keywords)
-    of_the_face = {name: parameters.pop(name) for name in OF_THE_FACE if name in parameters}
-    check_names(cls, parameters, OF_THE_FACE)
+    environment_keywords = {name: parameters.pop(name) for name in ENVIRONMENT_KEYWORDS if name in parameters}
+    check_names(cls, parameters, ENVIRONMENT_KEYWORDS)
     chosen = list(policies or default_policies(problem, control))
     acting: list[SteppingPolicy] = []
     for policy in chosen:
-        before = acting[-1] if acting and _suits_any(find_competitor(problem, policy, trust).maker) else None
+        before = (
+            acting[-1] if acting and _has_any_control(find_competitor(problem, policy, trust).maker) else None
+        )
         own = before.control if before is not None and control is None else control
         theirs = {} if before is None else before.task_keywords
         fitting = replace(experiment, control=own, keywords={**theirs, **parameters})
         acting.append(find_policy(problem, policy, fitting, trust))
-    return DatasetPlan(experiment, seeds, acting, [str(policy) for policy in chosen], of_the_face)
+    return DatasetPlan(experiment, seeds, acting, [str(policy) for policy in chosen], environment_keywords)
 
 
-def _suits_any(maker: Any) -> bool:
+def _has_any_control(maker: Any) -> bool:
     """Return whether a policy has no control of its own."""
     return getattr(maker, "control", None) is None and getattr(maker, "action_space", None) is None
 
@@ -310,7 +312,7 @@ def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, a
         )
 
 
-def _tell_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> None:
+def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> None:
     """Store the mean returns that are 0 and 1 in ``minari.get_normalized_score``, where both are known."""
     for entry, dataset in zip(written, stored, strict=True):
         alike = [other for other in written if other.environment == entry.environment]

@@ -12,7 +12,7 @@ from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import FRONT_MARK, PYTHON_MARK, TIME_TITLE, column_of_times
 from filtergym.papers.grid import Grid, markdown_table
-from filtergym.reports.tables.ranking import HARM, ranking, ranking_sentence, who_is_best
+from filtergym.reports.tables.ranking import HARM, best_competitor, ranking, ranking_sentence
 from filtergym.reports.tables.terminal_tables import (
     HEADLINE,
     INCONSISTENT,
@@ -181,7 +181,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
     by_window = {(s, p, m, c, "all"): r for (s, p, m, c), r in found.items()}
     bounds = [name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found]
     kinds, learned = {r.policy: r.kind for r in records}, pretrained_agents(cls.id)
-    verdicts = {s: who_is_best([record for record in records if record.scenario == s]) for s in sizes}
+    verdicts = {s: best_competitor([record for record in records if record.scenario == s]) for s in sizes}
 
     times = {s: column_of_times([record for record in records if record.scenario == s]) for s in sizes}
 

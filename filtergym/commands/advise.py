@@ -39,10 +39,10 @@ from .terminal import (
     TruthOption,
     command_line,
     console,
-    pair,
+    parse_pair,
+    parse_renames,
     parse_settings,
     progress_bar,
-    renamed,
 )
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
@@ -156,10 +156,10 @@ def advise_on_log(
     found = read_recording(
         recording,
         environment,
-        speeds=pair("--speeds", speeds),
+        speeds=parse_pair("--speeds", speeds),
         truth=truth,
         truth_offset=truth_offset,
-        rename=renamed(rename),
+        rename=parse_renames(rename),
         sort=sort,
         **keywords,
     )

@@ -52,12 +52,12 @@ def _libraries() -> Iterator[tuple[str, str]]:
     requirements = [Requirement(text) for text in importlib.metadata.requires(PACKAGE) or ()]
     extras = importlib.metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()
     for extra in ("", *(name for name in extras if name not in DEVELOPMENT)):
-        wanted = [each for each in requirements if _belongs(each, extra)]
+        wanted = [each for each in requirements if _is_in_extra(each, extra)]
         found = [f"{each.name} {_version(each)}" for each in wanted]
         yield f"[{extra}]" if extra else "libraries", ", ".join(found)
 
 
-def _belongs(requirement: Requirement, extra: str) -> bool:
+def _is_in_extra(requirement: Requirement, extra: str) -> bool:
     """Return whether a requirement belongs to an extra; the empty name means the packages that are always required."""
     if requirement.marker is None:
         return not extra

@@ -47,11 +47,11 @@ from .terminal import (
     check_no_recording_options,
     command_line,
     console,
-    pair,
+    parse_pair,
+    parse_renames,
     print_sentence,
     print_table,
     progress_bar,
-    renamed,
 )
 
 LARGE = 200_000_000
@@ -140,14 +140,14 @@ def find_data(
     problem = problem_of(environment) if environment else None
     named = problem.task.scenarios if problem else {}
     if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
-        speeds = pair("--speeds", options.speeds)
+        speeds = parse_pair("--speeds", options.speeds)
         found = read_recording(
             recording or str(scenario),
             environment,
             speeds=speeds,
             truth=options.truth,
             truth_offset=options.truth_offset,
-            rename=renamed(options.rename),
+            rename=parse_renames(options.rename),
             sort=options.sort,
             **keywords,
         )
@@ -163,9 +163,9 @@ def find_data(
         return problem, scenario
     return problem, read_flights(
         scenario,
-        None if options.site is None else pair("--site", options.site),
+        None if options.site is None else parse_pair("--site", options.site),
         longest_gap=options.longest_gap,
-        speeds=pair("--speeds", options.speeds),
+        speeds=parse_pair("--speeds", options.speeds),
         fewest_scans=options.fewest_scans,
         smoothing=options.smoothing,
     )
@@ -214,11 +214,11 @@ def causal_competitors(problem: Problem, recording: Recording, agents: bool = Tr
         one
         for one in found
         if one.maker is not RandomPolicy
-        and (not one.learned or (agents and _knows_fields(problem, one.maker, recording)))
+        and (not one.learned or (agents and _has_fields(problem, one.maker, recording)))
     ]
 
 
-def _knows_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
+def _has_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
     """Return whether an agent was trained on the fields that a recording with these axes gives."""
     stored = getattr(maker, "policy", maker)
     header, control = getattr(stored, "header", None), getattr(stored, "control", None)
@@ -228,7 +228,7 @@ def _knows_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
     return {*header["fields"]} <= {field.name for field in model.fields}
 
 
-def keeps_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
+def has_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
     """Return whether estimates are stored to score their predictions: for recordings that are not huge.
 
     Args:

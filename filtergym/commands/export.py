@@ -19,13 +19,13 @@ from .terminal import (
     Trust,
     command_line,
     complete_environment,
+    complete_from,
     complete_policy,
     console,
     import_environments,
-    one_of,
-    pair,
+    parse_pair,
+    parse_renames,
     parse_settings,
-    renamed,
 )
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def export(
         typer.Option(
             help="Format: safetensors, an agent's arrays; c, a whole filter as C99; onnx, the "
             "network of an agent.",
-            autocompletion=one_of(*FORMS),
+            autocompletion=complete_from(*FORMS),
         ),
     ] = "safetensors",
     out: Annotated[
@@ -122,8 +122,8 @@ def export(
         data = read_recording(
             recording,
             problem.id,
-            speeds=pair("--speeds", speeds),
-            rename=renamed(rename),
+            speeds=parse_pair("--speeds", speeds),
+            rename=parse_renames(rename),
             sort=sort,
             **keywords,
         )

@@ -34,11 +34,11 @@ from .terminal import (
     check_no_recording_options,
     complete_policy,
     console,
-    pair,
+    parse_pair,
+    parse_renames,
+    parse_whole_numbers,
     print_table,
     progress_bar,
-    renamed,
-    whole_numbers,
 )
 from .training import open_run, open_runs, print_standing, train_runs, trainer_of
 
@@ -75,10 +75,10 @@ def tune_policy(
         found = read_recording(
             recording,
             problem.id,
-            speeds=pair("--speeds", speeds),
+            speeds=parse_pair("--speeds", speeds),
             truth=truth,
             truth_offset=truth_offset,
-            rename=renamed(rename),
+            rename=parse_renames(rename),
             sort=sort,
         )
         fit_to_recording(problem, policy, found, out, seed)
@@ -208,7 +208,7 @@ def train(
     if seeds is None:
         opened = [open_run(problem, options, session)]
     else:
-        opened = open_runs(problem, options, session, whole_numbers("--seeds", seeds))
+        opened = open_runs(problem, options, session, parse_whole_numbers("--seeds", seeds))
     with Workers(jobs, cluster) as workers:
         runs = train_runs(opened, trainer, workers)
     if compare and all(run.is_complete for run in runs):  # unless somebody wished to stop

@@ -36,7 +36,7 @@ from ..protocol import protocol_names
 from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
 from ..reports.tables.headline import headline_table
-from ..reports.tables.reasons import explained_by_default
+from ..reports.tables.reasons import default_explained
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of
 from ..reports.tables.terminal_tables import results_tables
 from ..reports.tables.worst import find_worst
@@ -48,7 +48,7 @@ from .evaluation import (
     departure_lines,
     find_data,
     find_participants,
-    keeps_predictions,
+    has_predictions,
     own_names,
     run,
     write,
@@ -76,10 +76,10 @@ from .terminal import (
     TruthOption,
     command_line,
     complete_environment,
+    complete_from,
     complete_policy,
     console,
     import_environments,
-    one_of,
     parse_settings,
     print_sentence,
     print_table,
@@ -112,7 +112,7 @@ def evaluate_policies(
         typer.Option(
             help="In place of an environment: a frozen protocol over several of them, filtergym-1, whose row can be "
             "quoted; --policy NAME, or ENVIRONMENT=NAME for one of them.",
-            autocompletion=one_of(*protocol_names()),
+            autocompletion=complete_from(*protocol_names()),
         ),
     ] = None,
     scenario: ScenarioName = None,
@@ -255,7 +255,7 @@ def evaluate_policies(
         seed,
         split,
         control,
-        tracks=estimates is not None or keeps_predictions(problem, data, names),
+        tracks=estimates is not None or has_predictions(problem, data, names),
         drawn_episodes=int(out is not None),
         backend=backend,
         threads=threads,
@@ -269,7 +269,7 @@ def evaluate_policies(
         with Workers(jobs, cluster) as workers:
             found, refusal, failures = run(requests, outputs, workers, store)
         own, paper = own_names(problem, policy or []), found.dataset.attrs["paper"]
-        explained = why or explained_by_default(found.records, [*own, *(policy or [])], paper)
+        explained = why or default_explained(found.records, [*own, *(policy or [])], paper)
         worst: dict[str, list[WorstTrack]] = {name: [] for name in explained}
         if out is not None:
             worst = find_worst(experiment, found, competitors, explained)
@@ -342,7 +342,7 @@ def write_offline(
         str,
         typer.Option(
             help="train, validation or test; only test takes held-out scenarios and flights of your own.",
-            autocompletion=one_of("train", "validation", "test"),
+            autocompletion=complete_from("train", "validation", "test"),
         ),
     ] = "train",
     settings: Annotated[

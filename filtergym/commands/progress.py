@@ -34,8 +34,8 @@ class ProgressLines:
 
     def _begin(self, description: str, total: float) -> None:
         self._description, self._total = description, total
-        self._done = self._told = 0.0
-        self._begun = self._told_at = self._clock()
+        self._done = self._reported = 0.0
+        self._begun = self._reported_at = self._clock()
 
     def __enter__(self) -> Self:
         return self
@@ -62,18 +62,18 @@ class ProgressLines:
         if description is not None and description != self._description:
             self._description = description
             self.say(description)
-        since = self._clock() - self._told_at
-        if self._total <= 0.0 or since < FEWEST_SECONDS or self._done <= self._told:
+        since = self._clock() - self._reported_at
+        if self._total <= 0.0 or since < FEWEST_SECONDS or self._done <= self._reported:
             return
-        if since >= MOST_SECONDS or self._done - self._told >= STEP * self._total:
+        if since >= MOST_SECONDS or self._done - self._reported >= STEP * self._total:
             self._write(f"{self._description}: {self._standing()}")
-            self._told_at, self._told = self._clock(), self._done
+            self._reported_at, self._reported = self._clock(), self._done
 
     def say(self, text: str) -> None:
         """Write a line of its own."""
         standing = f" ({self._standing()})" if 0.0 < self._done < self._total else ""
         self._write(f"{text}{standing}")
-        self._told_at, self._told = self._clock(), self._done
+        self._reported_at, self._reported = self._clock(), self._done
 
     def _standing(self) -> str:
         share = min(self._done / self._total, 1.0)

@@ -11,7 +11,7 @@ from ..evaluation.storage.files import writable_file, writable_folder
 from ..reports.tables.results import read_all_results
 from ..reproductions import paper_module, papers
 from .shown import REPORT, make_report, print_headline, print_outcome, report_maker
-from .terminal import Cluster, Formats, Jobs, console, one_of, progress_bar
+from .terminal import Cluster, Formats, Jobs, complete_from, console, progress_bar
 
 
 def make(
@@ -42,7 +42,7 @@ def reproduce(
         str,
         typer.Argument(
             help=f"One of: {', '.join(papers()) or 'none, outside a clone'}.",
-            autocompletion=one_of(*papers()),
+            autocompletion=complete_from(*papers()),
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="Folder for report and figures.")] = None,

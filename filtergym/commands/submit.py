@@ -31,9 +31,9 @@ from .terminal import (
     Environment,
     Jobs,
     Trust,
+    complete_from,
     complete_policy,
     console,
-    one_of,
     print_table,
     progress_bar,
 )
@@ -55,7 +55,7 @@ def submit(
         typer.Option(
             help="filtergym-1: its 2,000 episodes of the training distribution and 500 of every other scenario; trial: "
             "32 of the training distribution.",
-            autocompletion=one_of(FROZEN, TRIAL),
+            autocompletion=complete_from(FROZEN, TRIAL),
         ),
     ] = FROZEN,
     title: Annotated[str | None, typer.Option(help="Title of the competitor; default: the name.")] = None,

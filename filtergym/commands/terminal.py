@@ -86,7 +86,7 @@ def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
 
 
-def one_of(*words: str) -> Callable[[str], list[str]]:
+def complete_from(*words: str) -> Callable[[str], list[str]]:
     """Return a function that completes one of a few words."""
 
     def complete(incomplete: str) -> list[str]:
@@ -155,7 +155,7 @@ Backend = Annotated[
     str,
     typer.Option(
         help="Implementation of the steps: auto, compiled (with filtergym[fast]) or numpy.",
-        autocompletion=one_of("auto", "compiled", "numpy"),
+        autocompletion=complete_from("auto", "compiled", "numpy"),
     ),
 ]
 Threads = Annotated[int, typer.Option(help="Threads that share the episodes of the compiled backend.")]
@@ -171,7 +171,7 @@ Cluster = Annotated[
         metavar="ADDRESS",
         help="Share the work over a cluster (with filtergym[cluster]): ray or dask for a new one on "
         "this machine; ray://HOST:PORT, ray://auto, tcp://HOST:PORT or tls://HOST:PORT for one that runs.",
-        autocompletion=one_of("ray", "dask"),
+        autocompletion=complete_from("ray", "dask"),
     ),
 ]
 Formats = Annotated[
@@ -179,7 +179,7 @@ Formats = Annotated[
     typer.Option(
         "--format",
         help="Of figures: png, svg (text stays text) or pdf (fonts embedded); repeat for several.",
-        autocompletion=one_of("png", "svg", "pdf"),
+        autocompletion=complete_from("png", "svg", "pdf"),
     ),
 ]
 Columns = Annotated[
@@ -187,7 +187,9 @@ Columns = Annotated[
 ]
 Split = Annotated[
     str,
-    typer.Option(help="test, validation or train.", autocompletion=one_of("test", "validation", "train")),
+    typer.Option(
+        help="test, validation or train.", autocompletion=complete_from("test", "validation", "train")
+    ),
 ]
 
 
@@ -283,7 +285,7 @@ def check_no_recording_options(truth: Any, rename: str | None, sort: bool) -> No
             raise ValueError(f"{option} is for a recording: --recording FILE {option} ...")
 
 
-def renamed(text: str | None) -> dict[str, list[str]]:
+def parse_renames(text: str | None) -> dict[str, list[str]]:
     """Return the columns of a file by their names in it, from an option such as ``t=time,pos=x``.
 
     Raises:
@@ -301,7 +303,7 @@ def renamed(text: str | None) -> dict[str, list[str]]:
     return names
 
 
-def pair(option: str, text: str) -> tuple[float, float]:
+def parse_pair(option: str, text: str) -> tuple[float, float]:
     """Parse two numbers such as ``48.72,2.38``."""
     try:
         first, second = map(float, text.split(","))
@@ -310,7 +312,7 @@ def pair(option: str, text: str) -> tuple[float, float]:
     return first, second
 
 
-def whole_numbers(option: str, text: str) -> list[int]:
+def parse_whole_numbers(option: str, text: str) -> list[int]:
     """Parse whole numbers such as ``0-2,7`` into 0, 1, 2 and 7, each once."""
     found: list[int] = []
     for part in text.split(","):

@@ -25,7 +25,7 @@ from .traced_filter import (
     SHOWN,
     STATE,
     TracedFilter,
-    count_answers,
+    action_size,
 )
 
 TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
@@ -144,7 +144,7 @@ class FilterText:
         read_rows = {STATE: self._rows("state"), MEASUREMENT: self._rows("measurement")}
         written = {STATE: self._rows("state", "next", ""), ESTIMATE: self._rows("estimate", qualifier="")}
         if traced.network is not None:
-            read_rows[ANSWER] = Rows("answer", range(count_answers(traced.network)))
+            read_rows[ANSWER] = Rows("answer", range(action_size(traced.network)))
             written[SHOWN] = Rows("shown", range(traced.shown))
         arrays = Arrays(read_rows, written)
         source = write_program(
@@ -176,7 +176,7 @@ class FilterText:
             body.append(self._taken())
         if traced.network is not None:
             zero = literal(0.0, self.scalar)
-            answers = f"{real} answer[{count_answers(traced.network)}] = {{{zero}}};"
+            answers = f"{real} answer[{action_size(traced.network)}] = {{{zero}}};"
             body = [f"{real} shown[{traced.shown}];", answers, *body]
         interval = next((place for place in given.values() if place == "interval"), None)
         if interval is not None:
@@ -228,7 +228,7 @@ class FilterText:
         network = self.traced.network
         weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
         after = (len(self.traced.state) + self.memory) * size
-        asked = 0 if network is None else scratch_size(network) + count_answers(network)
+        asked = 0 if network is None else scratch_size(network) + action_size(network)
         scratch = (self.update_source.scratch + self.traced.shown + asked) * size + after
         return self.update_source.operations, after, weights, scratch
 

@@ -194,7 +194,7 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     return numpy.stack(answers)
 
 
-def _answered(network: _Network | None) -> Any:
+def _network_rows(network: _Network | None) -> Any:
     """Return the rows of a network's output; without a decision the previous output is not read."""
     if network is None or network.answer is None:
         return collections.defaultdict(float)
@@ -207,7 +207,7 @@ def _interpret_update(
     """Return the results of an update in NumPy."""
 
     def read(argument: int, row: int) -> Any:
-        return (_answered(network) if argument == ANSWER else given[argument])[row]
+        return (_network_rows(network) if argument == ANSWER else given[argument])[row]
 
     return interpret(traced.update, read, dtype, network, traced.shown)
 
@@ -231,7 +231,7 @@ class _CompiledUpdate:
     def __call__(self, given: dict[int, Any], network: _Network | None) -> list[numpy.ndarray]:
         if network is not None and self._before is not None:
             network(self._before(given))
-        return self._whole({**given, ANSWER: _answered(network)})
+        return self._whole({**given, ANSWER: _network_rows(network)})
 
 
 class _Code:

@@ -173,12 +173,12 @@ def clear_missing(task: Task, measurement: Any) -> Any:
     return map_arrays(lambda own: clear(own, next(masked)), measurement)
 
 
-def count_answers(network: "LearnedPolicy") -> int:
+def action_size(network: "LearnedPolicy") -> int:
     """Return the number of values of an action."""
     return 1 if network.output == "argmax" else len(network.layers[-1][1])
 
 
-class AskedNetwork(Policy):
+class NetworkPlaceholder(Policy):
     """Placeholder of a network during the trace: stores the network's input, and returns new inputs as its output.
 
     Args:
@@ -197,10 +197,10 @@ class AskedNetwork(Policy):
         """Store the input; for plain numbers return zeros, of which only the shape matters."""
         if not isinstance(observation, Traced):
             return numpy.zeros(
-                (1,) if self.network.output == "argmax" else (1, count_answers(self.network))
+                (1,) if self.network.output == "argmax" else (1, action_size(self.network))
             ), ()
         self.shown = observation[:, self.network.columns].nodes.ravel().tolist()
-        nodes = [self.graph.input(ANSWER, i) for i in range(count_answers(self.network))]
+        nodes = [self.graph.input(ANSWER, i) for i in range(action_size(self.network))]
         if self.network.output == "argmax":
             return Traced(nodes, numpy.int64), ()
         return Traced(numpy.array(nodes)[None], numpy.float64), ()
@@ -218,7 +218,7 @@ def check_kind(name: str, maker: Any) -> None:
 
 def steps_of(
     traced: Task, control: str, maker: Any, plain: Model, graph: Graph
-) -> tuple[FilterSteps, "AskedNetwork | None"]:
+) -> tuple[FilterSteps, "NetworkPlaceholder | None"]:
     """Return the steps of a competitor on traced arrays, and the placeholder of its network; a graph must be open.
 
     Args:
@@ -229,14 +229,14 @@ def steps_of(
         graph: the open graph.
     """
     if _traced_as(maker) == "learned estimator":
-        policy, network = with_asked_network(maker(plain.task).network, graph)
+        policy, network = replace_network(maker(plain.task).network, graph)
         steered = steer(Model(traced, maker.bank), policy, 1)
         return FilterSteps(steered, functools.partial(clear_missing, traced), steered.decider), network
     if _traced_as(maker) == "gated":
-        inside: list[AskedNetwork | None] = []
+        inside: list[NetworkPlaceholder | None] = []
 
         def replace(policy: Any) -> Any:
-            replaced, network = with_asked_network(policy, graph)
+            replaced, network = replace_network(policy, graph)
             inside.append(network)
             return replaced
 
@@ -248,7 +248,7 @@ def steps_of(
             raise NotTraceable("it does not say that it is traceable")
         return FilterSteps(own, traced.world.mask_missing), None
     acting = plain if traced.parameters is plain.task.parameters else Model(traced, control)
-    policy, network = with_asked_network(make_competitor(maker, acting), graph)
+    policy, network = replace_network(make_competitor(maker, acting), graph)
     if isinstance(policy, RandomPolicy):
         raise NotTraceable("its actions are drawn")
     if not isinstance(policy, Policy):
@@ -262,15 +262,15 @@ def steps_of(
     return FilterSteps(steered, masked, steered.decider, reports_feedback=True), network
 
 
-def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:
-    """Replace the network of a policy by :class:`AskedNetwork`, wherever it is inside."""
+def replace_network(policy: Any, graph: Graph) -> tuple[Any, NetworkPlaceholder | None]:
+    """Replace the network of a policy by :class:`NetworkPlaceholder`, wherever it is inside."""
     if _traced_as(policy) == "network":
-        asked = AskedNetwork(policy, graph)
+        asked = NetworkPlaceholder(policy, graph)
         return asked, asked
     place = getattr(policy, "inner", None)
     if place is None:
         return policy, None
-    inner, asked_inside = with_asked_network(getattr(policy, place), graph)
+    inner, asked_inside = replace_network(getattr(policy, place), graph)
     policy = copy.copy(policy)
     setattr(policy, place, inner)
     return policy, asked_inside
@@ -484,7 +484,7 @@ def _trace_free(
 
 def _trace(
     steps: FilterSteps,
-    asked: "AskedNetwork | None",
+    asked: "NetworkPlaceholder | None",
     template: tuple[Any, Any],
     graph: ParameterGraph,
     free: Sequence[Declared],

@@ -105,7 +105,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
     room = MOST_ROWS - len(keep)
     rest: list[JudgedFilter] = []
     for each in advice.competitors:  # a filter that answers as another does in this log needs no row
-        if each not in keep and not any(_answers_alike(each, other) for other in [*keep, *rest]):
+        if each not in keep and not any(_has_same_results(each, other) for other in [*keep, *rest]):
             rest.append(each)
     agents = [c for c in rest if c.name in learned]
     keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
@@ -151,7 +151,7 @@ def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
     return table
 
 
-def _answers_alike(one: JudgedFilter, other: JudgedFilter) -> bool:
+def _has_same_results(one: JudgedFilter, other: JudgedFilter) -> bool:
     """Return whether two filters give the same numbers on a log; unknown likelihoods count as different."""
     compared = "log_likelihood", "gain", "difference", "prediction"
     return all(getattr(one, name) == getattr(other, name) for name in compared)

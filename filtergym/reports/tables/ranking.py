@@ -55,7 +55,7 @@ def rival_of(places: Sequence[Record], learned: Sequence[str]) -> Record | None:
     return next((place for place in places if (place.policy in learned) != was_learned), None)
 
 
-def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
+def best_competitor(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
     """Return the best of learned and classical competitors in a scenario, in two or three words.
 
     It rests on the paired ratio between the best one and the best of the other origin: where its interval contains one,

@@ -114,7 +114,7 @@ def _times(record: Record) -> str:
     return f"{value} times {record.component}" + (f" {interval}" if interval else "")
 
 
-def explained_by_default(records: Sequence[Record], named: Sequence[str], paper: str) -> list[str]:
+def default_explained(records: Sequence[Record], named: Sequence[str], paper: str) -> list[str]:
     """Return the competitor that sentences are about by default: the first of the user's, else the paper's algorithm,
     else the cheapest.
 

@@ -34,7 +34,7 @@ def find_worst(
     """
     found: dict[str, list[WorstTrack]] = {name: [] for name in explained}
     for name in found.keys() & evaluation.costs.keys():
-        opponent = opponent_in(evaluation.records, name)
+        opponent = find_opponent(evaluation.records, name)
         numbers = select_worst(evaluation.costs[name])
         makers = {one.name: one.maker for one in competitors if one.name in (name, opponent)}
         dataset = run_episodes(experiment, makers, numbers)
@@ -61,7 +61,7 @@ def _label(dataset: xarray.Dataset, number: int) -> str:
     return str(dataset[name].values[number])
 
 
-def opponent_in(records: Sequence[Record], name: str) -> str:
+def find_opponent(records: Sequence[Record], name: str) -> str:
     """Return the competitor to which the records compare a competitor's cost; empty: none."""
     ratios = [reason.ratio.component for reason in reasons_of(records, name) if reason.ratio is not None]
     return ratios[0] if ratios else ""
