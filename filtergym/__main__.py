@@ -187,7 +187,7 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
     try:
         with warnings.catch_warnings(), nullcontext() if sys.flags.safe_path else modules_from(os.getcwd()):
             warnings.showwarning = _show_warning
-            # Under one name, however it was started: the shell asks for completions of that.
+            # One name for every way of starting it, since the shell completes that name.
             program()([word for word in sys.argv[1:] if word != "--debug"], prog_name=name)
     except Exception as error:
         if debug:

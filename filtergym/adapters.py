@@ -20,7 +20,7 @@ LIBRARIES = {"FilterpyEstimator": ("filterpy", "adapters"), "StoneSoupEstimator"
 
 
 def __getattr__(name: str) -> Any:
-    # On first use: who has one of the libraries does not need the other.
+    # On first use: a user of one library does not need the other.
     if name not in LIBRARIES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     library, module = LIBRARIES[name]

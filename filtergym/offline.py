@@ -297,7 +297,7 @@ def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, a
     import minari
 
     with warnings.catch_warnings():
-        # It asks for the address of an author and a link to code, which the data of a simulation need not have.
+        # Minari warns without an author's address and a link to code, which simulated data do not need.
         warnings.filterwarnings("ignore", r"`(author_email|code_permalink)` is set to None", UserWarning)
         return minari.create_dataset_from_buffers(
             name,

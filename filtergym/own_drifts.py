@@ -45,7 +45,7 @@ def discretise_drift(
 
         return Discretised(lambda x, dt, u: runge_kutta(lambda y: slope(y, u), x, dt, steps), held)
     A = drift.matrix[:, :n]
-    # Inputs and what is constant are held: states without a drift of their own, the last of them 1.
+    # Inputs and constants are states without a drift, the last of them 1.
     whole = numpy.zeros((drift.matrix.shape[1] + 1,) * 2)
     whole[:n, :-1], whole[:n, -1] = drift.matrix, drift.offset
     still = numpy.zeros_like(whole)

@@ -262,7 +262,7 @@ def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
 
 def _two_lines(record: Record | None, scale: float) -> str:
     """Return the value above its interval, so that columns stay narrow."""
-    # Percentages to a hundredth: what is smaller is rounding.
+    # Percentages to a hundredth: smaller values are rounding.
     negligible = 0.005 if scale == 100.0 else 0.0
     shown = with_interval(record, scale, negligible=negligible)
     return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")

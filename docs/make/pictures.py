@@ -35,7 +35,7 @@ def draw_learning_curves(
     figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.2}[columns])
     axis = axes[0]
     for (name, runs), style in zip(curves.items(), styles(list(curves)).values(), strict=True):
-        # Runs of one algorithm are validated at the same steps; where one is shorter, all are shown as far as it goes.
+        # Runs of one algorithm are validated at the same steps; all are drawn up to the end of the shortest.
         steps = numpy.unique(numpy.concatenate([own for own, _ in runs]))
         steps = steps[(steps >= max(own[0] for own, _ in runs)) & (steps <= min(own[-1] for own, _ in runs))]
         percent = 100.0 * numpy.array([numpy.interp(steps, *own) for own in runs])

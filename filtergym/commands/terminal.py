@@ -22,7 +22,7 @@ from .progress import progress_bar as progress_bar
 if TYPE_CHECKING:
     from ..envs.contract.task import Task
 
-# --- what a shell completes; imports wait until it asks
+# --- completion by a shell; imports wait until it is used
 
 
 def complete_environment(incomplete: str) -> list[str]:
@@ -49,7 +49,7 @@ def _environments_of(ctx: typer.Context) -> list[str]:
     from ..envs.engine.catalogue import catalogue, task_class
 
     named = ctx.params.get("environment")
-    # An option that still lacks its value keeps click from telling the arguments: then the words as shells give them.
+    # Before an option has its value, click cannot parse the arguments: then the words as shells pass them.
     words = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
     for word in [named] if isinstance(named, str) else words.split():
         with suppress(ValueError):
@@ -217,7 +217,7 @@ class Output(Console):
 
     def _end(self) -> None:
         self.quiet = True
-        # What is still buffered would be refused again when Python ends.
+        # Buffered text would fail again when Python ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

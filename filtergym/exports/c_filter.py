@@ -160,7 +160,7 @@ class FilterText:
         )
         body = list(source.body)
         if self.has_state:
-            # What is written is not what is read.
+            # The written struct differs from the read one.
             start = " = *state" if self.memory or traced.free.kept else ""
             body = [
                 f"{state.name} after{start};",

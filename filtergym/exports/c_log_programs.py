@@ -25,14 +25,14 @@ LOG = """/* Reads a log (CSV, a file or standard input) as `filtergym evaluate -
 
 {reading}
 #define COLUMNS {count}
-#define NEEDED {needed} /* The first ones; others may lack. */
+#define NEEDED {needed} /* The first ones; others may be missing. */
 
 /* Names of the columns, in lower case: of the times, of which the first counts, and of numbers. */
 static const char *const times[] = {{{times}}};
 static const char *const names[COLUMNS] = {{{names}}};
 static const char recordings[] = {recording};
 static const char delimiters[] = {delimiters};
-static const double units[] = {{{units}}}; /* Of a second, in which numbers since 1970 may count. */
+static const double units[] = {{{units}}}; /* Possible units of numbers since 1970, s. */
 
 /* --- The filter. */
 
@@ -63,7 +63,7 @@ ODOMETRY = {
 }
 """Displacement from the columns a and b of a second sensor, the first pair that a log has."""
 READ_ODOMETRY = """
-/* Makes displacements of the rows of a track, of which those that lack a number have none. */
+/* Computes displacements of the rows of a track; rows without a number have none. */
 static int read_odometry(long n) {{
     long i;
     int k;
@@ -143,7 +143,7 @@ PLOTS = """#define INTERVAL {interval} /* s */
 static const double usual[2] = {{{first}, {second}}}; /* deviations of a log that states none */
 static double p0[2], v0[2], last, last_plot, scan;
 {project}
-/* Empties positions that are those of the row before, where noise would hardly ever give both numbers again. */
+/* Empties repeated positions, where noise would hardly ever repeat both numbers. */
 static void leave_out_stale(long n) {{
     const double *before = NULL;
     double gap;
@@ -206,7 +206,7 @@ static int read_plots(long n) {{
     return plots < 3 ? fail("a track starts from two plots and goes on: there are no three", "of them", own[0]) : 0;
 }}
 
-/* Takes in a scan: the last one of several until a row, or one before that misses the target. */
+/* Updates with a scan: the last one of several until a row, or an earlier one that misses the target. */
 static int step(double at, const Row *row, double scans, int is_last, Estimate *estimate) {{
     static const double none[2] = {{0.0, 0.0}}, nominal[2] = {{{nominal}, {nominal}}};
     const double interval = at - last, elapsed = at - last_plot, available = is_last && row->plot ? 1.0 : 0.0;

@@ -121,7 +121,7 @@ def parameter_text(
     before += min(texts, key=lambda parts: sum(map(len, parts)))
     body.append(f"{own}_derive(parameters, own);")
     if stated := _stated(free, scalar):
-        # The same bits whatever the functions of a library give.
+        # The same bits for every library of functions.
         numbers = numpy.array([free.usual[row] for row in stated])
         before.append(array_text(f"{own}_usual", numbers, scalar))
         place = f"own[{stated.start} + k]" if stated.start else "own[k]"

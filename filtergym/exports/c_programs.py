@@ -21,7 +21,7 @@ static const char columns[] =
 
 static char line[1024 + 32 * (COLUMNS + INITIAL + MEASUREMENT) + sizeof columns];
 
-/* The numbers of a line; an empty one is NaN. Returns how many there are, or minus the place of what is none. */
+/* The numbers of a line; an empty one is NaN. Returns their count, or minus the place of an invalid one. */
 static int numbers(const char *text, double *row) {{
     int count = 0;
     for (;;) {{
@@ -56,7 +56,7 @@ static void hold_missing(double *row, double *last) {{
             row[i] = last[i];
 }}
 
-/* Answers every measurement of some tracks until there are no more. */
+/* Writes the estimate of every measurement of some tracks until the end of input. */
 static int answer_all(long tracks, int steers, {own}_state *states, double *rows, double *last) {{
     const int width = ANSWER + (steers ? FEEDBACK : 0);
     long t;
@@ -91,7 +91,7 @@ static int answer_all(long tracks, int steers, {own}_state *states, double *rows
     return 0;
 }}
 
-/* Reads the hello, and answers. */
+/* Reads the hello, and writes estimates. */
 static int serve(void) {{
     const long tracks = number_of("\\"tracks\\": ");
     const int steers = FEEDBACK > 0 && number_of("\\"feedback\\": ") == FEEDBACK;
@@ -187,7 +187,7 @@ int main(int argc, char **argv) {{
 }}
 """
 """Reads a table of measurements and writes one of estimates."""
-INITIAL_IN_ROW = """/* Whether a row begins a track, the initial estimate that it has, and its measurement. */
+INITIAL_IN_ROW = """/* Whether a row begins a track, its initial estimate, and its measurement. */
 static int begins(const double *row) {{ return row[0] == row[0]; }}
 static const double *initial_of(const double *row) {{ return row; }}
 static const double *measurement_of(const double *row) {{ return row + INITIAL; }}

@@ -112,7 +112,7 @@ def replay(
     started: list[Any] = []
     start_lanes(plain, seeds, lambda episode: started.append(episode.measurement))
     kept: dict[str, list[numpy.ndarray]] = {"measurement": [], "mean": [], "covariance": []}
-    # What cannot be exported is refused before it runs. Measurements have the same form whatever steers.
+    # Competitors that cannot be exported fail before they run. Measurements have the same form for every control.
     first = start_lanes(plain, seeds[:1]).state.measurement
     known = problem.baselines.tunable
     traced = trace_filter(problem.task, control, maker, name, plain, (started[0], first), known)

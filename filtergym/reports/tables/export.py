@@ -99,7 +99,7 @@ def _latex_character(character: str) -> str:
         return "o" if character == "ο" else f"$\\{GREEK[character]}$"
     if "LATIN" in unicodedata.name(character, ""):
         return character
-    # What LaTeX has no letter for would stop it.
+    # A character without a letter in LaTeX would stop it.
     return f"[U+{ord(character):04X}]"
 
 
