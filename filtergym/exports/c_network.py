@@ -35,7 +35,7 @@ for (i = 0; i < {units}; ++i) {{
     memory[i] = ({one} - update) * candidate + update * memory[i];
     x[i] = memory[i];
 }}"""
-_LSTM = """/* Long short-term memory: input, forget, cell, output gates; its output, then its cells. */
+_LSTM = """/* Long short-term memory: gates admit (input), keep (forget), show (output); its output, then its cells. */
 {name}_layer(x, {inputs}, &{name}_lstm_input_weight[0][0], {name}_lstm_input_bias, {gates}, a);
 {name}_layer(memory, {units}, &{name}_lstm_memory_weight[0][0], {name}_lstm_memory_bias, {gates}, b);
 for (i = 0; i < {units}; ++i) {{

@@ -233,7 +233,7 @@ def _cost_columns(
     if lost:
         columns["failed"] = lambda name: f"{lost.get(name, 0)}"
         notes.append(
-            "failed counts episodes in which an answer was not finite, or no covariance; the last valid one is held."
+            "failed counts episodes with an estimate that was not finite, or had no covariance; its predecessor counts."
         )
     return columns, notes
 
