@@ -233,7 +233,8 @@ def _cost_columns(
     if lost:
         columns["failed"] = lambda name: f"{lost.get(name, 0)}"
         notes.append(
-            "failed counts episodes with an estimate that was not finite, or had no covariance; its predecessor counts."
+            "failed counts episodes with an estimate that was not finite, or had no covariance; the last valid one is "
+            "repeated."
         )
     return columns, notes
 
