@@ -45,17 +45,17 @@ def parameter_words(free: FreeParameters) -> str:
     text = (
         "Parameters, given at the start of a track. They have the names and limits of filtergym."
         if free.declared
-        else "Parameters: this filter has none that can be given."
+        else "Parameters: this filter has none."
     )
     if free.condition is not None:
         text += (
-            " Refused are also values that decide a branch of the filter's own code otherwise than the defaults, such "
-            "as their order: another program would follow."
+            " Values that decide a branch of the filter's own code otherwise than the defaults, such as their order, "
+            "are also rejected: they would need another program."
         )
     if free.constant:
         text += (
             " Constant here, since the form of the program depends on them, or they enter through a computation "
-            f"without one, such as that of a matrix equation: {', '.join(free.constant)}."
+            f"that is not exported, such as the solution of a matrix equation: {', '.join(free.constant)}."
         )
     return text
 

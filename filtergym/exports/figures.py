@@ -29,5 +29,5 @@ def operation_words(figures: Figures) -> str:
     """Return the operations of an update in words, with those of a network apart."""
     network = figures.network_operations
     return f"{figures.operations:,} operations an update" + (
-        f" and {network:,} of the network where it is asked" if network else ""
+        f" and {network:,} of the network where it is evaluated" if network else ""
     )

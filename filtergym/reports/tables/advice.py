@@ -142,7 +142,7 @@ def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
     rows = price_rows(advice, learned)
     if not rows:
         return None
-    table = Table(title="What an update costs in C, in double precision", title_justify="left")
+    table = Table(title="Cost of an update in C, in double precision", title_justify="left")
     table.add_column("filter", no_wrap=True)
     for title in PRICES:
         table.add_column(title, justify="right")

@@ -22,7 +22,7 @@
   }
   const something = (values) => values.some((x) => x !== null);
 
-  // --- how lines look: kinds always alike, one colour for a name in all figures of an environment
+  // --- style of lines: by kind, with one colour for a name in all figures of an environment
 
   function look(line) {
     const style = { color: css("--soft"), width: 1, dash: "solid" };
@@ -59,7 +59,7 @@
     return { name: all.length > 2 ? `${all[0]}${sign}${all.length - 1} others` : all.join(sign), every: all.join(`${sign}<br>`) };
   }
 
-  // Of the values that are drawn, the ends of an axis: numbers, or on a logarithmic axis their logarithms.
+  // Ends of an axis of the drawn values: numbers, or on a logarithmic axis their logarithms.
   function ends(lines, of, log) {
     const all = lines.flatMap((line) => (of(line).mid || []).filter((y) => y !== null && (!log || y > 0)).map((y) => log ? Math.log10(y) : y));
     const [low, high] = all.reduce(([l, h], y) => [Math.min(l, y), Math.max(h, y)], [Infinity, -Infinity]);
@@ -89,7 +89,7 @@
     return drawn;
   }
 
-  // --- what each figure offers: choices, each a function that returns traces and layout
+  // --- choices of each figure, each a function that returns traces and layout
 
   function overTime(cell, variable, indices, title, changes = {}, [x, numbers] = [cell.curves.time, cell.curves.numbers("time")]) {
     const { curves, lines } = cell;
@@ -158,7 +158,7 @@
     },
   };
 
-  // Who costs more than an axis shows.
+  // Competitors beyond the axis.
   const over = (end, names) => `over +${Math.round(end)} %: ${names.slice(0, 3).join(", ")}${names.length > 3 ? ` and ${names.length - 3} more` : ""}`;
 
   function dotted(rows, lines, paper) {
@@ -240,7 +240,7 @@
     return [low - margin, high + margin];
   }
 
-  // Where somebody's error is largest.
+  // Time of the largest error.
   function worstTime(track, name) {
     if (!track.has("truth")) return 0;
     const at = track.words("policy").indexOf(name);
@@ -281,7 +281,7 @@
       const title = (i) => ({ title: { text: `${words(components[i])}, ${plain(units[i])}` } });
       const rangeX = extent([tx, ...shown.map((line) => state(line, 0))]), rangeY = extent([ty, ...shown.map((line) => state(line, 1))]);
       Plotly.react(left, overview, layout({ xaxis: { ...title(0), range: rangeX }, yaxis: { ...title(1), range: rangeY, scaleanchor: "x", constrain: "domain" }, uirevision: "track" }), config);
-      // A close-up around the truth: what errors and ellipses are like now.
+      // A close-up around the truth with the current errors and ellipses.
       const close = [{ x: [0], y: [0], mode: "markers", name: "truth", marker: { color: css("--fg"), size: 9, symbol: "x-thin-open" }, showlegend: false }];
       if (sx.length && sx[n] !== null && tx[n] !== null) close.push({ x: [sx[n] - tx[n]], y: [sy[n] - ty[n]], mode: "markers", name: "measured", marker: { ...marks, size: 10 }, showlegend: false });
       let reach = 0;
@@ -292,7 +292,7 @@
         const around = ellipse(x[n], y[n], u * u, r * u * v, v * v), style = look(line), group = { legendgroup: plain(line.name), showlegend: false, name: plain(line.name) };
         const errors = x.map((u, i) => Math.hypot(u, y[i])).filter(Number.isFinite).sort((a, b) => a - b);
         reach = Math.max(reach, errors[Math.floor(0.9 * (errors.length - 1))] || 0, 2 * Math.max(u, v) / 1.5);
-        if (line === first) reach = Math.max(reach, Math.hypot(x[n], y[n])); // the one that the picture is about stays inside
+        if (line === first) reach = Math.max(reach, Math.hypot(x[n], y[n])); // the subject of the picture stays inside
         close.push(path(x.slice(Math.max(0, n - 12), n + 1), y.slice(Math.max(0, n - 12), n + 1), { line: { ...style, width: 1 }, opacity: 0.5, hoverinfo: "skip", ...group }),
           path(around.x, around.y, { line: style, hoverinfo: "skip", ...group }),
           { x: [x[n]], y: [y[n]], mode: "markers", marker: { color: style.color, size: 8 }, ...group });
@@ -344,7 +344,7 @@
     box.append(select);
   }
 
-  // One of the worst episodes at a time, with those two in colour whom it is about.
+  // One of the worst episodes at a time, with its two competitors in colour.
   function drawWorst(figure, cell) {
     const box = figure.querySelector(".plot");
     let draw = () => {};
@@ -416,7 +416,7 @@
       const value = (row) => row.cells[column].dataset.sort;
       const order = (a, b) => {
         const [u, v] = [value(a), value(b)];
-        if (u === undefined || v === undefined) return (u === undefined) - (v === undefined); // what is missing stands last
+        if (u === undefined || v === undefined) return (u === undefined) - (v === undefined); // missing values last
         const less = number && !Number.isNaN(Number(u)) && !Number.isNaN(Number(v)) ? Number(u) - Number(v) : u.localeCompare(v);
         return descending ? -less : less;
       };
