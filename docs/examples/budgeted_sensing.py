@@ -114,22 +114,22 @@ class Targets(World[Task, Truth, Measurement]):
         return truth, Measurement(read, truth.sigma, truth.agility)
 
     def state(self, truth: Truth) -> Array:
-        """Positions."""
+        """Return the positions."""
         return truth.position
 
     def error_cost(self, error: Array) -> Array:
-        """Mean squared error of the positions, none larger than of a lost target."""
+        """Return the mean squared error of the positions, limited to that of a lost target."""
         squares = self.xp.minimum(error**2, self.parameters.lost**2 + 0.0 * error)
         return sum(squares[j] for j in range(TARGETS)) / TARGETS
 
 
 class Track(NamedTuple):
-    """Hypotheses of one target, by their age."""
+    """Hypotheses on one target, by their age."""
 
     steady: AgedHypotheses
     """Position and velocity."""
     thrust: AgedHypotheses
-    """With the acceleration."""
+    """Position, velocity and acceleration."""
 
 
 class Tracks(NamedTuple):
@@ -188,7 +188,7 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
         return self._together(tuple(tracks), xp.stack([zero] * TARGETS))
 
     def _together(self, tracks: tuple[Track, ...], waited: Array) -> Tracks:
-        """With mean and covariance of each target over its hypotheses."""
+        """Return the tracks with mean and covariance of each target over its hypotheses."""
         xp, means, covariances = self.xp, [], []
         for track in tracks:
             steady, zero = track.steady, 0.0 * track.steady.probability
@@ -245,11 +245,11 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
         return self._together(tuple(tracks), xp.where(looked > 0.0, 0.0 * state.waited, state.waited))
 
     def mean(self, state: Tracks) -> Array:
-        """Positions."""
+        """Return the positions."""
         return state.mean[0]
 
     def covariance(self, state: Tracks) -> Array:
-        """Of them: targets are independent."""
+        """Return the covariance of the positions: targets are independent."""
         zero = 0.0 * state.waited[0]
         size = range(TARGETS)
         return _matrix(self.xp, [[state.covariance[0, 0, i] if i == j else zero for j in size] for i in size])
@@ -260,7 +260,7 @@ def _matrix(xp: Any, rows: Sequence[Sequence[Array]]) -> Array:
 
 
 def _accelerated(xp: Any, mean: Array, covariance: Array, variance: Array) -> tuple[Array, Array]:
-    """State of a manoeuvre whose acceleration has this variance, from position and velocity."""
+    """Return the state of a manoeuvre whose acceleration has this variance, from position and velocity."""
     zero = 0.0 * mean[0]
     rows = [[covariance[i, 0], covariance[i, 1], zero] for i in range(2)]
     return xp.concat([mean, zero[None]]), _matrix(xp, [*rows, [zero, zero, variance + zero]])
@@ -272,7 +272,7 @@ def _flown(table: AgedHypotheses, F: Array) -> AgedHypotheses:
 
 
 def _update(table: AgedHypotheses, measurement: Measurement, j: int) -> kalman.Update:
-    """Kalman filter of every hypothesis with a measured position."""
+    """Update the Kalman filter of every hypothesis with a measured position."""
     S = table.covariance[0, 0] + measurement.sigma[j] ** 2
     innovation = measurement.position[j] - table.mean[0]
     K = table.covariance[:, 0] / S
@@ -324,7 +324,7 @@ def later(P: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
 
 
 def updated(P: numpy.ndarray, R: numpy.ndarray, share: Any = 1.0) -> numpy.ndarray:
-    """Covariance after a look, or after a share of one."""
+    """Return the covariance after a look, or after a share of one."""
     return P - share * P[:, None, 0] * P[None, :, 0] / (P[0, 0] + R)
 
 
@@ -341,7 +341,7 @@ class Manager(Policy):
         self.readers = {name: model.reader(name) for name in names}
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Choose."""
+        """Choose the target of the largest index."""
         rest = {name: read(observation).T for name, read in self.readers.items()}
         entries = dict(zip(ENTRIES, rest.pop("covariance").reshape(len(ENTRIES), TARGETS, -1), strict=True))
         P = numpy.array([[entries[min(a, b), max(a, b)] for b in range(3)] for a in range(3)])
@@ -358,11 +358,11 @@ class Manager(Policy):
         raise NotImplementedError
 
     def found(self, P: numpy.ndarray, R: numpy.ndarray) -> numpy.ndarray:
-        """Probability that the beam finds it."""
+        """Return the probability that the beam finds it."""
         return erf(self.beam / numpy.sqrt(2.0 * (P[0, 0] + R)))
 
     def cost(self, P: numpy.ndarray) -> numpy.ndarray:
-        """Expected squared error, none larger than of a lost target."""
+        """Return the expected squared error, limited to that of a lost target."""
         ratio = self.lost / numpy.sqrt(P[0, 0])
         within = erf(ratio / math.sqrt(2.0))
         density = numpy.exp(-0.5 * ratio**2) / math.sqrt(2.0 * math.pi)
@@ -373,7 +373,7 @@ class RoundRobin(Manager):
     """The target that has waited longest."""
 
     def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
-        """Seconds since the last look."""
+        """Return the seconds since the last look."""
         return rest["waited"]
 
 
@@ -381,15 +381,15 @@ class GreedyInformation(Manager):
     """The look of the largest expected information about the position, nats."""
 
     def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
-        """Half the log of the variance before over that after."""
+        """Return half the logarithm of the variance before over that after."""
         return self.found(P, R) * 0.5 * numpy.log1p(P[0, 0] / R)
 
 
 class Greedy(Manager):
-    """The look that is expected to cost least now."""
+    """The look of the least expected cost now."""
 
     def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
-        """Expected cost before less that after."""
+        """Return the expected cost before less that after."""
         return self.found(P, R) * (self.cost(P) - self.cost(updated(P, R)))
 
 
@@ -408,12 +408,12 @@ class Deferral(Manager):
 
 
 class Rollout(Manager):
-    """Every pair of looks, and then what `greedy` would do for some seconds."""
+    """Every pair of looks, followed by some seconds of `greedy`."""
 
     seconds = TARGETS
 
     def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
-        """Cost of the best sequence that begins with each, negative."""
+        """Return the negative cost of the best sequence that begins with each."""
         pairs = numpy.eye(TARGETS)
         best = []
         for first in pairs:
@@ -459,7 +459,7 @@ class AllBeams:
         return self.bank.mean(after), self.bank.covariance(after), after
 
     def choose(self, predicted: Tracks, seen: Tracks, measurement: Measurement, truth: Truth) -> Tracks:
-        """All of them."""
+        """Choose all targets."""
         return seen
 
 
@@ -472,7 +472,7 @@ class Clairvoyant(AllBeams):
     seconds = TARGETS
 
     def choose(self, predicted: Tracks, seen: Tracks, measurement: Measurement, truth: Truth) -> Tracks:
-        """Look at one."""
+        """Choose one target."""
         xp = self.xp
         state = xp.stack([truth.position, truth.velocity, truth.acceleration])
         gain = self._errors(predicted.mean - state) - self._errors(seen.mean - state)
@@ -485,7 +485,7 @@ class Clairvoyant(AllBeams):
         return self.bank.look(predicted, measurement, xp.stack(looked))
 
     def _errors(self, error: Array) -> Array:
-        """Sum of the squared errors of the positions as they go on, ``(4, N)``."""
+        """Return the sum of the squared future errors of the positions, ``(4, N)``."""
         total, limit = 0.0, self.bank.parameters.lost**2 + 0.0 * error[0]
         for k in range(self.seconds):
             ahead = error[0] + k * error[1] + 0.5 * k * k * error[2]
