@@ -128,7 +128,7 @@ def evaluate_policies(
         bool | None,
         typer.Option(
             "--netcdf/--no-netcdf",
-            help="With --out, write results.nc however large it is, or not at all; default: up to 200 MB.",
+            help="With --out, write results.nc of any size, or not at all; default: up to 200 MB.",
         ),
     ] = None,
     format: Formats = None,
@@ -176,7 +176,7 @@ def evaluate_policies(
     ] = 10.0,
     memory_limit: Annotated[
         float,
-        typer.Option(help="Of programs and isolated estimators: address space, MB, on Linux; 0: no limit."),
+        typer.Option(help="Address space of programs and isolated estimators, MB, on Linux; 0: no limit."),
     ] = 4000.0,
     backend: Backend = "auto",
     threads: Threads = 1,

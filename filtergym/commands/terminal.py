@@ -122,7 +122,8 @@ Experiment = Annotated[int, typer.Option(help="Number of the experiment.")]
 Trust = Annotated[
     bool,
     typer.Option(
-        "--trust", help="Load files and modules that can execute code: you made them, or know who did."
+        "--trust",
+        help="Load files and modules that can execute code; use it only if you trust their authors.",
     ),
 ]
 Control = Annotated[str | None, typer.Option(help="Control of all policies.")]
@@ -136,8 +137,8 @@ TruthOption = Annotated[
     Path | None,
     typer.Option(
         "--truth",
-        help="Of a recording in tables: the truth in a file of its own (CSV, .pos), matched by time; a note reports "
-        "the share of measurements with a truth.",
+        help="File (CSV, .pos) with the truth of a recording in tables, matched by time; a note reports the share "
+        "of measurements with a truth.",
     ),
 ]
 RenameOption = Annotated[
@@ -178,7 +179,7 @@ Formats = Annotated[
     list[str] | None,
     typer.Option(
         "--format",
-        help="Of figures: png, svg (text stays text) or pdf (fonts embedded); repeat for several.",
+        help="Format of figures: png, svg (text stays text) or pdf (fonts embedded); repeat for several.",
         autocompletion=complete_from("png", "svg", "pdf"),
     ),
 ]
