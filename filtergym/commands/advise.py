@@ -29,7 +29,7 @@ from ..reports.tables.advice import (
 )
 from ..reports.tables.results import settings_of
 from .evaluation import causal_competitors, departure_lines
-from .shown import report_maker
+from .result_output import report_maker
 from .terminal import (
     Parameters,
     RenameOption,
@@ -177,7 +177,7 @@ def advise_on_log(
         def progress(what: str, share: float) -> None:
             bar.update(fits, completed=share)
             if what:
-                bar.say(what)
+                bar.write_line(what)
 
         prices = update_prices(problem, found)
         advice = advise(FittedLog(problem, found, noise, seed, keywords), makers, own, progress, prices)
@@ -225,7 +225,7 @@ def advise_on_log(
 
 
 def _advice_maker() -> Callable[..., str]:
-    """Return the function that makes the report of an advice; errors as of :func:`.shown.report_maker`."""
+    """Return the function that makes the report of an advice; errors as of :func:`.result_output.report_maker`."""
     report_maker()
     from ..reports.pages.advice_report import advice_html
 

@@ -42,7 +42,7 @@ from ..reports.tables.recording_tables import recording_tables
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of, write_results
 from ..reports.tables.terminal_tables import flights_table, results_tables
 from ..reports.tables.worst import worst_figures
-from .shown import REPORT, make_report
+from .result_output import REPORT, make_report
 from .terminal import (
     check_no_recording_options,
     command_line,

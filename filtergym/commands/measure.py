@@ -54,7 +54,7 @@ from .evaluation import (
     write,
 )
 from .protocol import check_options, evaluate_protocol
-from .shown import REPORT, make_report, print_headline, print_outcome
+from .result_output import REPORT, make_report, print_headline, print_outcome
 from .terminal import (
     Backend,
     Cluster,
@@ -433,7 +433,7 @@ def benchmark(
         def tell_result(result: Result) -> None:
             first = result.records[0]
             count = len({record.policy for record in result.records})
-            bar.say(
+            bar.write_line(
                 f"{result.short}, {result.scenario}: {count} competitor{'s' * (count > 1)} over "
                 f"{first.episodes:,} episodes"
             )

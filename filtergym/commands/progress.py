@@ -16,7 +16,7 @@ STEP = 0.05
 class _Bar(Progress):
     """A progress bar that disappears at the end; it shows by itself what :class:`ProgressLines` writes."""
 
-    def say(self, text: str) -> None:
+    def write_line(self, text: str) -> None:
         """Ignore the line: the bar shows the progress."""
 
 
@@ -61,7 +61,7 @@ class ProgressLines:
         self._done = self._done + (advance or 0.0) if completed is None else completed
         if description is not None and description != self._description:
             self._description = description
-            self.say(description)
+            self.write_line(description)
         since = self._clock() - self._reported_at
         if self._total <= 0.0 or since < FEWEST_SECONDS or self._done <= self._reported:
             return
@@ -69,7 +69,7 @@ class ProgressLines:
             self._write(f"{self._description}: {self._standing()}")
             self._reported_at, self._reported = self._clock(), self._done
 
-    def say(self, text: str) -> None:
+    def write_line(self, text: str) -> None:
         """Write a line of its own."""
         standing = f" ({self._standing()})" if 0.0 < self._done < self._total else ""
         self._write(f"{text}{standing}")

@@ -10,7 +10,7 @@ from ..evaluation.running.parallel import Workers
 from ..evaluation.storage.files import writable_file, writable_folder
 from ..reports.tables.results import read_all_results
 from ..reproductions import paper_module, papers
-from .shown import REPORT, make_report, print_headline, print_outcome, report_maker
+from .result_output import REPORT, make_report, print_headline, print_outcome, report_maker
 from .terminal import Cluster, Formats, Jobs, complete_from, console, progress_bar
 
 
