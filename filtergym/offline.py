@@ -276,7 +276,6 @@ def _datasets_in(folder: Path) -> Iterator[None]:
 
 
 def _buffers(episodes: Sequence[Transitions]) -> list[Any]:
-    """Return the episodes in Minari's form."""
     from minari.data_collector import EpisodeBuffer
 
     return [

@@ -179,7 +179,6 @@ class _Motion(NamedTuple):
 
 
 def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
-    """Return the motion of f and Q."""
     n, f, parts = len(around.mean), given["f"], _sources("Q", given["Q"])
     takes = further_arguments(f)
     wrong = next((Q for Q in parts.values() if ("dt" in takes) != callable(Q)), None)
@@ -231,7 +230,6 @@ def _sum(parts: Sequence[Sequence[Any]]) -> list[Any]:
 
 
 def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
-    """Return the motion of a drift and a diffusion."""
     n, p, drift = len(around.mean), len(around.inputs), given["drift"]
     if callable(drift):
         takes = further_arguments(drift)

@@ -37,7 +37,6 @@ def _general_options(program: Any) -> list[Any]:
 
 
 def _options(parameters: list[Any], function: Callable[..., Any]) -> list[str]:
-    """Return the table of a command's arguments and options."""
     annotations = {name: p.annotation for name, p in inspect.signature(function).parameters.items()}
     rows = []
     for parameter in parameters:
@@ -52,7 +51,6 @@ def _options(parameters: list[Any], function: Callable[..., Any]) -> list[str]:
 
 
 def _kind(annotation: Any) -> str:
-    """Return the word for the values of an option."""
     if hasattr(annotation, "__metadata__"):
         annotation = annotation.__origin__
     if get_origin(annotation) is UnionType:

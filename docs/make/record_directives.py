@@ -370,7 +370,6 @@ DIRECTIVES = {
 
 
 def _write_playground(app: Any) -> None:
-    """Write the filters of the playground beside its script."""
     write_text(Path(app.outdir) / "_static" / "playground_filters.js", page_script(read_modules()))
 
 

@@ -141,7 +141,6 @@ def export(
 
 
 def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> None:
-    """Write a filter as C99, and print its cost."""
     from ..exports.c_filter import file_stem
     from ..exports.c_source import export_c
     from ..exports.figures import operation_words

@@ -100,7 +100,6 @@ def _percent(estimate: Any) -> str:
 
 
 def _table(found: ProtocolResult) -> Table:
-    """Return a table of the entries against the paper's algorithm in each environment."""
     table = plain_table(
         f"{found.protocol.name}: {found.title} ({found.protocol.episodes} episodes each, {found.protocol.split} split, "
         f"seed {found.protocol.seed}; 95 % intervals)"

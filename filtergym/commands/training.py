@@ -128,7 +128,6 @@ def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
 
 
 def _train_here(training: Training, trainer: Trainer) -> None:
-    """Train a run with its progress and reports on the console."""
     folder, run, session = training
     console.print(f"{folder}: seed {run.seed}")
     with progress_bar() as bar:

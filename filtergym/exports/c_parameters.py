@@ -178,7 +178,6 @@ def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused
 
 
 def _value(one: Declared, scalar: Scalar) -> str:
-    """Return the default of a member as C writes it."""
 
     def braces(part: numpy.ndarray) -> str:
         if part.ndim == 0:
@@ -189,7 +188,6 @@ def _value(one: Declared, scalar: Scalar) -> str:
 
 
 def _limits(one: Declared, scalar: Scalar) -> tuple[float, float]:
-    """Return the limits of a type of numbers."""
     if scalar is DOUBLE:
         return one.low, one.high
     largest = float(numpy.finfo(scalar.dtype).max)

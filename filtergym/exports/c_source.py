@@ -292,7 +292,6 @@ def files_of(writer: Writer, replayed: Replay, notes: Sequence[str] = ()) -> dic
 
 
 def _about(request: ExportRequest, writer: Writer, precision: str, command: str) -> list[str]:
-    """Return the paragraphs that describe the filter."""
     own, maker = writer.name, request.maker
     described = maker if isinstance(maker, type) else getattr(maker, "func", None) and maker
     first = (getattr(described, "__doc__", None) or "").strip().split("\n\n")[0].replace("`", "")

@@ -68,7 +68,6 @@ class Replay(NamedTuple):
 
 
 def _report(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return the input and the estimate of a filter."""
     mean, covariance = model.mean(episode), model.covariance(episode)
     return {"measurement": episode.measurement, "mean": mean, "covariance": covariance}
 
@@ -204,7 +203,6 @@ def _network_rows(network: _Network | None) -> Any:
 def _interpret_update(
     traced: TracedFilter, dtype: Any, given: dict[int, Any], network: _Network | None
 ) -> list[numpy.ndarray]:
-    """Return the results of an update in NumPy."""
 
     def read(argument: int, row: int) -> Any:
         return (_network_rows(network) if argument == ANSWER else given[argument])[row]

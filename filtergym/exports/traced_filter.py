@@ -680,7 +680,6 @@ def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Dec
 def _live_members(
     graph: Graph, classes: Sequence[int], after: Sequence[int], wanted: Sequence[int]
 ) -> list[int]:
-    """Return the members that some result depends on, now or later."""
 
     def read(nodes: Sequence[int]) -> set[int]:
         inputs = (node for node in graph.live(nodes) if graph.operations[node] == "input")

@@ -108,7 +108,6 @@ def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]
 
 
 def _log_lines(advice: Advice) -> Iterator[str]:
-    """Return sentences on the log, and on the use of its parts."""
     yield from reading_lines(advice.recording)
     share = advice.share
     counts = [

@@ -84,7 +84,6 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
 
 
 def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any]:
-    """Return the template's values of an environment in a scenario."""
     first = result.records[0]
     header, rows = _table(result)
     return {

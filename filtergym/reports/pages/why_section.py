@@ -45,7 +45,6 @@ def why_section(result: Result) -> list[dict[str, Any]]:
 
 
 def _row(result: Result, reason: Reason, against: bool) -> tuple[str, str, list[str]]:
-    """Return the row of a cause: its name, its condition, and its numbers."""
     numbers = [
         with_interval(reason.measurements, 100.0, negligible=0.005),
         with_interval(reason.share, 100.0, negligible=0.005),

@@ -222,7 +222,6 @@ def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
 
 
 def _label(advice: Advice, one: JudgedFilter) -> str:
-    """Return the name of a filter, and its role."""
     role = "fitted" if one.fitted else "rival" if one.name == advice.rival else ""
     role = "advised" if one is advice.advised else role
     return f"{one.name} ({role})" if role else one.name
@@ -440,7 +439,6 @@ def parameter_text(
 
 
 def _fits(advice: Advice) -> Iterator[str]:
-    """Return sentences on the fits themselves."""
     one = advice.fitted
     spread = advice.fits[one.name].spread
     if spread > DROP:
@@ -538,7 +536,6 @@ def _anchor(advice: Advice) -> Iterator[str]:
 
 
 def _warnings(advice: Advice) -> Iterator[str]:
-    """Return warnings that weaken the advice."""
     one, count = advice.advised, int(advice.recording.rows.sum())
     if count < FEW:
         yield f"{count} measurements are few: below {FEW} the parameters and the choice of a filter are uncertain."

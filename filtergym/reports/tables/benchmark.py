@@ -323,7 +323,6 @@ def run_benchmark(
 def _run_cells(
     wanted: Sequence[Cell], options: BenchmarkOptions, callbacks: Callbacks, workers: Workers, store: Store
 ) -> list[Result]:
-    """Run all competitors of some cells that the store lacks."""
     tick = callbacks.started(sum(cell.measurements for cell in wanted))
     # The requests, and the cell of each.
     asked = [(one, i) for i, cell in enumerate(wanted) for one in options.requests(cell)]

@@ -87,7 +87,6 @@ Found = Mapping[tuple[str, str, str], Any]
 
 
 def _rounded(estimate: Any, digits: int) -> str:
-    """Return the value and interval with so many decimals."""
     if estimate is None or estimate.value is None or math.isnan(estimate.value):
         return "-"
     low, high = estimate.low, estimate.high
@@ -121,7 +120,6 @@ def _consistency_columns(found: Found, has_one_band: bool) -> dict[str, Column]:
 
 
 def _prediction_columns(records: Sequence[Any], found: Found) -> dict[str, Column]:
-    """Return the error and correlation of every group of predicted numbers."""
     groups = {r.component: r.unit for r in records if r.metric == "prediction_error"}
 
     def error(group: str, name: str) -> str:

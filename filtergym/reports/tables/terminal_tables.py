@@ -320,7 +320,6 @@ def competitors_table(
 
 
 def _widest(table: Table) -> int:
-    """Return the columns that a table needs without folding."""
     return Measurement.get(_MEASURING, _MEASURING.options, table).maximum
 
 

@@ -86,7 +86,6 @@ def worst_figures(
 
 
 def _titles(one: WorstTrack, phrases: Mapping[str, str]) -> tuple[str, str]:
-    """Return the title of an episode: seed, main cause and cost."""
     against = "" if one.ratio is None else f",\n{one.ratio:.3g} times {one.opponent}"
     cause = phrases.get(one.causes[0], one.causes[0]) if one.causes else "under no cause in particular"
     return f"episode {one.seed}\nmostly {cause}", f"mean cost {one.cost:.3g}{against}"
