@@ -1,5 +1,5 @@
 # Two commands do everything on a machine with Python >= 3.11: `make benchmark` and `make test`.
-# What Python has compiled of the sources serves the other processes and the next run.
+# Compiled Python files serve the other processes and the next run.
 unexport PYTHONDONTWRITEBYTECODE
 PYTHON ?= python3
 # Processes of `make benchmark`; each takes up to half a GB.
@@ -36,10 +36,10 @@ DISTRIBUTIONS := build/distributions
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
 
-test: $(VENV)/.dev  ## run the tests of code, without what only whole programs show
+test: $(VENV)/.dev  ## run the tests of code, without tests of whole programs
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not claims"
 
-claims: $(VENV)/.dev  ## test what is said of results: tables, rankings, limits, records
+claims: $(VENV)/.dev  ## test the statements on results: tables, rankings, limits, records
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "claims and not slow"
 
 test-slow: $(VENV)/.dev  ## run whole programs: pages, recipes, reproductions, a browser, clusters
@@ -73,7 +73,7 @@ test-cluster: $(VENV)/.dev  ## tests on clusters of Ray and Dask, whose packages
 	build/cluster/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[cluster]"
 	OMP_NUM_THREADS=1 build/cluster/bin/python -m pytest tests/test_parallel.py -k cluster
 
-test-extras: test-cluster test-lowest  ## each extra alone does its work, and is asked for where it is missing; lowest versions
+test-extras: test-cluster test-lowest  ## each extra alone works, and a sentence names a missing one; lowest versions
 	build/cluster/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
 	OMP_NUM_THREADS=1 build/cluster/bin/python tests/check_extras.py build/extras
 	$(PYTHON) -m venv build/lowest-extras
@@ -96,13 +96,13 @@ test-pythons:  ## core tests with every newer Python that is found
 test-processors: $(VENV)/.dev  ## parity, gradients and stored trajectories as other processors compute them
 	OMP_NUM_THREADS=1 $(BIN)/python tests/check_processors.py -n 2 --dist worksteal
 
-test-without-unix: $(VENV)/.dev  ## core tests as on Windows, without what only Unix has
+test-without-unix: $(VENV)/.dev  ## core tests as on Windows, without functions of Unix only
 	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python -m pytest -p without_unix $(CORE_TESTS)
 
-test-parts: $(VENV)/.dev  ## delete each part beyond the core, one at a time, and run what is left; ten minutes
+test-parts: $(VENV)/.dev  ## delete each part beyond the core, one at a time, and run the rest; ten minutes
 	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python tests/check_parts.py
 
-distributions: $(VENV)/.dev  ## build what would be published; try the wheel, and the tests of the unpacked source
+distributions: $(VENV)/.dev  ## build the distributions; test the wheel and the unpacked source
 	rm -rf $(DISTRIBUTIONS)
 	$(BIN)/python -m build --outdir $(DISTRIBUTIONS) . > /dev/null
 	$(PYTHON) -m venv $(DISTRIBUTIONS)/venv
@@ -112,7 +112,7 @@ distributions: $(VENV)/.dev  ## build what would be published; try the wheel, an
 	cd $(DISTRIBUTIONS)/source && ../venv/bin/python -m pip install --quiet --constraint constraints.txt \
 	  --editable . pytest hypothesis && OMP_NUM_THREADS=1 ../venv/bin/python -m pytest $(SOURCE_TESTS)
 
-publishable: $(VENV)/.dev  ## ask the field's own tools about packages, workflows, licences and types; needs an index
+publishable: $(VENV)/.dev  ## check with the field's own tools packages, workflows, licences and types; needs an index
 	$(BIN)/python tests/check_publishable.py build/publishable
 
 check: $(VENV)/.dev  ## format, lint and types
@@ -126,10 +126,10 @@ check: $(VENV)/.dev  ## format, lint and types
 docs: $(VENV)/.dev  ## build the documentation into site/
 	$(SITE)
 
-numbers: $(VENV)/.dev  ## tune, train and ship again, and make every published table; hours, goes on after an interruption
+numbers: $(VENV)/.dev  ## tune, train and ship again, and make every published table; hours, resumes after an interruption
 	$(MAKE) -f docs/make/numbers.mk JOBS=$(JOBS)
 
-format: $(VENV)/.dev  ## put the code into its form
+format: $(VENV)/.dev  ## format the code
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
 
@@ -146,5 +146,5 @@ $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,report,agents,dev]"
 	touch $@ $(VENV)/.core
 
-clean:  ## remove everything that make made
+clean:  ## remove everything made by make
 	rm -rf $(VENV) build site jupyter_execute *.egg-info

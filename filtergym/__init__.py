@@ -61,13 +61,14 @@ MODULES = {
     "state_space": "own_models",
     "tidy_records": "functions",
 }
-"""Where names of this package come from, when they are first used."""
+"""Module of each name of this package, imported when the name is first used."""
 
 register()
 
 
 def register_task(task: "type[Task]", baselines: "Baselines | None" = None) -> None:
-    """Make an environment of your own a citizen: it lists, makes, evaluates, renders and trains like the others.
+    """Register an environment of your own: it can then be listed, made, evaluated, rendered and trained on as the
+    others.
 
     Call it where your module or package is imported, not inside a function. Then any process finds the
     environment by ``module:id``, as in ``gymnasium.make("my_package:mine/Pendulum-v0")`` and on the command
@@ -75,13 +76,13 @@ def register_task(task: "type[Task]", baselines: "Baselines | None" = None) -> N
     by itself.
 
     Args:
-        task: class that keeps the contract of :class:`filtergym.envs.contract.task.Task`.
-        baselines: what it is compared with; without them random actions are its only policy, and there is no
-            score.
+        task: class that fulfils the contract of :class:`filtergym.envs.contract.task.Task`.
+        baselines: its filters, policies and references; without them random actions are its only policy, and
+            there is no score.
 
     Raises:
-        ValueError: if the task does not keep the contract, computes arrays of other shapes than it declares, its id is
-            taken, or the table does not fit it.
+        ValueError: if the task does not fulfil the contract, computes arrays of other shapes than it declares, its id
+            is taken, or the table does not fit it.
     """
     from .baselines.catalogue import add_baselines
     from .envs.engine.registration import add_task

@@ -27,7 +27,7 @@ from .envs.contract.failures import own_line
 from .envs.engine.catalogue import modules_from
 
 Commands = Mapping[str, Callable[..., None] | str]
-"""Functions by the names of their commands; or ``module:function`` of what is imported when it is called."""
+"""Functions by the names of their commands, or ``module:function`` for an import on the first call."""
 GROUPS: Mapping[str, Commands] = {
     "Use an environment": {
         "list": "listing:list_environments",
@@ -57,10 +57,10 @@ GROUPS: Mapping[str, Commands] = {
     },
 }
 MARKUP: Any = "markdown"
-"""Of help: in rich's own, the extra in filtergym[fast] would be taken for a style."""
+"""Markup of the help; with rich's own, the extra in filtergym[fast] would be read as a style."""
 REPORT = (
-    "--debug shows where it happened: if that is not in code of your own, please report it with what it shows and with "
-    "what filtergym doctor prints"
+    "--debug shows the traceback: if it ends outside your own code, please report it with the traceback and the "
+    "output of filtergym doctor"
 )
 
 
@@ -76,7 +76,7 @@ def _general(
     ] = False,
     no_cache: Annotated[
         bool,
-        typer.Option("--no-cache", help="Neither read nor keep compiled code in the user's cache folder."),
+        typer.Option("--no-cache", help="Neither read nor store compiled code in the user's cache folder."),
     ] = False,
 ) -> None:
     """Gymnasium environments for adaptive-filter benchmarking. With --debug, an error shows its traceback."""
@@ -85,18 +85,18 @@ def _general(
 
 
 class Program(typer.core.TyperGroup):
-    """Commands in groups, each imported when it is called: whoever asks for help need not wait for all libraries."""
+    """Commands in groups, each imported when it is called, so that the help needs no library."""
 
     groups: Mapping[str, Commands]
     listing: bool = False
-    """Whether commands are only named, each with its first sentence."""
+    """Whether the commands are only listed, each with its first sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names, in their order."""
+        """Return the names of the commands, in their order."""
         return [name for commands in self.groups.values() for name in commands]
 
     def get_command(self, ctx: Any, name: str) -> Any:
-        """Return a command; None where there is none of that name."""
+        """Return the command of a name; None where there is none."""
         for group, commands in self.groups.items():
             if name in commands:
                 return (
@@ -105,7 +105,7 @@ class Program(typer.core.TyperGroup):
         return None
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help of the program, which names its commands."""
+        """Write the help of the program, with the names of its commands."""
         self.listing = True
         super().format_help(ctx, formatter)
         self.listing = False
@@ -127,7 +127,7 @@ def import_command(command: Callable[..., None] | str) -> Callable[..., None]:
     if place not in sys.modules:
         with without_collection():  # a hundred thousand objects come, none of which is garbage
             importlib.import_module(place)
-        gc.freeze()  # they stay to the end: nobody need look through them again
+        gc.freeze()  # they live to the end: the collector need not visit them again
     function: Callable[..., None] = getattr(sys.modules[place], name)
     return function
 
@@ -140,13 +140,13 @@ def _command(name: str, command: Callable[..., None] | str) -> Any:
 
 @functools.cache
 def _docstrings(module: str) -> dict[str, str | None]:
-    """Return the docstrings of a module of commands, by the names of its functions, and import nothing."""
+    """Return the docstrings of a module of commands, by the names of its functions, without an import."""
     text = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
     return {n.name: ast.get_docstring(n) for n in ast.parse(text).body if isinstance(n, ast.FunctionDef)}
 
 
 def _listed(name: str, command: Callable[..., None] | str, group: str) -> Any:
-    """Return a command that has nothing but its help, read from the text of its module."""
+    """Return a command that has its help only, read from the text of its module."""
     if isinstance(command, str):
         module, _, function = command.partition(":")
         words = _docstrings(module)[function]
@@ -156,7 +156,7 @@ def _listed(name: str, command: Callable[..., None] | str, group: str) -> Any:
 
 
 def program_of(groups: Mapping[str, Commands]) -> Any:
-    """Return commands as one program, whose help shows them in groups; called with arguments, it ends in SystemExit."""
+    """Return commands as one program with grouped help; called with arguments, it ends in SystemExit."""
     app = typer.Typer(
         cls=type("Program", (Program,), {"groups": groups}),
         callback=_general,
@@ -175,19 +175,19 @@ def application() -> Any:
 
 
 def main(program: Callable[[], Any] = application, name: str = "filtergym") -> None:
-    """Run the command line, or another program with its ways of ending.
+    """Run the command line, or another program with the same handling of errors.
 
-    A user's mistake, or what the operating system refuses, ends in one sentence and exit code 2; what nobody expected
-    in one that asks for a report, and exit code 1. With ``--debug`` both end in a traceback.
+    A user's mistake, or a refusal of the operating system, ends in one sentence and exit code 2; an unexpected error in
+    one that requests a report, and exit code 1. With ``--debug`` both end in a traceback.
     """
     debug = "--debug" in sys.argv
-    with suppress(ValueError):  # in a thread, where nobody may
+    with suppress(ValueError):  # a thread may not
         signal.signal(signal.SIGTERM, _end)
     open_output()
     try:
         with warnings.catch_warnings(), nullcontext() if sys.flags.safe_path else modules_from(os.getcwd()):
             warnings.showwarning = _show_warning
-            # Under one name, however it was started: the shell asks for completions of that.
+            # One name for every way of starting it, since the shell completes that name.
             program()([word for word in sys.argv[1:] if word != "--debug"], prog_name=name)
     except Exception as error:
         if debug:
@@ -202,7 +202,7 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
 
 
 def _end(number: int, _: Any) -> None:
-    """End as at an error: what is unfinished is taken away on the way out."""
+    """Exit as after an error, so that unfinished files are removed."""
     sys.exit(128 + number)
 
 
@@ -211,7 +211,6 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 
 def _print_error(text: str, style: str) -> None:
-    """Print one line to standard error."""
     Console(stderr=True, highlight=False, emoji=False).print(
         text.replace("\n", " "), style=style, markup=False, soft_wrap=True
     )

@@ -1,4 +1,4 @@
-"""Adapters: filters of other libraries, and of one's own that know one track only, as estimators.
+"""Adapters that make estimators of filters of other libraries, and of a user's filters of a single track.
 
 See docs/own_estimator.md. ``pip install 'filtergym[adapters]'`` brings filterpy and Stone Soup.
 """
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 __all__ = ["FilterpyEstimator", "SingleTrackEstimator", "StoneSoupEstimator"]
 
 LIBRARIES = {"FilterpyEstimator": ("filterpy", "adapters"), "StoneSoupEstimator": ("stonesoup", "stone_soup")}
-"""What an adapter needs, and its module."""
+"""Library that an adapter needs, and the module of the adapter."""
 
 
 def __getattr__(name: str) -> Any:
-    # On first use: who has one of the libraries does not need the other.
+    # On first use: a user of one library does not need the other.
     if name not in LIBRARIES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     library, module = LIBRARIES[name]

@@ -1,7 +1,7 @@
-"""What stands beyond the core, and how the core finds it: tables of places, ``module:name``, imported on first use.
+"""Tables of the parts beyond the core, as places ``module:name`` that are imported on first use.
 
-A companion enters its line here and nothing else of the core names it. Where its module is missing, what it offers is
-refused, and everything else works.
+A companion enters its line here; no other file of the core names it. Where its module is missing, the core refuses
+its functions, and everything else works.
 """
 
 import importlib
@@ -18,28 +18,30 @@ PREFIXES: Mapping[str, str] = {
     "file:": "evaluation.competitors.file_estimates:find_estimates",
     "gated:": "agents.gate:find_gated",
 }
-"""Before a competitor's name: a function of the name, of what follows the prefix, of the problem and of what finds
-other competitors of it, that returns a :class:`.evaluation.competitors.kinds.Competitor`."""
+"""Prefixes of competitors' names, each with a function of the name, the rest after the prefix, the problem and the
+finder of other competitors, that returns a :class:`.evaluation.competitors.kinds.Competitor`.
+"""
 SOURCES: Sequence[str] = ("baselines.fitted_filters:ADVISED", "agents.named_policies:LEARNED")
-"""Each a :class:`.evaluation.competitors.kinds.CompetitorFiles`, of competitors in files and folders."""
+"""Sources of competitors in files and folders, each a :class:`.evaluation.competitors.kinds.CompetitorFiles`."""
 WATCHES: Sequence[str] = ("agents.envelope:watch_live",)
-"""Functions of a model, of the maker of a competitor and of its kind, which return what watches it where it runs live
-(:class:`.evaluation.competitors.online_state.Watch`), or None."""
+"""Functions of a model, of the maker of a competitor and of its kind, which return a monitor of its live run
+(:class:`.evaluation.competitors.online_state.Watch`), or None.
+"""
 DEPARTURES: Sequence[str] = ("agents.envelope:departure",)
 """Functions of the class of a task, of the maker of an agent, of a scenario's data and of parameters, which return a
-sentence on how these depart from what the agent was trained on, or None."""
+sentence on how the data depart from the agent's training, or None.
+"""
 MODEL_COMPANIONS: Sequence[str] = ("envs.logs.own_models:state_space_log_format",)
-"""Functions of the definition of a model of one's own and of its defaults, each of which returns a companion of its
-task."""
+"""Functions of the definition of a user's model and of its defaults, each of which returns a companion of its task."""
 READERS: Sequence[str] = ("envs.logs.reading:RECORDINGS", "envs.logs.reading:FLIGHTS")
-"""Each a :class:`.envs.data.scenario_data.Reader`, in the order in which they are tried."""
+"""Readers of data, each a :class:`.envs.data.scenario_data.Reader`, in the order in which they are tried."""
 
 
 def load(place: str, package: str | None = PACKAGE) -> Any:
-    """Import what stands at ``module:name`` of a package.
+    """Import the object at ``module:name`` of a package.
 
     Raises:
-        ValueError: if this installation does not hold the module.
+        ValueError: if this installation lacks the module.
     """
     module, _, name = place.partition(":")
     path = f"{package}.{module}"
@@ -48,11 +50,11 @@ def load(place: str, package: str | None = PACKAGE) -> Any:
     except ModuleNotFoundError as error:
         if error.name != path:
             raise
-        raise ValueError(f"this installation of filtergym holds no {module}") from None
+        raise ValueError(f"this installation of filtergym lacks {module}") from None
 
 
 def load_present(places: Iterable[str], package: str | None = PACKAGE) -> Iterator[Any]:
-    """Import what stands at several places of a package, without those whose module this installation does not hold."""
+    """Import the objects at several places of a package, except those whose module this installation lacks."""
     for place in places:
         module = f"{package}.{place.partition(':')[0]}"
         if module in sys.modules or _is_there(module):

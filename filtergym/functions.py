@@ -1,4 +1,4 @@
-"""Functions of the package: evaluate, record, and make a policy for a loop of one's own."""
+"""Functions of the package: evaluate, record, and make a policy for a user's own loop."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -46,26 +46,26 @@ def evaluate(
         competitors: a name, names, or a mapping from a name to a name, a class, or an object: with a method ``predict``
             (:class:`.kinds.Policy`), or with ``start`` and ``update``
             (:class:`.kinds.Estimator`); see :func:`.names.competitor` for what a name can be. A
-            model of Stable-Baselines3 is shown observations as its ``VecNormalize`` normalises them, if it holds one.
+            model of Stable-Baselines3 observes what its ``VecNormalize`` normalises, if it contains one.
         scenario: name of a scenario, path of flights or of a recording, or a trajectory; default: the environment's
             training distribution.
         episodes: Monte Carlo runs M.
         seed: number of the experiment.
         split: "test" (default), "validation" or "train"; splits share no episode.
-        control: demand this control; by default every policy runs in its own.
-        progress: called with the number of measurements done, now and then.
-        trust: load models' zips, which can execute code.
+        control: control of all policies; by default every policy runs in its own.
+        progress: function that is called repeatedly with the number of measurements done.
+        trust: whether to load models' zips, which can execute code.
         **keywords: parameters of the task; also ``backend``, ``threads``, ``tracks``, ``drawn_episodes``, ``strict``
             of :class:`.evaluate.Experiment`, and ``workers`` of :func:`.evaluate.run_experiment`.
 
     Returns:
         Errors, costs and records over the dimensions policy, episode and time; see
         :func:`.evaluate.run_experiment`. Costs are compared with the paper's algorithm where it is among the
-        competitors, whatever it is called there.
+        competitors, under any name.
 
     Raises:
-        ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
-            an estimator that does not answer with mean and covariance.
+        ValueError: for unknown names, a user's name that is taken, a policy that does not fit the control, or an
+            estimator that does not return mean and covariance.
     """
     problem = import_problem(env)
     makers = {found.name: found.maker for found in find_competitors(problem, competitors, trust)}
@@ -83,23 +83,23 @@ def record(
     backend: str = "auto",
     **keywords: Any,
 ) -> Recording:
-    """Record what the sensors say in episodes of the simulation, and the truth.
+    """Record the measurements of simulated episodes, and the truth.
 
-    They are the episodes that an evaluation of the same scenario, seed and split flies. Replayed on the same backend,
+    They are the episodes of an evaluation with the same scenario, seed and split. Replayed on the same backend,
     observations, estimates and costs are the same, bit for bit.
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         scenario: name of a scenario, a trajectory, or flights; default: the environment's training distribution.
-        episodes: how many.
+        episodes: number of episodes.
         seed: number of the experiment.
         split: "test" (default), "validation" or "train".
-        progress: called with the number of measurements done, now and then.
-        backend: what computes the steps, "auto", "compiled" or "numpy".
+        progress: function that is called repeatedly with the number of measurements done.
+        backend: implementation of the steps, "auto", "compiled" or "numpy".
         **keywords: parameters of the task.
 
     Raises:
-        ValueError: for unknown names, a closed loop, or more measurements than a recording may hold.
+        ValueError: for unknown names, a closed loop, or more measurements than a recording may contain.
     """
     task = import_task(env)
     return record_experiment(
@@ -113,9 +113,9 @@ def requests_of(
     """Return the requests of an evaluation, one for each competitor.
 
     Args:
-        problem: whose competitors these are.
+        problem: problem of the competitors.
         experiment: as :meth:`.baselines.problem.Problem.experiment` makes it.
-        competitors: that take part.
+        competitors: those that take part.
         curves: whether figures will be drawn.
     """
     paper = problem.paper_among({one.name: one.maker for one in competitors})
@@ -139,19 +139,19 @@ def make_policy(
     """Make a policy to step an environment with: the paper's, a tuned one, an agent, or one of your own.
 
     It has Stable-Baselines3's ``predict(observation, state, episode_start, deterministic)``, for one observation as for
-    a batch, and does in a loop of your own what it does in an evaluation.
+    a batch, and acts in a loop of your own as in an evaluation.
 
     Args:
         env: an environment, single or native vector, in which the policy acts; or the id of one, which is then made
             with ``gymnasium.make(id, **made.keywords)``.
         policy: a name or a path, see :func:`.names.competitor`, or an object or a class as in :func:`evaluate`.
-        control: for an id: demand this control; by default the policy's own.
-        scenario: for an id: of the environment.
-        trust: load a model's zip, which can execute code.
+        control: for an id: the control; by default the policy's own.
+        scenario: for an id: name of the scenario.
+        trust: whether to load a model's zip, which can execute code.
         **keywords: for an id: parameters of the task.
 
     Raises:
-        ValueError: for unknown names, what is no policy, and a policy that does not fit the environment.
+        ValueError: for unknown names, an object that is no policy, and a policy that does not fit the environment.
     """
     if isinstance(env, str):
         problem = import_problem(env)
@@ -176,13 +176,13 @@ def make_policy(
 
 
 def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bool = False) -> SteppingPolicy:
-    """Make a policy to step the environment of an experiment with, and that environment's model.
+    """Make a policy for the environment of an experiment, and that environment's model.
 
     Args:
-        problem: whose policy it is.
-        policy: as of :func:`make_policy`, likewise what is refused.
-        experiment: whose control, scenario and parameters the environment has.
-        trust: likewise.
+        problem: problem of the policy.
+        policy: name, path, object or class; errors are those of :func:`make_policy`.
+        experiment: experiment that gives the environment its control, scenario and parameters.
+        trust: whether to load a model's zip, which can execute code.
     """
     name, maker = _named_policy(problem, policy, trust)
     control = control_of(maker, experiment.control, problem.task, name)
@@ -192,10 +192,10 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
 
 
 def _named_policy(problem: Problem, policy: Any, trust: bool) -> tuple[str, Any]:
-    """Return the name of a policy in errors, and what makes it.
+    """Return the name of a policy in errors, and its maker.
 
     Raises:
-        ValueError: for what does not act.
+        ValueError: for a competitor that does not act.
     """
     if isinstance(policy, str | Path):
         name, maker = str(policy), find_competitor(problem, policy, trust).maker
@@ -219,7 +219,7 @@ def _model_of(env: Any) -> Any:
     """Return the model of an environment.
 
     Raises:
-        ValueError: if it is none of filtergym, or computes in torch.
+        ValueError: if the environment is none of filtergym, or computes in torch.
     """
     inner = env.unwrapped if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv) else env
     if not isinstance(inner, TaskEnv | TaskVectorEnv):
@@ -229,20 +229,20 @@ def _model_of(env: Any) -> Any:
         )
     if inner.privileged:
         raise ValueError(
-            "this environment shows what no policy may know: make it without observation='asymmetric', or show "
-            "a policy of your own observation['observation']"
+            "this environment shows the truth, which a policy may not observe: make it without "
+            "observation='asymmetric', or show a policy of your own observation['observation']"
         )
     if inner.fleet.mixes_scenarios:
         raise ValueError(
-            "a policy is made for the parameters of one scenario, and this environment flies several: make it with one"
+            "a policy is made for the parameters of one scenario, and this environment has several: make it with one"
         )
     if inner.backend == "torch":
-        raise ValueError("policies answer in NumPy arrays: make the environment with another backend")
+        raise ValueError("policies return NumPy arrays: make the environment with another backend")
     return inner.model
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:
-    """Return every metric of every policy with its interval, the environment's own among them.
+    """Return every metric of every policy with its interval, the metrics of the environment included.
 
     Args:
         dataset: from :func:`evaluate`; see :func:`.evaluation.running.metrics.tidy_records`.

@@ -1,4 +1,4 @@
-"""Run what competes in a loop of one's own."""
+"""Run a competitor in a user's own loop."""
 
 import dataclasses
 from datetime import timedelta
@@ -38,24 +38,25 @@ def online(
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         policy: a name or a path, see :func:`~filtergym.names.competitor`, or an object or a class as in
-            :func:`~filtergym.evaluate`. A file of ``filtergym advise`` brings the interval, the noise level and the
-            parameters of the log that it was advised for, and the origin of x and y where that had latitude and
-            longitude, which ``update`` takes then.
-        control: demand this control; by default the policy's own.
-        scenario: whose parameters are taken; default: the environment's.
-        tracks: how many are followed side by side.
-        regular: every measurement comes, one sampling interval after the one before; some filters are then simpler.
-        second_sensor: a measurement holds what only recordings do, such as odometry; what ``advise`` has fitted to one
-            takes it anyway.
-        lag: how late a measurement may come: after how many that are newer, or a :class:`datetime.timedelta` after the
-            newest. These are kept, each with the state of the filter before it: in ManeuveringTarget from 5 kB each
-            (``imm``) to 43 kB (``semi-markov-vague``), for each eight tracks begun. Default: times must increase.
-        backend: what computes, "auto", "compiled" or "numpy".
-        trust: load a model's zip, which can execute code.
+            :func:`~filtergym.evaluate`. A file of ``filtergym advise`` contains the interval, the noise level and the
+            parameters of the log that it was advised for. Where that log had latitude and longitude, it also contains
+            the origin of x and y, and ``update`` accepts latitude and longitude.
+        control: control of the policy; by default its own.
+        scenario: scenario that gives the parameters; default: the environment's.
+        tracks: number of tracks side by side.
+        regular: whether every measurement arrives, one sampling interval after the last; some filters are then simpler.
+        second_sensor: whether a measurement contains fields that only recordings have, such as odometry; a filter that
+            ``advise`` has fitted to such a recording uses them in any case.
+        lag: largest delay of a measurement: a number of newer measurements, or a :class:`datetime.timedelta` to the
+            newest one. The newer ones are stored, each with the state of the filter before it: in ManeuveringTarget
+            from 5 kB each (``imm``) to 43 kB (``semi-markov-vague``), for each eight tracks begun. Default: times must
+            increase.
+        backend: implementation of the steps, "auto", "compiled" or "numpy".
+        trust: whether to load a model's zip, which can execute code.
         **keywords: parameters of the task.
 
     Raises:
-        ValueError: for unknown names, and what needs the truth or later measurements.
+        ValueError: for unknown names, and for competitors that need the truth or later measurements.
     """
     problem = import_problem(env)
     for what, value in (("regular", regular), ("second_sensor", second_sensor), ("trust", trust)):

@@ -1,4 +1,4 @@
-"""A name and what it stands for: the one place where names become competitors."""
+"""Names of competitors: the one place where a name becomes a competitor."""
 
 import os
 import re
@@ -19,26 +19,26 @@ MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
-    """Return what makes a policy, estimator, reference or bound.
+    """Return the maker of a policy, estimator, reference or bound.
 
     Args:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
             ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's,
             ``isolated:module:Class`` of an estimator in a process of its own, ``exec:COMMAND`` of any program, or
-            ``gated:NAME`` of a policy: an estimator that answers with that one's filter while it is trusted, else with
-            a classical filter, or ``file:PATH`` of estimates that another program has made. A path is that of a file or
-            folder, whatever else has its name.
-        trust: load a ``.zip``, which can execute code.
+            ``gated:NAME`` of a policy: an estimator that returns the estimate of that policy's filter while it is
+            trusted, else that of a classical filter, or ``file:PATH`` of another program's estimates. A path always
+            means a file or folder, even if something else has its name.
+        trust: whether to load a ``.zip``, which can execute code.
 
     Raises:
-        ValueError: if there is no such name, what it names is no competitor, or it takes ``trust``.
+        ValueError: if there is no such name, it names no competitor, or it needs ``trust``.
     """
     return find_competitor(import_problem(env), name, trust).maker
 
 
 def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> Competitor:
-    """Return what a name stands for in a problem; names and refusals as of :func:`competitor`."""
+    """Return the competitor of a name in a problem; names and errors as of :func:`competitor`."""
     if isinstance(name, Path):
         found = _find_in_files(problem, str(name.absolute()), trust)
         if found is None:
@@ -63,7 +63,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
         for ending in file_endings():
             # Stable-Baselines3 saves "mine" as mine.zip. Unlike a Path, this takes a name that no file can have.
             if os.path.isfile(f"{name}{ending}"):
-                raise ValueError(f"unknown policy {name!r}: a file is named whole, {name}{ending}")
+                raise ValueError(f"unknown policy {name!r}: write the whole file name, {name}{ending}")
         raise nearest("policy", name, shipped_names(problem))
     with running(name):
         holder = import_user_module(module, f"cannot load policy {name!r}")
@@ -77,7 +77,7 @@ def _sources() -> Iterator[CompetitorFiles]:
 
 
 def _find_in_files(problem: Problem, name: str, trust: bool) -> Competitor | None:
-    """Return the competitor of a file or folder of that name, or of one that is shipped; None where there is none."""
+    """Return the competitor of a file or folder of that name, or of a shipped one; None where there is none."""
     found = (source.find(name, problem, trust, partial(_find_shipped, problem)) for source in _sources())
     return next((one for one in found if one is not None), None)
 
@@ -90,7 +90,7 @@ def _find_shipped(problem: Problem, name: str, what: str) -> Competitor:
 
 
 def file_endings() -> list[str]:
-    """Return the endings of files that hold competitors."""
+    """Return the endings of files that contain competitors."""
     return [ending for source in _sources() for ending in source.endings]
 
 
@@ -100,20 +100,20 @@ def learned_names(id: str) -> list[str]:
 
 
 def ranked_names(problem: Problem) -> list[str]:
-    """Return the names of all that is shipped for a problem and ranked: policies and estimators as they are, those that
-    were tuned, and agents.
+    """Return the names of all shipped and ranked competitors of a problem: policies and estimators as they are, tuned
+    ones, and agents.
     """
     known = problem.baselines
     return [*known.policies, *known.estimators, *problem.tuned_policies, *learned_names(problem.id)]
 
 
 def shipped_names(problem: Problem) -> list[str]:
-    """Return the names of all that is shipped for a problem: its own competitors, tuned ones and agents."""
+    """Return the names of all shipped competitors of a problem: its own, tuned ones and agents."""
     return [*problem.names, *learned_names(problem.id)]
 
 
 def adopt(found: Any) -> Any:
-    """Return an object of a user as a competitor: a model of a known library behind its adapter, others as they are."""
+    """Return a user's object as a competitor: a model of a known library behind its adapter, others as they are."""
     for source in _sources():
         found = source.adopt(found)
     return found
@@ -124,7 +124,7 @@ def find_competitors(
     competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
     trust: bool = False,
 ) -> list[Competitor]:
-    """Return some competitors, each by its name; arguments and refusals as of :func:`~filtergym.evaluate`."""
+    """Return several competitors, each by its name; arguments and errors as of :func:`~filtergym.evaluate`."""
     if isinstance(competitors, str | Path):
         competitors = [competitors]
     if not isinstance(competitors, Mapping | Sequence):
@@ -139,9 +139,7 @@ def find_competitors(
         if name in shipped_names(problem):
             known = find_competitor(problem, name).maker
             if type(entry) is not type(known) or not bool(entry == known):
-                raise ValueError(
-                    f"{name!r} is the name of what {problem.id} has already: call your own something else"
-                )
+                raise ValueError(f"{name!r} is already a name of {problem.id}: choose another one")
     return [
         find_competitor(problem, entry, trust)._replace(name=name)
         if isinstance(entry, str | Path)
@@ -151,14 +149,16 @@ def find_competitors(
 
 
 def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
-    """Return names of competitors, where each ``module:Class`` is one in a process of its own.
+    """Return names of competitors, with each ``module:Class`` in a process of its own.
 
     Raises:
-        ValueError: for one behind a gate, which acts in this process.
+        ValueError: for a competitor behind a gate, which acts in this process.
     """
     for name in names:
         if name.startswith("gated:") and is_module(problem, name.removeprefix("gated:")):
-            raise ValueError(f"{name!r} acts in this process, beside the truth: an estimator can be isolated")
+            raise ValueError(
+                f"{name!r} acts in this process, beside the truth: only an estimator can be isolated"
+            )
     return [
         f"isolated:{name}" if is_module(problem, name) and not name.startswith((*PREFIXES,)) else name
         for name in names
@@ -166,5 +166,5 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
 
 
 def is_module(problem: Problem, name: str) -> bool:
-    """Whether a name is ``module:Class`` of a user."""
+    """Return whether a name is ``module:Class`` of a user."""
     return problem.find(name) is None and MODULE.fullmatch(name) is not None

@@ -34,20 +34,20 @@ from .names import find_competitor
 from .reports.tables.terminal_tables import plain_table
 
 CHUNK = 256
-"""Episodes flown side by side, and held in memory until they are written."""
+"""Number of episodes that are simulated side by side, and stored in memory until they are written."""
 RANDOM = "random"
-OF_THE_FACE = ("reward", "dtype")
-"""Keywords of ``gymnasium.make`` that are no parameters of the task, and change what an agent is given."""
+ENVIRONMENT_KEYWORDS = ("reward", "dtype")
+"""Keywords of ``gymnasium.make`` that are no parameters of the task, and change the agent's observation or reward."""
 
 
 class DatasetSummary(NamedTuple):
-    """A data set that was written."""
+    """A written data set."""
 
     name: str
-    """For ``minari.load_dataset``."""
+    """Name for ``minari.load_dataset``."""
     policy: str
     environment: dict[str, Any]
-    """Keywords of ``gymnasium.make``; data sets of the same ones can be combined."""
+    """Keywords of ``gymnasium.make``; data sets with equal ones can be combined."""
     episodes: int
     steps: int
     mean_return: float
@@ -55,11 +55,11 @@ class DatasetSummary(NamedTuple):
 
 
 def default_policies(problem: Problem, control: str | None = None) -> list[str]:
-    """Return the names of the paper's policy, of the tuned one that costs least, and of random actions.
+    """Return the names of the paper's policy, of the tuned one of least cost, and of random actions.
 
     Args:
-        problem: whose policies they are.
-        control: leave out those that do not act in it.
+        problem: problem of the policies.
+        control: control in which the policies must act; None: any.
     """
     paper = problem.baselines.score_paper
     names = [paper, problem.tuned_values.best_policy(control), RANDOM]
@@ -86,32 +86,32 @@ def write_datasets(
 ) -> list[DatasetSummary]:
     """Write the episodes of policies as Minari data sets, one for each policy.
 
-    A policy acts in its own control and with its own parameters, which its environment is made with. One that has no
+    The environment of a policy is made with the policy's own control and parameters. One that has no
     control of its own, such as ``random``, acts in the environment of the policy named before it: these two data sets
-    can be combined. All policies meet the same episodes. Where random actions are among the data sets of an
+    can be combined. All policies act in the same episodes. Where random actions are among the data sets of an
     environment, their mean return is its ``ref_min_score`` and the largest one its ``ref_max_score``.
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         policies: names or paths, see :func:`.names.competitor`; default: :func:`default_policies`.
         scenario: of the environment; default: its training distribution.
-        control: demand this control of all policies.
-        episodes: in each data set.
+        control: control of all policies.
+        episodes: number of episodes in each data set.
         seed: number of the experiment.
-        split: "train" (default), "validation" or "test"; held-out scenarios, and flights of one's own, take "test".
-        folder: where data sets are kept; default: where Minari keeps them, ``MINARI_DATASETS_PATH`` or
+        split: "train" (default), "validation" or "test"; held-out scenarios, and a user's flights, need "test".
+        folder: folder of the data sets; default: that of Minari, ``MINARI_DATASETS_PATH`` or
             ``~/.minari/datasets``.
-        namespace: that the names begin with; default: ``filtergym/maneuvering-target`` and the like.
-        progress: called with the number of decisions done, now and then.
-        trust: load a model's zip, which can execute code.
+        namespace: beginning of the names; default: ``filtergym/maneuvering-target`` and the like.
+        progress: function that is called repeatedly with the number of decisions done.
+        trust: whether to load a model's zip, which can execute code.
         **keywords: parameters of the task; also ``reward`` and ``dtype`` of ``gymnasium.make``.
 
     Returns:
-        What was written, in the order of the policies.
+        Summaries of the data sets, in the order of the policies.
 
     Raises:
-        ValueError: for unknown names, what does not act, a scenario that is held out, a data set that is there already,
-            a folder that cannot be written to, or without Minari. Then nothing is written.
+        ValueError: for unknown names, a competitor that does not act, a scenario that is held out, a data set that
+            exists already, a folder that cannot be written to, or without Minari. Then nothing is written.
     """
     problem = import_problem(env)
     experiment = problem.experiment(scenario, episodes, seed, split, control, keywords=keywords)
@@ -119,29 +119,29 @@ def write_datasets(
 
 
 class DatasetPlan(NamedTuple):
-    """Data sets before they are written; all that can be wrong with them but their place is refused by then."""
+    """Data sets before they are written; all errors except those of the folder have been raised by then."""
 
     experiment: Experiment
-    """Whose episodes they hold."""
+    """Experiment of the episodes."""
     seeds: list[int]
-    """Of the episodes."""
+    """Seeds of the episodes."""
     policies: list[SteppingPolicy]
-    """Each of a data set."""
+    """Policies, one for each data set."""
     names: list[str]
-    """Of the policies."""
-    of_the_face: dict[str, Any]
+    """Names of the policies."""
+    environment_keywords: dict[str, Any]
     """Keywords of ``gymnasium.make`` beside those of the policies."""
 
     @property
     def decisions(self) -> int:
-        """How many there are in all data sets."""
+        """Number of decisions in all data sets."""
         tasks = [policy.model.task for policy in self.policies]
         return len(self.seeds) * sum(task.horizon // task.decision_interval for task in tasks)
 
     def write(
         self, folder: Path | None = None, namespace: str | None = None, progress: Progress | None = None
     ) -> list[DatasetSummary]:
-        """Write the data sets; arguments, result and refusals as of :func:`write_datasets`."""
+        """Write the data sets; arguments, result and errors as of :func:`write_datasets`."""
         from minari.storage import get_dataset_path
 
         root = Path(folder) if folder is not None else get_dataset_path()
@@ -149,21 +149,21 @@ class DatasetPlan(NamedTuple):
         with whole_files(root) as waiting, _datasets_in(waiting):
             found = [self._write_one(i, name, progress or (lambda _: None)) for i, name in enumerate(names)]
             written = [entry for entry, _ in found]
-            _tell_scores(written, [dataset for _, dataset in found])
+            _store_scores(written, [dataset for _, dataset in found])
             for space in waiting.rglob("namespace_metadata.json"):
                 if (root / space.relative_to(waiting)).exists():  # it may say what the user has written there
                     space.unlink()
         return written
 
     def _write_one(self, i: int, name: str, progress: Progress) -> tuple[DatasetSummary, Any]:
-        """Write the data set of a policy; return what was written, and the data set."""
+        """Write the data set of a policy; return its summary, and the data set."""
         policy, stepping, id = self.names[i], self.policies[i], self.experiment.task.id
-        made_with = {**stepping.keywords, **self.of_the_face}
+        made_with = {**stepping.keywords, **self.environment_keywords}
         dataset: Any = None
         returns: list[float] = []
         for first in range(0, len(self.seeds), CHUNK):
             seeds = self.seeds[first : first + CHUNK]
-            part = transitions_of(id, stepping, seeds, progress, **self.of_the_face)
+            part = transitions_of(id, stepping, seeds, progress, **self.environment_keywords)
             returns += [float(episode.rewards.sum()) for episode in part]
             if dataset is None:
                 about = self._description(policy, stepping.control)
@@ -191,13 +191,13 @@ def plan_datasets(
     """Return the plan of data sets.
 
     Args:
-        problem: whose policies these are.
-        experiment: on it; its keywords may hold ``reward`` and ``dtype`` of ``gymnasium.make``, too.
-        policies: as of :func:`write_datasets`, likewise what is refused.
-        trust: likewise.
+        problem: problem of the policies.
+        experiment: experiment on it; its keywords may also contain ``reward`` and ``dtype`` of ``gymnasium.make``.
+        policies: names or paths; errors are those of :func:`write_datasets`.
+        trust: whether to load a model's zip, which can execute code.
     """
     try:
-        import h5py  # noqa: F401  (Minari says what it lacks only when it writes)
+        import h5py  # noqa: F401  (Minari reports that it is missing only when it writes)
         import minari.storage  # noqa: F401
     except ImportError as error:
         raise ValueError(
@@ -211,29 +211,31 @@ def plan_datasets(
         except ValueError as error:
             raise ValueError(f"{error}, or take the split test for data to be judged on") from error
     parameters = dict(experiment.keywords)
-    of_the_face = {name: parameters.pop(name) for name in OF_THE_FACE if name in parameters}
-    check_names(cls, parameters, OF_THE_FACE)
+    environment_keywords = {name: parameters.pop(name) for name in ENVIRONMENT_KEYWORDS if name in parameters}
+    check_names(cls, parameters, ENVIRONMENT_KEYWORDS)
     chosen = list(policies or default_policies(problem, control))
     acting: list[SteppingPolicy] = []
     for policy in chosen:
-        before = acting[-1] if acting and _suits_any(find_competitor(problem, policy, trust).maker) else None
+        before = (
+            acting[-1] if acting and _has_any_control(find_competitor(problem, policy, trust).maker) else None
+        )
         own = before.control if before is not None and control is None else control
         theirs = {} if before is None else before.task_keywords
         fitting = replace(experiment, control=own, keywords={**theirs, **parameters})
         acting.append(find_policy(problem, policy, fitting, trust))
-    return DatasetPlan(experiment, seeds, acting, [str(policy) for policy in chosen], of_the_face)
+    return DatasetPlan(experiment, seeds, acting, [str(policy) for policy in chosen], environment_keywords)
 
 
-def _suits_any(maker: Any) -> bool:
-    """Whether a policy has no control of its own."""
+def _has_any_control(maker: Any) -> bool:
+    """Return whether a policy has no control of its own."""
     return getattr(maker, "control", None) is None and getattr(maker, "action_space", None) is None
 
 
 def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) -> list[str]:
-    """Name the data sets of policies.
+    """Return the names of the policies' data sets.
 
     Raises:
-        ValueError: for a namespace that is none, and if a data set has one of the names.
+        ValueError: for an invalid namespace, and if a data set has one of the names.
     """
     from minari.dataset.minari_dataset import parse_dataset_id
 
@@ -254,13 +256,13 @@ def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) 
 
 
 def _minari_name(text: str) -> str:
-    """Letters, digits and hyphens, which Minari takes for a name."""
+    """Return the text in letters, digits and hyphens, as Minari requires of a name."""
     return re.sub(r"[^\w-]+", "-", text).strip("-")
 
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Let Minari keep its data sets in a folder; it asks the environment variable every time."""
+    """Let Minari store its data sets in a folder; it reads the environment variable every time."""
     variable = "MINARI_DATASETS_PATH"
     before = os.environ.get(variable)
     os.environ[variable] = str(folder.absolute())
@@ -274,7 +276,6 @@ def _datasets_in(folder: Path) -> Iterator[None]:
 
 
 def _buffers(episodes: Sequence[Transitions]) -> list[Any]:
-    """Episodes in Minari's form."""
     from minari.data_collector import EpisodeBuffer
 
     return [
@@ -295,7 +296,7 @@ def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, a
     import minari
 
     with warnings.catch_warnings():
-        # It asks for the address of an author and a link to code, which the data of a simulation need not have.
+        # Minari warns without an author's address and a link to code, which simulated data do not need.
         warnings.filterwarnings("ignore", r"`(author_email|code_permalink)` is set to None", UserWarning)
         return minari.create_dataset_from_buffers(
             name,
@@ -310,8 +311,8 @@ def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, a
         )
 
 
-def _tell_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> None:
-    """Say which mean return is 0 and which is 1 in ``minari.get_normalized_score``, where both are known."""
+def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> None:
+    """Store the mean returns that are 0 and 1 in ``minari.get_normalized_score``, where both are known."""
     for entry, dataset in zip(written, stored, strict=True):
         alike = [other for other in written if other.environment == entry.environment]
         low = next((other.mean_return for other in alike if other.policy == RANDOM), None)
@@ -322,7 +323,7 @@ def _tell_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> No
 
 
 def datasets_table(written: Iterable[DatasetSummary]) -> Table:
-    """Return what data sets hold; those whose environments are the same can be combined."""
+    """Return a table of data sets; those with the same environment can be combined."""
     table = plain_table()
     table.add_column("data set", overflow="fold")
     table.add_column("environment", overflow="fold")

@@ -1,4 +1,4 @@
-"""Angles of a state-space model: those that are declared, and turns that its functions take off and nobody declares."""
+"""Angles of a state-space model: declared ones, and undeclared ones whose functions remove whole turns."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -13,27 +13,27 @@ from .envs.linear.sensors import Channel
 from .filters.angles import PERIODS
 
 STEPS = ((0.01, 1001), (1.0, 1001))
-"""Steps, and how many, by which a component of the state is moved to find jumps: 10 rad and 1,000 degrees."""
+"""Steps, and their number, by which a component of the state is moved to find jumps: 10 rad and 1,000 degrees."""
 EXACT = 1e-3
 """Share of a turn by which a jump may differ from one."""
 HALVINGS = 30
-"""Of the distance over which a jump is confirmed."""
+"""Halvings of the distance over which a jump is confirmed."""
 
 
 def find_periods(
     angles: Any, names: Sequence[str], places: Sequence[int | None], channels: Sequence[Channel]
 ) -> dict[int, float]:
-    """Return the periods of the components that are angles, by their numbers: those that are declared, and those that a
-    sensor of angles measures as they are.
+    """Return the periods of the components that are angles, by their numbers: the declared ones, and those that a
+    sensor of angles measures directly.
 
     Args:
         angles: unit of each, by its name.
         names: of all components.
-        places: component that each number of a measurement is, or None.
+        places: component that each number of a measurement measures, or None.
         channels: the sensors.
 
     Raises:
-        ValueError: for another component or unit.
+        ValueError: for an unknown component or unit.
     """
     if not isinstance(angles, Mapping):
         raise ValueError(
@@ -65,7 +65,7 @@ def warn_of_turns(
 
     Args:
         model: traced equations.
-        given: a usual state, then the interval and the inputs that the functions take, ``(n + 1 + p,)``.
+        given: a typical state, then the interval and the inputs that the functions take, ``(n + 1 + p,)``.
         components: whether each is declared, by its name.
         channels: the sensors.
     """
@@ -93,7 +93,7 @@ def _warn(text: str) -> None:
 
 
 def _jumping_rows(function: VectorFunction, given: numpy.ndarray, n: int) -> dict[int, str]:
-    """Units of the turns by which rows of a function jump along a component of the state, by their numbers."""
+    """Return the units of the turns by which rows of a function jump along a component of the state, by row number."""
     found: dict[int, str] = {}
     for place in range(n):
         for step, count in STEPS:
@@ -115,8 +115,8 @@ def _jumping_rows(function: VectorFunction, given: numpy.ndarray, n: int) -> dic
 def _jumps_by(
     function: VectorFunction, row: int, low: numpy.ndarray, high: numpy.ndarray, period: float
 ) -> bool:
-    """Whether a row of a function jumps by a turn between two points ``(n,)``: a step of a smooth function that is as
-    large by chance vanishes with the distance.
+    """Return whether a row of a function jumps by a turn between two points ``(n,)``; a step of a smooth function that
+    is as large by chance vanishes with the distance.
     """
     for _ in range(HALVINGS):
         points = numpy.stack([low, 0.5 * (low + high), high], axis=1)

@@ -1,4 +1,4 @@
-"""Models in continuous time: a drift and a diffusion, made into a motion and a process noise of an interval."""
+"""Models in continuous time: a drift and a diffusion become the motion and the process noise of an interval."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from .compiler.vector_functions import VectorFunction
 from .filters.discretisation import choose_series, discretise, held_noise, runge_kutta
 
 LONGEST = 1e4
-"""Sampling intervals for which linear models are exact to rounding."""
+"""Sampling intervals over which linear models are exact to rounding."""
 
 
 class Discretised(NamedTuple):
@@ -25,13 +25,13 @@ class Discretised(NamedTuple):
 def discretise_drift(
     drift: VectorFunction, diffusion: numpy.ndarray, interval: float, steps: int
 ) -> Discretised:
-    """Make a model of an interval of one in continuous time, see :mod:`.filters.discretisation`.
+    """Return the model of an interval for a model in continuous time, see :mod:`.filters.discretisation`.
 
     Args:
         drift: from state and inputs, ``(n + p,)``, to the derivative of the state, ``(n,)``.
         diffusion: spectral density of the noise, ``(n, n)``.
-        interval: usual time between measurements, s.
-        steps: of the Runge-Kutta method in an interval.
+        interval: typical time between measurements, s.
+        steps: number of steps of the Runge-Kutta method in an interval.
     """
     n = drift.size
     if drift.matrix is None:
@@ -45,7 +45,7 @@ def discretise_drift(
 
         return Discretised(lambda x, dt, u: runge_kutta(lambda y: slope(y, u), x, dt, steps), held)
     A = drift.matrix[:, :n]
-    # Inputs and what is constant are held: states without a drift of their own, the last of them 1.
+    # Inputs and constants are states without a drift, the last of them 1.
     whole = numpy.zeros((drift.matrix.shape[1] + 1,) * 2)
     whole[:n, :-1], whole[:n, -1] = drift.matrix, drift.offset
     still = numpy.zeros_like(whole)

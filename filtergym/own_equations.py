@@ -1,4 +1,4 @@
-"""The equations of somebody's state-space model, checked and traced."""
+"""The equations of a user's state-space model, checked and traced."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -19,16 +19,16 @@ Function = Callable[..., Any] | Sequence[Sequence[float]] | numpy.ndarray
 """A function of the state ``(n,)`` that returns a list of numbers, or a matrix; with more arguments see
 :func:`.own_models.state_space`."""
 FURTHER = ("dt", "u")
-"""What f may take after the state, by these names."""
+"""Names of the further arguments that f may take after the state."""
 FAR = 3.0
-"""Deviations of the inputs from their means up to which R must be a covariance."""
+"""Standard deviations of the inputs from their means up to which R must be a covariance."""
 
 
 class NoiseBlock(NamedTuple):
-    """The noise of some of the numbers that are measured, independent of that of all others."""
+    """The noise of some of the measured numbers, independent of that of all others."""
 
     what: str
-    """Its name, in errors."""
+    """Name of the noise, in errors."""
     R: Any
     """A number, a matrix ``(size, size)``, or a function that returns either."""
     size: int
@@ -36,16 +36,16 @@ class NoiseBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What the equations of a model have to fit."""
+    """The state, interval and inputs that the equations of a model must fit."""
 
     mean: numpy.ndarray
-    """Of the initial state, ``(n,)``."""
+    """Mean of the initial state, ``(n,)``."""
     interval: float
-    """Usual time between measurements, s."""
+    """Typical time between measurements, s."""
     inputs: Mapping[str, Input]
-    """By their names."""
+    """Inputs by their names."""
     integration_steps: int = 1
-    """Of the Runge-Kutta method in an interval, of a drift that is not linear."""
+    """Number of steps of the Runge-Kutta method in an interval, for a drift that is not linear."""
 
     @property
     def usual_inputs(self) -> numpy.ndarray:
@@ -58,10 +58,10 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
 
     Args:
         given: f and Q, or drift and diffusion; h and R; with sensors the blocks of R.
-        around: what they have to fit; the covariance of a timed model is checked at its usual interval.
+        around: state, interval and inputs that they must fit; a timed covariance is checked at the typical interval.
 
     Raises:
-        ValueError: for what does not, or cannot be traced.
+        ValueError: for equations that do not fit, or cannot be traced.
     """
     n = len(around.mean)
     h = trace_measurement("h", given["h"], n, len(around.inputs))
@@ -79,7 +79,8 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
 def _sensor_noise(
     blocks: Sequence[NoiseBlock], around: Surroundings, timed: bool
 ) -> numpy.ndarray | VectorFunction:
-    """R of blocks: a matrix where all of them are, else a function of the state, the interval and the inputs.
+    """Return the R of blocks: a matrix where all of them are, else a function of the state, the interval and the
+    inputs.
 
     Raises:
         ValueError: for a block that is no covariance, cannot be traced, or takes an argument that does not exist.
@@ -113,7 +114,7 @@ def _sensor_noise(
 
 
 def _matrix(R: Any) -> Any:
-    """A covariance, or the variance of one number, as a traced matrix."""
+    """Return a covariance, or the variance of one number, as a traced matrix."""
     if isinstance(R, list | tuple):
         R = namespace.stack([namespace.asarray(row) for row in R])
     found = namespace.asarray(R)
@@ -121,7 +122,7 @@ def _matrix(R: Any) -> Any:
 
 
 def _noise_arguments(block: NoiseBlock, around: Surroundings, timed: bool) -> tuple[str, ...]:
-    """What the function of a block takes, in its order: x, dt and u; empty for a matrix.
+    """Return the arguments of a block's function, in its order: x, dt and u; empty for a matrix.
 
     Raises:
         ValueError: for an argument that the model does not have.
@@ -169,7 +170,7 @@ def _check_sensor_noise(model: StateSpaceModel, blocks: Sequence[NoiseBlock], ar
 
 
 class _Motion(NamedTuple):
-    """How the state moves: of a :class:`StateSpaceModel` f, G and Q."""
+    """Motion of the state: f, G and Q of a :class:`StateSpaceModel`."""
 
     f: VectorFunction
     G: VectorFunction | None
@@ -178,7 +179,6 @@ class _Motion(NamedTuple):
 
 
 def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
-    """The motion of f and Q."""
     n, f, parts = len(around.mean), given["f"], _sources("Q", given["Q"])
     takes = further_arguments(f)
     wrong = next((Q for Q in parts.values() if ("dt" in takes) != callable(Q)), None)
@@ -211,10 +211,10 @@ def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 
 
 def _sources(what: str, given: Any) -> Mapping[str, Any]:
-    """Covariances of the sources of noise by their names; a single one has none.
+    """Return the covariances of the sources of noise by their names; a single one has no name.
 
     Raises:
-        ValueError: for no source, or a name that is none.
+        ValueError: for no source, or an invalid name.
     """
     if not isinstance(given, Mapping):
         return {"": given}
@@ -226,12 +226,10 @@ def _sources(what: str, given: Any) -> Mapping[str, Any]:
 
 
 def _sum(parts: Sequence[Sequence[Any]]) -> list[Any]:
-    """Sum of lists, number by number."""
     return [sum(numbers[1:], numbers[0]) for numbers in zip(*parts, strict=True)]
 
 
 def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
-    """The motion of a drift and a diffusion."""
     n, p, drift = len(around.mean), len(around.inputs), given["drift"]
     if callable(drift):
         takes = further_arguments(drift)
@@ -263,7 +261,9 @@ def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 def _with_inputs(
     what: str, call: Callable[[Any, Any, Any], Any], timed: bool, around: Surroundings
 ) -> tuple[VectorFunction, VectorFunction | None]:
-    """Motion of state, interval and inputs, and where an input has noise the same as a function of the inputs."""
+    """Return the motion as a function of state, interval and inputs, and where an input has noise, as a function of the
+    inputs, too.
+    """
     n, p = len(around.mean), len(around.inputs)
     further = int(timed)  # the interval stands between state and inputs, or nothing does
     of_state = lambda v: call(v[:n], v[n] if timed else None, v[n + further :])  # noqa: E731
@@ -275,10 +275,10 @@ def _with_inputs(
 
 
 def trace_measurement(what: str, h: Function, n: int, p: int) -> VectorFunction:
-    """Trace what is measured of a state of n numbers and, where it takes them, p inputs.
+    """Trace the measurement of a state of n numbers and, where it takes them, p inputs.
 
     Raises:
-        ValueError: if it cannot be traced, or takes what is not there.
+        ValueError: if it cannot be traced, or takes an argument that does not exist.
     """
     takes = further_arguments(h)
     if "dt" in takes or ("u" in takes and not p):
@@ -289,7 +289,7 @@ def trace_measurement(what: str, h: Function, n: int, p: int) -> VectorFunction:
 
 
 def _of_inputs(h: Function, traced: VectorFunction, around: Surroundings) -> VectorFunction | None:
-    """Return h as a function of the inputs and then of the state; None where none with noise acts on it."""
+    """Return h as a function of the inputs and then of the state; None where no input with noise acts on it."""
     p = len(around.inputs)
     if not callable(h) or not traced.given or not any(one.noise > 0.0 for one in around.inputs.values()):
         return None
@@ -297,12 +297,12 @@ def _of_inputs(h: Function, traced: VectorFunction, around: Surroundings) -> Vec
 
 
 def further_arguments(function: Any) -> tuple[str, ...]:
-    """Which of :data:`FURTHER` a function takes after the state."""
+    """Return the arguments among :data:`FURTHER` that a function takes after the state."""
     return tuple(name for name in FURTHER if name in arguments(function)[1:])
 
 
 def arguments(function: Any) -> tuple[str, ...]:
-    """Names of the arguments of a function; empty for what is none, or does not show them."""
+    """Return the names of the arguments of a function; empty for an object that is none, or has no signature."""
     if not callable(function):
         return ()
     try:
@@ -312,7 +312,7 @@ def arguments(function: Any) -> tuple[str, ...]:
 
 
 def check_array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:
-    """Return finite numbers of a shape, None for any number, or raise ValueError."""
+    """Return finite numbers of a shape (None: any number), or raise ValueError."""
     array = read_numbers(what, values)
     fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
     if fits and not numpy.isfinite(array).all():
@@ -336,10 +336,10 @@ def check_covariance(what: str, values: Any, size: int, definite: bool = False) 
 
 
 def trace(what: str, function: Function, size: int, answers: int | None, given: int = 0) -> VectorFunction:
-    """Trace a function of so many numbers, and others without a derivative; None for any number of answers.
+    """Trace a function of so many numbers, and others without a derivative; ``None`` allows any number of results.
 
     Raises:
-        ValueError: if it cannot be traced, or answers with another number.
+        ValueError: if it cannot be traced, or returns another number of results.
     """
     if not callable(function):
         function = check_array(what, function, (answers, size))
@@ -347,8 +347,8 @@ def trace(what: str, function: Function, size: int, answers: int | None, given: 
         made = VectorFunction(function, size, given)
     except NotTraceable as error:
         raise ValueError(
-            f"{what} cannot be traced ({error}): write it with NumPy's functions of the state, return a list, and let "
-            "numpy.where choose where something depends on numbers"
+            f"{what} cannot be traced ({error}): write it with NumPy's functions of the state, return a list, and use "
+            "numpy.where in place of branches on numbers"
         ) from error
     except ValueError as error:
         raise ValueError(f"{what} {error}") from error
@@ -358,7 +358,7 @@ def trace(what: str, function: Function, size: int, answers: int | None, given: 
 
 
 def _entries(matrix: Any) -> list[Any]:
-    """Numbers of a matrix, or of a list of its rows, row by row."""
+    """Return the numbers of a matrix, or of a list of its rows, row by row."""
     try:
         return [entry for row in matrix for entry in row]
     except TypeError:

@@ -39,8 +39,9 @@ EQUATIONS = ("f", "Q", "drift", "diffusion", "h", "R", "sensors")
 TRIED = 32, 64
 """Episodes and measurements from which the unit of the reward is estimated."""
 SMALL, FEWEST = 12, 8
-"""States up to which all these measurements are tried, whose time grows with the cube of the state; and how many are
-tried of any."""
+"""Number of states up to which all these measurements are used, since their time grows with its cube; and the least
+number of measurements.
+"""
 
 
 def state_space(
@@ -71,8 +72,8 @@ def state_space(
 ) -> type[StateSpace]:
     """Make an environment of a state-space model and register it: ``x = f(x) + w``, ``z = h(x) + v``.
 
-    Call it where your module is imported, as :func:`filtergym.register_task`. The class is also kept in your module, by
-    the name in its id, where other processes look for it.
+    Call it where your module is imported, as :func:`filtergym.register_task`. The class is also stored in your module,
+    under the name in its id, where other processes find it.
 
     Args:
         id: with your name and a version, such as ``"mine/Tracker-v0"``.
@@ -81,42 +82,42 @@ def state_space(
         f: the state at the next measurement, from the state ``(n,)`` to a list of n numbers, written with NumPy's
             functions and without branches on numbers; or a matrix ``(n, n)``. With a second argument called ``dt``
             it is the state that interval later, s: the model is timed, and measurements may come at any time. With an
-            argument called ``u`` it is given the inputs ``(p,)`` that act until then.
+            argument called ``u`` it receives the inputs ``(p,)`` that act until then.
         Q: covariance of the process noise, ``(n, n)``; of a timed model a function that returns that of an interval,
-            ``Q(dt)``. Or several of them by the names of their sources, of which it is the sum: each then has a factor
-            of its own that ``tune`` and ``advise`` search.
+            ``Q(dt)``. Or several covariances by the names of their sources, which are summed: ``tune`` and
+            ``advise`` then search a factor of each.
         drift: in place of f and Q the derivative of the state, ``drift(x)`` or ``drift(x, u)``, or a matrix: the model
             is timed, see :mod:`filtergym.filters.discretisation`.
         diffusion: spectral density of the noise of that derivative, ``(n, n)``; or several by their sources.
-        integration_steps: of the Runge-Kutta method between two measurements, of a drift that is not linear.
-        h: as f what is measured, m numbers, ``h(x)`` or ``h(x, u)``; or a matrix ``(m, n)``.
+        integration_steps: steps of the Runge-Kutta method between two measurements, for a drift that is not linear.
+        h: the measurement, m numbers, ``h(x)`` or ``h(x, u)``, written as f is; or a matrix ``(m, n)``.
         R: covariance of the measurement noise, ``(m, m)``, positive definite; or a function that returns it,
-            of the state and of ``dt`` and ``u``, as many of them as it names, such as ``R(x)`` or ``R(u)``.
-        sensors: by their names, in place of h, R and ``measured``.
+            of any of the state, ``dt`` and ``u``, such as ``R(x)`` or ``R(u)``.
+        sensors: sensors by their names, in place of h, R and ``measured``.
         names: of the components; default: ``x1``, ``x2`` and so on.
         units: of the components; default: ``1``, of an angle its unit.
         angles: components that are angles, ``"rad"`` or ``"deg"`` by their names: their errors are the shortest
             differences, whatever turn the truth, an estimate or f is on.
-        measured: names of the m numbers that h returns, which are the columns of a table of yours; default: ``z1``,
+        measured: names of the m numbers that h returns, which are the columns of your table; default: ``z1``,
             ``z2`` and so on.
-        inputs: known inputs, each with what a simulation draws for it and the noise with which it is told; or their
-            names. They are columns of a table, too.
-        weights: of their squared errors in the cost, ``(n,)``; default: 1 / n, for the mean squared error.
-        filter_model: what the filters believe in place of f, Q, drift, diffusion, h, R, or some of the sensors.
-        hypotheses: further models between which the world switches, each by what differs from the first, likewise.
-            Filters then are interacting multiple models of all of them.
+        inputs: known inputs, each with its distribution in a simulation and the noise of its reported value; or
+            their names. They are also columns of a table.
+        weights: weights of the squared errors in the cost, ``(n,)``; default: 1 / n, for the mean squared error.
+        filter_model: the filters' own f, Q, drift, diffusion, h, R, or some of the sensors, where they differ.
+        hypotheses: further models between which the world switches, each given by its differences to the first. The
+            filters are then interacting multiple models of all of them.
         transition: probabilities that one model follows another (row = from), ``(M, M)``; default: it stays with 0.95.
-        switching: whether the world switches; otherwise only the filters take it for possible.
+        switching: whether the world switches; otherwise only the filters assume that it may.
         registered: whether Gymnasium and the commands find it by its id.
-        **parameters: of :class:`filtergym.envs.linear.parameters.StateSpaceParameters` in the training distribution,
-            such as ``horizon`` and ``process_noise``.
+        **parameters: fields of :class:`filtergym.envs.linear.parameters.StateSpaceParameters` in the training
+            distribution, such as ``horizon`` and ``process_noise``.
 
     Returns:
         The class of the task.
 
     Raises:
-        ValueError: for arrays that do not fit each other, functions that cannot be traced or do not answer with enough
-            numbers, and whatever :func:`filtergym.register_task` refuses.
+        ValueError: for arrays that do not fit each other, functions that cannot be traced or return too few
+            numbers, and all errors of :func:`filtergym.register_task`.
     """
     allowed = [field.name for field in dataclasses.fields(StateSpaceParameters)]
     for parameter in parameters:
@@ -229,7 +230,6 @@ def state_space(
 
 
 def _sequence(what: str, given: Any) -> tuple[Any, ...]:
-    """Return words, or models, as a tuple."""
     kind, of = (Mapping, "models") if what == "hypotheses" else (str, "words")
     if isinstance(given, str) or not (
         isinstance(given, Sequence) and all(isinstance(one, kind) for one in given)
@@ -241,34 +241,34 @@ def _sequence(what: str, given: Any) -> tuple[Any, ...]:
 def _sensors(
     sensors: Mapping[str, Sensor] | None, others: tuple[Any, Any, Sequence[str]]
 ) -> dict[str, Sensor]:
-    """Return the sensors, empty where h, R and perhaps names of what is measured stand for them.
+    """Return the sensors; empty where h, R and perhaps ``measured`` replace them.
 
     Raises:
-        ValueError: for neither, or both.
+        ValueError: if neither is given, or both.
     """
     h, R, measured = others
     if sensors is None:
         if h is None or R is None:
-            raise ValueError("what is measured is said by h and R, or by sensors")
+            raise ValueError("give the measurement by h and R, or by sensors")
         return {}
     if h is not None or R is not None or len(measured):
-        raise ValueError("sensors say h, R and names of what is measured: leave h, R and measured out")
+        raise ValueError("sensors contain h, R and the names: leave out h, R and measured")
     if not sensors:
         raise ValueError("sensors must name at least one")
     return replace_sensors(None, sensors)
 
 
 def _check_motion(first: Mapping[str, Any]) -> None:
-    """Raise ValueError for neither f and Q, nor drift and diffusion, or parts of both."""
+    """Raise ValueError unless the motion is given by either f and Q, or drift and diffusion."""
     there = [name for name in EQUATIONS[:4] if first[name] is not None]
     if there not in (["f", "Q"], ["drift", "diffusion"]):
         raise ValueError(
-            f"motion is said by f and Q, or by drift and diffusion, got {', '.join(there) or 'neither'}"
+            f"give the motion by f and Q, or by drift and diffusion, got {', '.join(there) or 'neither'}"
         )
 
 
 def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return equations with some in place of others, or raise ValueError for what is none of them."""
+    """Return equations with some of them replaced, or raise ValueError for an unknown one."""
     own = first["sensors"]
     unused = {*(("h", "R") if own else ("sensors",))}
     unused |= {"f", "Q"} if first["f"] is None else {"drift", "diffusion"}
@@ -276,7 +276,7 @@ def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> di
     unknown = [name for name in part if name not in known] if isinstance(part, Mapping) else [part]
     if unknown:
         raise ValueError(
-            f"{what} says {', '.join(known[:-1])} or {known[-1]}, got {quote_shortened(unknown[0])}"
+            f"{what} can contain {', '.join(known[:-1])} or {known[-1]}, got {quote_shortened(unknown[0])}"
         )
     if "sensors" in part:
         part = {**part, "sensors": replace_sensors(own, part["sensors"])}
@@ -284,7 +284,7 @@ def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> di
 
 
 def _check_sources(filters: Sequence[StateSpaceModel], sensors: Iterable[str]) -> None:
-    """Raise ValueError for names of the noises in Q that differ between models, or are those of others."""
+    """Raise ValueError if the named noises in Q differ between models, or share names with other noises."""
     first, *others = ([*model.sources] for model in filters)
     if any(one != first for one in others):
         raise ValueError(f"all models must name the same sources of noise, got {first} and {others}")
@@ -296,7 +296,7 @@ def _check_sources(filters: Sequence[StateSpaceModel], sensors: Iterable[str]) -
 
 
 def _stack(given: dict[str, Any], size: int, inputs: int) -> dict[str, Any]:
-    """Put h and the noises of all sensors in the place of h and R."""
+    """Replace h and R by h and the noises of all sensors."""
     if not given["sensors"]:
         return given
     h, R = stack_sensors(given["sensors"], size, inputs)
@@ -304,7 +304,7 @@ def _stack(given: dict[str, Any], size: int, inputs: int) -> dict[str, Any]:
 
 
 def _inputs(given: Mapping[str, Input] | Sequence[str]) -> dict[str, Input]:
-    """Return inputs by their names, or raise ValueError for what is none."""
+    """Return inputs by their names, or raise ValueError for an invalid one."""
     is_list = isinstance(given, Mapping | Sequence) and not isinstance(given, str)
     if not is_list or not all(isinstance(name, str) for name in given):
         raise ValueError(
@@ -331,12 +331,12 @@ def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:
 
 
 class _EstimatedReward:
-    """Reward of a class whose unit is estimated when it is first asked for: most uses of a model need none, and it
-    takes a tenth of a second, or half of one where the model is a drift.
+    """Reward of a class whose unit is estimated on first use, which takes a tenth of a second, or half a second for a
+    drift; most models never use it.
 
     Args:
         cls: the class.
-        parameters: of the class, as it is registered.
+        parameters: parameters of the registered class.
     """
 
     cost, kind, log_unit = StateSpace.reward.cost, StateSpace.reward.kind, None
@@ -351,7 +351,9 @@ class _EstimatedReward:
 
 
 def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:
-    """Median over some episodes of the cost of the filter as written, to two digits; 1 where that is no unit."""
+    """Return the median over some episodes of the cost of the filter as written, to two digits; 1 where that is no
+    unit.
+    """
     model: Any = Model(cls(parameters), cls.paper_policy.control)
     episodes, measurements = TRIED
     share = min(1.0, SMALL / cls.definition.world[0].f.size) ** 3

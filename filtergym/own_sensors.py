@@ -1,4 +1,4 @@
-"""The sensors of somebody's state-space model, checked and put one after the other."""
+"""The sensors of a user's state-space model, checked and stacked."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -12,21 +12,23 @@ from .filters.angles import PERIODS
 from .own_equations import Function, NoiseBlock, check_array, further_arguments, trace_measurement
 
 RESERVED = (RECORDING, "values", "available")
-"""Names that mean something else in a table or a measurement."""
+"""Names that have another meaning in a table or a measurement."""
 NOISES = ("process", "measurement")
-"""What has a noise of this name beside the sensors."""
+"""Owners of the other noises, by the noise's name."""
 
 
 def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[str, Sensor]:
-    """Return sensors with some in place of others of the same name.
+    """Return sensors with some replaced by others of the same name.
 
     Raises:
-        ValueError: for what is no sensor, or of another name.
+        ValueError: for an object that is no sensor, or an unknown name.
     """
     if not isinstance(given, Mapping) or not all(isinstance(one, Sensor) for one in given.values()):
         raise ValueError(f"sensors must be a mapping from names to Sensor, got {quote_shortened(given)}")
     if {*given} & {*NOISES}:
-        raise ValueError(f"sensors cannot be called {' or '.join(NOISES)}, whose noises are others")
+        raise ValueError(
+            f"sensors cannot be called {' or '.join(NOISES)}, which are the names of other noises"
+        )
     if sensors is not None and not {*given} <= {*sensors}:
         unknown = next(name for name in given if name not in sensors)
         raise ValueError(f"sensors are {', '.join(sensors) or 'not named'}, got {unknown!r}")
@@ -34,10 +36,10 @@ def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[st
 
 
 def stack_sensors(sensors: Mapping[str, Sensor], size: int, inputs: int) -> tuple[Function, list[NoiseBlock]]:
-    """Return h of all sensors together and their noises, of a state of n numbers and p inputs.
+    """Return h of all sensors together and their noises, for a state of n numbers and p inputs.
 
     Raises:
-        ValueError: for what does not fit.
+        ValueError: for sensors that do not fit.
     """
     R, traced = [], []
     for name, one in sensors.items():
@@ -63,12 +65,12 @@ def find_channels(
     """Return the places of sensors among the numbers of a measurement.
 
     Args:
-        sensors: by their names; without any, one measures everything.
-        counts: of the numbers of each.
-        interval: between measurements, s.
+        sensors: sensors by their names; empty: one sensor measures everything.
+        counts: number of measured numbers of each.
+        interval: time between measurements, s.
 
     Raises:
-        ValueError: for a sensor that is due more often.
+        ValueError: for a sensor with a shorter period.
     """
     if not sensors:
         return (Channel("values", 0, counts[0]),)
@@ -76,8 +78,8 @@ def find_channels(
     for (name, one), count in zip(sensors.items(), counts, strict=True):
         if one.interval is not None and one.interval < interval * (1.0 - 1e-9):
             raise ValueError(
-                f"the sensor {name!r} is due every {one.interval:g} s, and measurements are {interval:g} s apart: let "
-                "sampling_interval be the shortest of all"
+                f"the sensor {name!r} is due every {one.interval:g} s, and measurements are {interval:g} s apart: set "
+                "sampling_interval to the shortest of all"
             )
         period = None if one.wraps is None else PERIODS[one.wraps]
         channels.append(Channel(name, first, count, one.interval, one.availability, one.gate, period))
@@ -86,7 +88,7 @@ def find_channels(
 
 
 def sensor_columns(sensors: Mapping[str, Sensor], channels: Sequence[Channel]) -> dict[str, str]:
-    """Return the units of what sensors measure by the names of its columns; empty where a component says it.
+    """Return the units of the measured numbers by the names of their columns; empty where a component gives the unit.
 
     Raises:
         ValueError: for names or units that do not fit.
@@ -106,7 +108,7 @@ def sensor_columns(sensors: Mapping[str, Sensor], channels: Sequence[Channel]) -
 
 
 def check_columns(names: Sequence[str], count: int, inputs: Iterable[str]) -> None:
-    """Raise ValueError for names of what is measured that cannot be told apart in a table, also from the inputs."""
+    """Raise ValueError for names of measured numbers that are ambiguous in a table, also with those of the inputs."""
     lower = [str(name).lower() for name in (*names, *inputs)]
     if len(names) != count or len({*lower}) != len(lower) or {*lower} & {*TIME, *RESERVED, ""}:
         raise ValueError(

@@ -1,7 +1,7 @@
 """A frozen protocol with a name: one number for a competitor over several environments.
 
 A protocol is one file, ``protocols/NAME.toml``: environments, scenarios, split, seed, episodes and statistic. Its
-digest stands in every row that it gives: rows with the same digest can be compared. With c_e the mean cost of episode e
+digest stands in every row of results: rows with the same digest can be compared. With c_e the mean cost of episode e
 and p_e that of the paper's algorithm in the same episode, the ratio in an environment of M episodes is
 
     r = exp(1/M sum_e log(c_e / p_e)),
@@ -36,11 +36,11 @@ from .names import find_competitor
 FOLDER = files(__name__.rpartition(".")[0]) / "protocols"
 SUFFIX = ".toml"
 MOST_BYTES = 100_000
-"""Of a file."""
+"""Largest size of a file, bytes."""
 
 
 class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is run of one environment."""
+    """One environment of a protocol."""
 
     id: str
     """Gymnasium id."""
@@ -51,9 +51,9 @@ class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     lost_cost: float
     """Mean cost of an episode beyond which its track is lost."""
     training: str
-    """Scenario that the number is of."""
+    """Scenario of the number."""
     held_out: tuple[str, ...] = ()
-    """Scenarios of which the worst is told."""
+    """Scenarios of which the worst is reported."""
 
     @property
     def short(self) -> str:
@@ -62,25 +62,25 @@ class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
 
 class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a file holds."""
+    """Content of a protocol file."""
 
     name: str
     year: int
     split: Literal["test", "validation"]
     seed: int
     episodes: int
-    """Of the training distribution."""
+    """Number of episodes of the training distribution."""
     held_out_episodes: int
-    """Of every other scenario."""
+    """Number of episodes of every other scenario."""
     resamples: int
-    """Of the bootstrap."""
+    """Resamples of the bootstrap."""
     statistic: str
     time: str
     environments: tuple[ProtocolEnvironment, ...]
 
 
 def protocol_names() -> list[str]:
-    """Return the names of the protocols of this package, the newest last: by number, not by letter."""
+    """Return the names of this package's protocols, the newest last: by number, not by letter."""
     found = [file.name.removesuffix(SUFFIX) for file in FOLDER.iterdir() if file.name.endswith(SUFFIX)]
     return sorted(found, key=lambda name: int(name.rpartition("-")[2]))
 
@@ -89,14 +89,14 @@ def read_protocol(name: str) -> tuple[Protocol, str]:
     """Read a protocol.
 
     Args:
-        name: of one of this package, or the path of a ``.toml``.
+        name: name of one of this package, or the path of a ``.toml``.
 
     Returns:
-        What it holds, and the SHA-256 digest of the file.
+        The protocol, and the SHA-256 digest of the file.
 
     Raises:
-        ValueError: for another name, a file that is no protocol, or one that this package does not hold to: of another
-            interface, bound, bootstrap or scenario.
+        ValueError: for another name, a file that is no protocol, or one with another interface, bound, bootstrap or
+            scenario than this package.
     """
     if name.endswith(SUFFIX):
         try:
@@ -111,13 +111,13 @@ def read_protocol(name: str) -> tuple[Protocol, str]:
         protocol = msgspec.toml.decode(content, type=Protocol)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise ValueError(f"{name} holds no protocol of filtergym: {reason:.300}") from error
+        raise ValueError(f"{name} contains no protocol of filtergym: {reason:.300}") from error
     _check(protocol)
     return protocol, hashlib.sha256(content.replace(b"\r\n", b"\n")).hexdigest()
 
 
 def _check(protocol: Protocol) -> None:
-    """Raise ValueError where this package would run something else."""
+    """Raise ValueError where this package would run a different experiment."""
     if not protocol.environments:
         raise ValueError(f"protocol {protocol.name} names no environment")
     pairs: list[tuple[str, Any, Any]] = [("resamples", protocol.resamples, RESAMPLES)]
@@ -151,16 +151,17 @@ class Entry(NamedTuple):
 def find_entries(
     protocol: Protocol, words: Sequence[str], trust: bool = False, rename: Any = None
 ) -> list[Entry]:
-    """Return what is entered in each environment of a protocol.
+    """Return the entry of each environment of a protocol.
 
     Args:
         protocol: that is run.
         words: ``NAME`` for all environments, at most once, and ``ENVIRONMENT=NAME`` for one of them.
-        trust: load models that can execute code.
-        rename: given a problem and names, returns names; see :func:`.names.isolate_names`.
+        trust: whether to load models that can execute code.
+        rename: function of a problem and names that returns names; see :func:`.names.isolate_names`.
 
     Raises:
-        ValueError: if nothing is entered, or two for one environment; for unknown names; and for what may not compete.
+        ValueError: if nothing is entered, or two for one environment; for unknown names; and for those that may not
+            compete.
     """
     short = {own.short: own for own in protocol.environments}
     named: dict[str, str] = {}
@@ -201,7 +202,7 @@ def _find_entry(own: ProtocolEnvironment, name: str, trust: bool, rename: Any) -
 
 
 class EnvironmentResult(NamedTuple):
-    """What came out in one environment."""
+    """Result of one environment."""
 
     entry: Entry
     cost: IntervalEstimate
@@ -214,8 +215,9 @@ class EnvironmentResult(NamedTuple):
     time: ProcessorTime | None
     paper_time: ProcessorTime | None
     costs: Mapping[str, Mapping[str, numpy.ndarray]]
-    """Mean cost of every episode, ``(episodes,)``, by scenario and by the name of what ran: the competitor, the paper's
-    algorithm or a reference."""
+    """Mean cost of every episode, ``(episodes,)``, by scenario and by the name of the competitor, the paper's algorithm
+    or a reference.
+    """
 
     @property
     def logarithms(self) -> numpy.ndarray:
@@ -226,23 +228,23 @@ class EnvironmentResult(NamedTuple):
 
 
 class ProtocolResult(NamedTuple):
-    """What came out of a protocol."""
+    """Result of a protocol."""
 
     protocol: Protocol
     digest: str
     """SHA-256 of its file."""
     environments: list[EnvironmentResult]
     records: list[Record]
-    """Of all scenarios."""
+    """Records of all scenarios."""
 
     @property
     def title(self) -> str:
-        """Names of what was entered, each once."""
+        """Names of the entries, each once."""
         return ", ".join(dict.fromkeys(one.entry.name for one in self.environments))
 
     @property
     def complete(self) -> bool:
-        """Whether all environments were entered, without which there is no number."""
+        """Whether all environments were entered; otherwise there is no number."""
         return len(self.environments) == len(self.protocol.environments)
 
     @property
@@ -261,7 +263,7 @@ class ProtocolResult(NamedTuple):
 
     @property
     def time(self) -> ProcessorTime | None:
-        """Geometric mean over the environments of the time of a measurement; None if not known of all of them."""
+        """Geometric mean over the environments of the time of a measurement; None if it is unknown in any of them."""
         times = [one.time for one in self.environments if one.time is not None]
         if not self.complete or len(times) < len(self.environments):
             return None
@@ -277,14 +279,14 @@ def run_protocol(
     progress: Progress | None = None,
     **options: Any,
 ) -> ProtocolResult:
-    """Run what is entered, and the papers' algorithms beside it.
+    """Run the entries of a protocol, with the papers' algorithms beside them.
 
     Args:
-        protocol: of :func:`read_protocol`.
-        digest: likewise.
-        entries: of :func:`find_entries`.
-        workers: who shares the work.
-        progress: told of measurements done.
+        protocol: protocol from :func:`read_protocol`.
+        digest: SHA-256 digest of its file.
+        entries: entries from :func:`find_entries`.
+        workers: processes that share the work.
+        progress: function that is called with the number of measurements done.
         **options: ``backend`` and ``threads`` of :class:`.evaluate.Experiment`.
 
     Raises:
@@ -306,12 +308,14 @@ def run_protocol(
 
 
 def measurements_of(protocol: Protocol, entries: Sequence[Entry]) -> int:
-    """Return how many measurements a run has."""
+    """Return the number of measurements of a run."""
     return sum(one.measurements for e in entries for cell in _cells(protocol, e, {}) for one in cell)
 
 
 def _cells(protocol: Protocol, entry: Entry, options: Mapping[str, Any]) -> Iterator[list[EvaluationRequest]]:
-    """Yield the requests of each scenario: the paper's algorithm, references, and the competitor unless it is one."""
+    """Yield the requests of each scenario: the paper's algorithm, references, and the competitor unless it is one of
+    these.
+    """
     own = entry.environment
     problem = problem_of(own.id)
     makers = {name: problem.competitor(name) for name in (own.paper, *entry.references)}
@@ -373,8 +377,8 @@ def bib_entry(result: ProtocolResult, version: str) -> str:
     """Return a BibTeX entry of the protocol.
 
     Args:
-        result: that is quoted.
-        version: of the package.
+        result: result to quote.
+        version: version of the package.
     """
     protocol = result.protocol
     ids = ", ".join(own.short for own in protocol.environments)

@@ -1,4 +1,4 @@
-"""Finds the reproductions of papers, which a clone of the repository holds and an installed package lacks."""
+"""Reproductions of papers, which a clone of the repository contains and an installed package lacks."""
 
 import importlib.util
 import pkgutil
@@ -10,7 +10,7 @@ PAPERS = f"{__package__}.papers"
 
 
 def papers() -> dict[str, str]:
-    """Return the module of every paper that can be reproduced, by its name on the command line."""
+    """Return the module of every reproducible paper, by its name on the command line."""
     spec = importlib.util.find_spec(PAPERS)
     folders = (spec and spec.submodule_search_locations) or ()
     return {

@@ -1,15 +1,15 @@
-"""Submissions: a competitor and its results on a protocol in one file that anybody can run again.
+"""Submissions: a competitor and its results on a protocol in one file that any user can run again.
 
-A file is JSON of declared types. Nothing in it is compressed, so that it is as large as it looks, and nothing in it
+A file is JSON of declared types. Nothing in it is compressed, so that its size is known, and nothing in it
 names a file. An agent is its arrays (:mod:`..agents.learned_policy`) and executes nothing. An estimator is its source
-text, which runs only where the reader says that it is trusted, and then in a process that is told what is measured and
-nothing else (:mod:`.evaluation.competitors.isolation`). A competitor of this package is its name.
+text, which runs only where the reader trusts it, and then in a process that receives the measurements only
+(:mod:`.evaluation.competitors.isolation`). A competitor of this package is its name.
 
 A second run of a file gives the same numbers but for rounding: the noise of an episode is a function of its seed.
 Processors and libraries agree on sums and products, and differ by some units in the last place of functions, u = 2^-53
-relative. A filter hands on what n measurements have left of an error times the condition number of what it inverts,
-kappa, so that costs differ by about n * kappa * u: of n = 3000 and kappa = 10^6, 3 * 10^-7. :data:`TOLERANCE` is the
-next power of ten.
+relative. Over n measurements a filter multiplies such errors by up to n times the condition number kappa of the
+matrices that it inverts, so that costs differ by about n * kappa * u: of n = 3000 and kappa = 10^6, 3 * 10^-7.
+:data:`TOLERANCE` is the next power of ten.
 
 The seeds of a protocol are public, and a competitor can carry the truth of its episodes. So a verification also runs
 the protocol on fresh episodes, from a seed that did not exist when the file was written, and compares both results
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from .evaluation.running.metrics import Record
 
 TOLERANCE = 1e-6
-"""Largest relative difference of a number that is run again; of a ratio, absolute where it is below one."""
+"""Largest relative difference of a number in a second run; of a ratio below one, the absolute difference."""
 ALARM = 1e-4
 """Share of honest submissions that chance refuses on fresh episodes where estimates are normal, at most."""
 SEED_BITS = 128
@@ -63,13 +63,13 @@ SEED_BITS = 128
 NEGLIGIBLE = 5e-5
 """Relative difference of costs that is rounding."""
 SMALLEST = 1e-300
-"""Cost, or ratio of costs, that stands for zero where a logarithm is taken."""
+"""Cost, or ratio of costs, that replaces zero under a logarithm."""
 MOST_BYTES = 8_000_000
-"""Of a file."""
+"""Largest size of a file, bytes."""
 OWN = "submission"
 """Name of a submission among the competitors of its evaluation."""
 TIME = "nanoseconds"
-"""The metric that differs from run to run: it is told, and not compared."""
+"""The metric that differs from run to run: it is reported, not compared."""
 RATIOS = (
     "geometric_cost_difference", "lost_tracks", "relative_cost_difference", "anees", "lost_episodes",
 )  # fmt: skip
@@ -77,27 +77,28 @@ RATIOS = (
 FROZEN = protocol_names()[-1]
 """Name of the newest frozen protocol."""
 TRIAL = "trial"
-"""Name of a short one, to try."""
+"""Name of a short protocol for trials."""
 GEOMETRIC = "geometric_cost_difference"
 """A ratio of costs less one, whose logarithm is compared."""
 NOT_COMPARED = "relative_cost_difference"
-"""Metric of fresh episodes: a ratio of two means. Where few lost tracks rule both, its interval is too short; the mean
-cost is compared itself."""
+"""Metric of fresh episodes that is a ratio of two means. Where few lost tracks dominate both, its interval is too
+short; the mean cost is compared itself.
+"""
 METRICS = ("cost", *RATIOS, TIME)
-"""Metrics of results, beside the one that the environment calls physical."""
+"""Metrics of the results, beside the one that the environment calls physical."""
 
 Name = Annotated[str, msgspec.Meta(pattern=r"^[\w.:/+-]{1,100}\Z")]
 Title = Annotated[str, msgspec.Meta(pattern=r"^[\w .,:+()/&'-]{1,80}\Z")]
-"""Words that mean nothing to a terminal, to Markdown or to HTML."""
+"""Words without special meaning to a terminal, Markdown or HTML."""
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 
 class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What stands in a file, and nothing else."""
+    """Content of a file, without further members."""
 
 
 class Card(_Stored, frozen=True):
-    """What an author says of a submission."""
+    """The author's description of a submission."""
 
     title: Title
     author: Title = "-"
@@ -134,7 +135,7 @@ class Shipped(_Stored, frozen=True, tag="shipped"):
 
 
 class Submission(_Stored, frozen=True):
-    """All that a file holds."""
+    """Content of a file."""
 
     environment: Name
     """Gymnasium id."""
@@ -142,7 +143,7 @@ class Submission(_Stored, frozen=True):
     """Version of the package that made the results."""
     protocol: Name
     protocol_sha256: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
-    """Digest of the protocol's file; of a trial, of the file that it shortens."""
+    """Digest of the protocol's file; of a trial, of the full protocol's file."""
     card: Card
     competitor: Arrays | Source | Shipped
     results: tuple[Figure, ...]
@@ -150,14 +151,14 @@ class Submission(_Stored, frozen=True):
 
 
 def protocol_of(problem: Problem, name: str) -> tuple[Protocol, str]:
-    """Return the part of a frozen protocol that is of one environment, and the digest of the protocol's file.
+    """Return the part of a frozen protocol for one environment, and the digest of the protocol's file.
 
     Args:
-        problem: whose environment it is.
-        name: of the protocol; or ``"trial"``: 32 episodes of the training distribution, to try.
+        problem: problem of the environment.
+        name: name of the protocol; or ``"trial"``: 32 episodes of the training distribution, to try.
 
     Raises:
-        ValueError: for another name, and an environment that the protocol has not.
+        ValueError: for another name, and an environment that the protocol lacks.
     """
     names = (*protocol_names(), TRIAL)
     if name not in names:  # a file names no other file
@@ -178,16 +179,16 @@ def protocol_of(problem: Problem, name: str) -> tuple[Protocol, str]:
 
 
 def read_submission(path: Path) -> tuple[Submission, str]:
-    """Read a submission, and run nothing of it.
+    """Read a submission without running any of it.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Returns:
-        What it holds, and the SHA-256 digest of the file.
+        The submission, and the SHA-256 digest of the file.
 
     Raises:
-        ValueError: if it is none.
+        ValueError: if the file is no submission.
     """
     content = _read(path)
     return _decode(path, content), hashlib.sha256(content).hexdigest()
@@ -197,11 +198,11 @@ def write_submission(path: Path, submission: Submission) -> str:
     """Write a submission, and return the SHA-256 digest of the file.
 
     Args:
-        path: of the file.
-        submission: that it holds.
+        path: path of the file.
+        submission: submission to write.
 
     Raises:
-        ValueError: if it cannot be written, or is larger than a reader takes.
+        ValueError: if the file cannot be written, or is larger than a reader accepts.
     """
     content = msgspec.json.format(msgspec.json.encode(submission), indent=1) + b"\n"
     if len(content) > MOST_BYTES:
@@ -227,22 +228,22 @@ def _decode(path: Path, content: bytes) -> Submission:
         return msgspec.json.decode(content, type=Submission)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())  # it may quote the file
-        raise ValueError(f"{path} holds no submission of filtergym: {reason:.300}") from error
+        raise ValueError(f"{path} contains no submission of filtergym: {reason:.300}") from error
 
 
 # --- competitors
 
 
 def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
-    """Return what a submission holds of a competitor that its author names.
+    """Return the part of a submission that contains a competitor, which its author names.
 
     Args:
-        problem: whose competitor it is.
-        name: of a shipped agent or a classical competitor; a ``.safetensors``; the folder of a run that has one; or
-            ``module:Class``, of a module in one file that imports installed packages only.
+        problem: problem of the competitor.
+        name: name of a shipped agent or a classical competitor; a ``.safetensors``; the folder of a run that has one;
+            or ``module:Class``, of a module in one file that imports installed packages only.
 
     Raises:
-        ValueError: for whatever else.
+        ValueError: for any other name.
     """
     if name in pretrained_agents(problem.id):
         return Arrays(pretrained_path(problem.id, name).read_bytes())
@@ -252,7 +253,7 @@ def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
     if path.is_dir():
         path = best_agent(path)
         if path.suffix != ".safetensors":
-            raise ValueError(f"{name} holds a model only: filtergym export {name} writes its arrays")
+            raise ValueError(f"{name} contains a model only: filtergym export {name} writes its arrays")
     if path.suffix == ".safetensors":
         return Arrays(_read(path))
     module, colon, attribute = name.partition(":")
@@ -263,7 +264,7 @@ def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
     found = import_user_module(module, f"cannot submit {name!r}")
     if colon and kind_of(getattr(found, attribute, None)) != "estimator":
         raise ValueError(
-            f"cannot submit {name!r}: what is handed in as source is an estimator, with start and update"
+            f"cannot submit {name!r}: as source code an estimator can be submitted, with start and update"
         )
     try:
         text = inspect.getsource(found)
@@ -273,17 +274,17 @@ def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
 
 
 def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = False) -> Any:
-    """Return what makes the competitor of a submission.
+    """Return the maker of a submission's competitor.
 
     Args:
-        problem: that it is of.
-        submission: from a file.
-        path: of the file, for errors.
-        trust: run source.
+        problem: problem of the submission.
+        submission: submission from a file.
+        path: path of the file, for errors.
+        trust: whether to run source code.
 
     Raises:
-        ValueError: if it holds source and is not trusted, what is no competitor, one that is told the truth, or an
-            agent that was trained on what is held out.
+        ValueError: if it contains source code and is not trusted; for an object that is no competitor, a competitor
+            that uses the truth, or an agent that was trained on held-out data.
     """
     held = submission.competitor
     if isinstance(held, Arrays):
@@ -291,8 +292,8 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
     if isinstance(held, Source):
         if not trust:
             raise ValueError(
-                f"{path} holds source code, and to verify it is to execute it: read it (--source FILE writes it), and "
-                "if you trust it add --trust"
+                f"{path} contains source code, which a verification executes: read it (--source FILE writes it), "
+                "and if you trust it add --trust"
             )
         return isolate_source(held.text, held.name, f"source of {path}")
     if held.name in problem.baselines.names:
@@ -301,8 +302,8 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
         raise nearest("competitor", held.name, problem.baselines.names)
     if kind_of(found) not in RANKED:
         raise ValueError(
-            f"{path} holds a {kind_of(found)}, which may know what no sensor says: only policies and estimators can be "
-            "submitted"
+            f"{path} names a {kind_of(found)}, which may know more than the sensors measure: only policies and "
+            "estimators can be submitted"
         )
     return found
 
@@ -312,7 +313,7 @@ def _load_agent(problem: Problem, held: Arrays, path: Path) -> Any:
 
     Raises:
         ValueError: in one printable sentence that names the submission, if the arrays are no agent of the environment,
-            or it was trained on what is held out.
+            or it was trained on held-out data.
     """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "agent.safetensors"
@@ -329,7 +330,7 @@ def _load_agent(problem: Problem, held: Arrays, path: Path) -> Any:
 
 
 def _check_trained(problem: Problem, scenario: Any) -> None:
-    """Check the scenario, or the mixture of some, that an agent was trained on; what a file says opens no other file.
+    """Check the scenario, or the mixture of some, that an agent was trained on; a name in the file opens no other file.
 
     Raises:
         ValueError: for a scenario that is held out, or none.
@@ -351,18 +352,18 @@ def make_submission(
     workers: Workers,
     progress: Progress | None = None,
 ) -> Submission:
-    """Run a protocol and return what is handed in.
+    """Run a protocol and return the submission.
 
     Args:
-        problem: that is solved.
-        name: of the competitor, see :func:`pack`.
+        problem: problem to solve.
+        name: name of the competitor, see :func:`pack`.
         protocol: name of the protocol.
-        card: what the author says.
-        workers: who shares the work.
-        progress: told of measurements done.
+        card: description by the author.
+        workers: processes that share the work.
+        progress: function that is called with the number of measurements done.
 
     Raises:
-        ValueError: for what :func:`verify` would refuse.
+        ValueError: for a competitor that :func:`verify` would refuse.
     """
     from . import __version__
 
@@ -375,7 +376,7 @@ def make_submission(
 
 
 def check_submission(problem: Problem, submission: Submission, path: Path) -> Protocol:
-    """Check what a submission says against what this package knows, run nothing, and return its protocol.
+    """Check the statements of a submission against this package, without running it, and return its protocol.
 
     Raises:
         ValueError: for a protocol that is not this package's.
@@ -389,12 +390,12 @@ def check_submission(problem: Problem, submission: Submission, path: Path) -> Pr
 
 
 class Suspicion(NamedTuple):
-    """A cost significantly below that of a reference, which knows what no sensor measures."""
+    """A cost significantly below that of a reference, which knows more than the sensors measure."""
 
     scenario: str
     reference: str
     knows: str
-    """What the reference knows beyond the measurements."""
+    """The reference's knowledge beyond the measurements."""
     difference: float
     """Geometric mean of the ratios of the episodes' costs, less one."""
 
@@ -405,7 +406,7 @@ class Run(NamedTuple):
     seed: int
     figures: tuple[Figure, ...]
     suspicions: tuple[Suspicion, ...]
-    """Of the references that took part."""
+    """Suspicions from the references that took part."""
 
 
 def run_submission(
@@ -421,14 +422,14 @@ def run_submission(
     """Run the competitor of a submission over the scenarios of its protocol.
 
     Args:
-        problem: that it is of.
-        submission: from a file.
-        path: of the file, for errors.
-        trust: run source.
-        workers: who shares the work.
-        progress: called with the measurements done.
-        seed: of other episodes than those of the protocol; None: those of the protocol.
-        references: also run the reference of the environment, and compare costs with it.
+        problem: problem of the submission.
+        submission: submission from a file.
+        path: path of the file, for errors.
+        trust: whether to run source code.
+        workers: processes that share the work.
+        progress: function that is called with the number of measurements done.
+        seed: seed of other episodes than those of the protocol; None: those of the protocol.
+        references: whether to run the reference of the environment, too, and compare costs with it.
 
     Raises:
         ValueError: as :func:`check_submission` and :func:`unpack`.
@@ -451,9 +452,9 @@ def _suspicions(
     """Yield the references whose costs are significantly above those of the submission, by a paired t-test.
 
     Args:
-        problem: whose references they are.
+        problem: problem of the references.
         references: their names.
-        costs: of every episode, by scenario and competitor.
+        costs: costs of every episode, by scenario and competitor.
     """
     critical = _critical(len(references) * len(costs))
     for name in references:
@@ -472,10 +473,12 @@ def _figures(records: "Sequence[Record]", physical: tuple[str, str]) -> Iterator
 
 
 class Deviation(NamedTuple):
-    """The number of some results that is furthest from what was found."""
+    """The number of some results that differs most from the second run."""
 
     size: float
-    """In units of what rounding, or on fresh episodes chance, explains; infinite where one of both has no number."""
+    """Size in units of what rounding, or on fresh episodes chance, explains; infinite where one of both has
+    no number.
+    """
     sentence: str
 
     @property
@@ -485,31 +488,32 @@ class Deviation(NamedTuple):
 
 
 def deviation(claimed: Sequence[Figure], found: Sequence[Figure]) -> Deviation:
-    """Compare results with those that were found when the same episodes were run again; times are not compared.
+    """Compare results with those of a second run of the same episodes; times are not compared.
 
     Args:
-        claimed: of a file.
-        found: here.
+        claimed: results of a file.
+        found: results of the second run.
     """
-    said, known = _by_name(claimed), _by_name(found)
+    stated, known = _by_name(claimed), _by_name(found)
     worst = Deviation(0.0, "")
-    if said.keys() != known.keys() or len(said) != sum(f.metric != TIME for f in claimed):
-        odd = sorted(said.keys() ^ known.keys())
+    if stated.keys() != known.keys() or len(stated) != sum(f.metric != TIME for f in claimed):
+        odd = sorted(stated.keys() ^ known.keys())
         which = " ".join(odd[0]) if odd else "a number twice"
         return Deviation(float("inf"), f"its results are not those of its protocol: {which}")
     for key, own in known.items():
         for one, other, which in zip(
-            _numbers(said[key]), _numbers(own), ("", "lower end of ", "upper end of "), strict=True
+            _numbers(stated[key]), _numbers(own), ("", "lower end of ", "upper end of "), strict=True
         ):
             size = 0.0 if one is None and other is None and which else float("inf")
             if one is not None and other is not None:
                 size = abs(one - other) / (TOLERANCE * (abs(other) + (key[1] in RATIOS)) or 1.0)
-            if math.isnan(size):  # what is no number never holds
+            if math.isnan(size):  # NaN never passes
                 size = math.inf
             if size > worst.size:
                 name = f"{which}{key[1]} {key[2]}".rstrip()
                 worst = Deviation(
-                    size, f"{name} in scenario {key[0]!r} is {_number(other)}, and it says {_number(one)}"
+                    size,
+                    f"{name} in scenario {key[0]!r} is {_number(other)}, and the file states {_number(one)}",
                 )
     return worst
 
@@ -524,16 +528,16 @@ def fresh_deviation(claimed: Sequence[Figure], fresh: Sequence[Figure]) -> Devia
     Raises:
         KeyError: for other scenarios or metrics.
     """
-    said = _by_name(claimed)
+    stated = _by_name(claimed)
     known = {key: own for key, own in _by_name(fresh).items() if own.metric != NOT_COMPARED}
     worst, critical = Deviation(0.0, ""), _critical(len(known))
     for key, own in known.items():
-        size = _errors_apart(said[key], own) / critical
+        size = _errors_apart(stated[key], own) / critical
         if size > worst.size:
             name = f"{key[1]} {key[2]}".rstrip()
             worst = Deviation(
                 size,
-                f"{name} in scenario {key[0]!r} is {_estimate(own)}, and the file states {_estimate(said[key])}",
+                f"{name} in scenario {key[0]!r} is {_estimate(own)}, and the file states {_estimate(stated[key])}",
             )
     return worst
 
@@ -547,7 +551,9 @@ def _numbers(figure: Figure) -> tuple[float | None, float | None, float | None]:
 
 
 def _critical(count: int) -> float:
-    """Return how many standard errors all of some numbers are within with probability ``1 - ALARM``, at least."""
+    """Return the number of standard errors within which all of some numbers are with probability ``1 - ALARM`` at
+    least.
+    """
     return statistics.NormalDist().inv_cdf(1.0 - 0.5 * ALARM / max(count, 1))
 
 
@@ -578,21 +584,21 @@ def _number(value: float | None) -> str:
 
 
 class Verification(NamedTuple):
-    """What has come out where a submission was run again."""
+    """Results of a verification."""
 
     submission: Submission
     digest: str
-    """SHA-256 of its file."""
+    """SHA-256 digest of the file."""
     deviation: Deviation
-    """Of the results of the file from those over the same episodes here."""
+    """Deviation of the file's results from those over the same episodes here."""
     again: tuple[Figure, ...]
-    """Those."""
+    """Results over the same episodes here."""
     fresh: Run | None
     """Results over fresh episodes, with the seed that repeats them; None where the same episodes decided."""
     fresh_deviation: Deviation
-    """Of the results of the file from the fresh ones."""
+    """Deviation of the file's results from the fresh ones."""
     suspicions: tuple[Suspicion, ...]
-    """Costs below what is attainable, over the fresh episodes, or over the same where there are none."""
+    """Costs below the attainable one, over the fresh episodes, or over the same where there are none."""
 
     @property
     def holds(self) -> bool:
@@ -613,16 +619,16 @@ def verify(
     Results that do not hold on their own episodes are not run on fresh ones.
 
     Args:
-        path: of the file.
-        trust: run source.
-        workers: who shares the work; default: this process.
-        progress: called with the measurements done.
-        seed: of the fresh episodes, to repeat a verification; default: 128 random bits.
+        path: path of the file.
+        trust: whether to run source code.
+        workers: processes that share the work; default: this process.
+        progress: function that is called with the number of measurements done.
+        seed: seed of the fresh episodes, to repeat a verification; default: 128 random bits.
         same_seeds: run the episodes of the protocol only. A competitor that carries their truth passes.
 
     Raises:
-        ValueError: if it is no submission, not of this package's protocol, or holds source and is not
-            trusted; and for a seed that is none, is the protocol's, or is given with ``same_seeds``.
+        ValueError: if it is no submission, not of this package's protocol, or contains source code and is not
+            trusted; and for a seed that is invalid, is the protocol's, or is given with ``same_seeds``.
     """
     submission, digest = read_submission(path)
     problem = problem_of(submission.environment)

@@ -328,7 +328,9 @@ def one_family(monkeypatch):
 
 
 def test_a_short_log_says_that_it_is_short(one_family, tmp_path):
-    with pytest.raises(ValueError, match=r"has 3 measurements after the start of its track: .* needs at least 5"):
+    with pytest.raises(
+        ValueError, match=r"has 3 measurements after the start of its track: .* needs at least 5"
+    ):
         advise(FittedLog(PROBLEM, read(write_log(tmp_path, count=5))), {})
     recording = read(write_log(tmp_path, count=12))
     found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
@@ -351,10 +353,8 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
     found = advise(FittedLog(PROBLEM, recording), {**shipped, "true": true})
     assert found.rival == found.advised.name == "true"
     lines = list(advice_lines(found, []))
-    assert lines[0].startswith(
-        "Take true, as it is shipped: nothing that was fitted predicts better beyond chance"
-    )
-    assert any(line.startswith(f"Of what was fitted {found.fitted.name} comes closest") for line in lines)
+    assert lines[0].startswith("Take true, as it is shipped: no fitted filter predicts better beyond chance")
+    assert any(line.startswith(f"Of the fitted filters {found.fitted.name} comes closest") for line in lines)
     for high, sure in ((-0.1, True), (0.1, False)):
         fitted = found.fitted._replace(relative_error=IntervalEstimate(-0.2, -0.3, high))
         said = next(iter(advice_lines(found._replace(fitted=fitted), [])))
@@ -492,4 +492,4 @@ def test_starts_that_disagree_and_parameters_at_a_limit_are_said(advice):
         interval = fitting.Interval(*ends, value == low, value == high)
         found = two_hills._replace(values=values, at_limit=at_limit)
         line = next(parameter_lines(tunable, found, {"log10_acceleration": interval}))
-        assert f"at the {side} limit of the search, the log says {bound}" in line
+        assert f"at the {side} limit of the search, the log supports {bound}" in line

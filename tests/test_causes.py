@@ -28,7 +28,7 @@ from filtergym.evaluation.statistics.cause_split import (
 )
 from filtergym.names import find_competitors
 from filtergym.reports.tables.reasons import (
-    explained_by_default,
+    default_explained,
     largest_reasons,
     reason_sentences,
     reasons_of,
@@ -209,8 +209,8 @@ def test_the_largest_reasons_hold_much_cost_in_few_measurements(records):
     assert all(reason.excess >= 0.05 for reason in largest)
     assert reason_weight(np.array(0.5), np.array(0.1)) == pytest.approx(0.5 * np.log(5.0))
     assert reason_weight(np.array(0.0), np.array(0.1)) == 0.0
-    assert explained_by_default(records, ["known-turn", "kalman-imm-turn"], "imm") == ["kalman-imm-turn"]
-    assert explained_by_default(records, [], "imm") == ["imm"]
+    assert default_explained(records, ["known-turn", "kalman-imm-turn"], "imm") == ["kalman-imm-turn"]
+    assert default_explained(records, [], "imm") == ["imm"]
 
 
 def test_the_worst_episodes_are_those_that_cost_most_and_are_flown_again_bit_for_bit(dataset, records):

@@ -207,11 +207,11 @@ def test_progress_where_nobody_looks_is_few_lines_with_the_time_that_is_left():
 def test_what_has_been_finished_is_said_with_the_time_that_is_left():
     lines, clock = [], Clock()
     shown = ProgressLines(lines.append, clock)
-    shown.say("log.nc: 250 measurements")
+    shown.write_line("log.nc: 250 measurements")
     task = shown.add_task("benchmark", total=10)
     clock.now = 8.0
     shown.update(task, advance=4)
-    shown.say("ManeuveringTarget, random: 41 competitors over 500 episodes")
+    shown.write_line("ManeuveringTarget, random: 41 competitors over 500 episodes")
     shown.update(task, description="fitting")
     shown.update(task, description="fitting")
     assert lines.pop() == "fitting (40 % done after 8 s, 12 s left)"

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from filtergym import evaluate, tidy_records
 from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate, share_interval
-from filtergym.reports.tables.ranking import ranking, ranking_sentence, who_is_best
+from filtergym.reports.tables.ranking import best_competitor, ranking, ranking_sentence
 
 ID = "filtergym/ManeuveringTarget-v0"
 EPISODES = 100
@@ -147,7 +147,7 @@ def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
         kept = [record for record in records if record.policy in names]
         if low is not None:
             kept = [r._replace(low=low) if r.metric == "behind_best" else r for r in kept]
-        return who_is_best(kept)
+        return best_competitor(kept)
 
     everyone = [place.policy for place in ranking(records)]
     classical = [name for name in everyone if name not in learned]
@@ -162,7 +162,7 @@ def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
         for r in records
     ]
     beaten = [r._replace(low=0.01) if (r.policy, r.metric) == ("bptt", "behind_best") else r for r in swapped]
-    assert who_is_best(beaten) == "classical best"
+    assert best_competitor(beaten) == "classical best"
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(1.0 - 1e-6, "bptt"), (1.0 - 1e-3, "copy")])

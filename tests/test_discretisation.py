@@ -141,14 +141,14 @@ def test_a_linear_drift_moves_by_the_exponential(make):
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        ({"f": np.eye(2)}, "motion is said by f and Q, or by drift and diffusion, got f, drift, diffusion"),
+        ({"f": np.eye(2)}, "give the motion by f and Q, or by drift and diffusion, got f, drift, diffusion"),
         ({"drift": None, "diffusion": None}, "got neither"),
         ({"drift": lambda x: [x[0]]}, "neither drift, h nor R takes u: write"),
         ({"drift": lambda x, u: [x[0] * u[0]]}, "drift must return 2 numbers, got 1"),
         ({"drift": lambda x, dt, u: [x[0], u[0]]}, "drift takes the state, and u where there are inputs"),
         ({"diffusion": -np.eye(2)}, "diffusion must be symmetric"),
         ({"integration_steps": 0}, "integration_steps must be"),
-        ({"filter_model": {"Q": np.eye(2)}}, "filter_model says drift, diffusion, h or R, got 'Q'"),
+        ({"filter_model": {"Q": np.eye(2)}}, "filter_model can contain drift, diffusion, h or R, got 'Q'"),
     ],
 )  # fmt: skip
 def test_what_is_no_continuous_model_is_refused(make, wrong, sentence):

@@ -115,7 +115,7 @@ def test_competitors_that_cannot_be(tmp_path, monkeypatch):
     (tmp_path / "mine.zip").touch()
     for names, message in (
         (["adaptve"], "unknown policy 'adaptve': did you mean 'adaptive'"),
-        (["mine"], r"unknown policy 'mine': a file is named whole, mine\.zip"),
+        (["mine"], r"unknown policy 'mine': write the whole file name, mine\.zip"),
         ([], "at least one policy"),
         (3, "competitors are a name, a sequence of names, or a mapping"),
     ):

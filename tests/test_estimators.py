@@ -289,7 +289,7 @@ def test_what_an_estimator_raises_is_told_with_its_own_line(command, monkeypatch
 
 def test_a_name_that_is_taken_is_refused():
     for name in ("imm", "kalman-imm", "known-turn", "imm-tuned", "bptt"):
-        with pytest.raises(ValueError, match=f"'{name}' is the name of what {ID} has already"):
+        with pytest.raises(ValueError, match=f"'{name}' is already a name of {ID}"):
             filtergym.evaluate(ID, {name: Start}, episodes=2, horizon=3)
 
 
@@ -348,9 +348,7 @@ def test_a_class_of_one_track_is_refused_with_its_adapter(given):
     made = {}
     exec(f"def start(self, x0, P0): pass\ndef update(self, {given}): pass", made)  # as students write it
     found = type("OneTrack", (), {name: made[name] for name in ("start", "update")})
-    sentence = (
-        rf"'one': update\({given}\) is of a single-track filter, .*adapters\.SingleTrackEstimator"
-    )
+    sentence = rf"'one': update\({given}\) is of a single-track filter, .*adapters\.SingleTrackEstimator"
     with pytest.raises(ValueError, match=sentence):
         filtergym.evaluate(ID, {"one": found}, episodes=1)
 

@@ -250,6 +250,6 @@ def test_what_cannot_be_set_is_named(tmp_path):
     problem = problem_of("filtergym/UavAutopilot-v0")
     export_c(ExportRequest(problem, "mehra", find_competitor(problem, "mehra").maker), tmp_path)
     text = " ".join((tmp_path / "mehra.h").read_text().split())
-    assert "this filter has none that can be given" in text
+    assert "Parameters: this filter has none." in text
     assert "Constant here" in text
     assert "window, " in text

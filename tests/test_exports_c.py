@@ -479,7 +479,9 @@ def test_the_operations_of_a_network_are_told_beside_those_of_the_filter(tmp_pat
     figures = export_c(request, tmp_path / "own")
     assert figures.network_operations == 2 * (14 * 6 + 6 * 2) + 6 + 2
     words = " ".join((tmp_path / "own" / "own.h").read_text().split())
-    assert f"{figures.operations:,} operations an update and 200 of the network where it is asked" in words
+    assert (
+        f"{figures.operations:,} operations an update and 200 of the network where it is evaluated" in words
+    )
 
 
 def test_files_of_a_filter_are_not_those_of_the_programs_around_it():

@@ -162,8 +162,8 @@ def test_what_may_not_enter(small, words, sentence):
         ("resamples = 1000", "resamples = 10", "states resamples 10"),
         ('"glint"', '"glimt"', "unknown scenario of filtergym/ManeuveringTarget-v0 'glimt'"),
         ('"kalman"', '"true-state"', "unknown paper of filtergym/UavAutopilot-v0 'true-state'"),
-        ("seed = 3", "seeds = 3", "holds no protocol"),
-        ('split = "test"', 'split = "train"', "holds no protocol"),
+        ("seed = 3", "seeds = 3", "contains no protocol"),
+        ('split = "test"', 'split = "train"', "contains no protocol"),
     ],
 )
 def test_what_is_no_protocol_of_this_package(tmp_path, old, new, sentence):

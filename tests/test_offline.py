@@ -201,7 +201,7 @@ def test_an_interruption_leaves_no_half_of_a_data_set(minari, monkeypatch, tmp_p
 
     with pytest.raises(KeyboardInterrupt):
         offline.write_datasets(ENV, ["imm"], episodes=2, horizon=4, folder=tmp_path / "out", progress=stopped)
-    monkeypatch.setattr(offline, "_tell_scores", stopped)
+    monkeypatch.setattr(offline, "_store_scores", stopped)
     with pytest.raises(KeyboardInterrupt):
         offline.write_datasets(ENV, ["imm"], episodes=2, horizon=4, folder=tmp_path / "out")
     assert list(tmp_path.rglob("*")) == []

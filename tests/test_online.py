@@ -652,7 +652,9 @@ def test_a_forged_state_is_refused_in_a_sentence_and_the_filter_goes_on(name):
         parts |= {"policy": [5, "x"]}
     for part, values in parts.items():
         for value in values:
-            with pytest.raises(ValueError, match="cannot continue from this state, which is not one that save"):
+            with pytest.raises(
+                ValueError, match="cannot continue from this state, which is not one that save"
+            ):
                 filter.restore(saved._replace(**{part: value}))
     one, two = (each.update(20.0, x=20200.0, y=30700.0) for each in (filter, other))
     np.testing.assert_array_equal(one.mean, two.mean)
@@ -714,5 +716,7 @@ def test_times_since_1970_are_of_the_unit_that_they_must_have():
             np.testing.assert_allclose(one.mean, other.mean, atol=0.5 if unit == 10**6 else 1e-3)
     filter = filtergym.online("filtergym/ManeuveringTarget-v0", "kalman-imm-turn")
     filter.start(mean, covariance)
-    with pytest.raises(ValueError, match=r"counts from 1970, but the last one, 0\.0 s, does not: start the track"):
+    with pytest.raises(
+        ValueError, match=r"counts from 1970, but the last one, 0\.0 s, does not: start the track"
+    ):
         filter.update(start, x=21e3, y=30.5e3)

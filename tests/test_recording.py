@@ -598,7 +598,7 @@ PAGE = DOCS / "own_data.md"
 
 
 def test_the_example_of_the_page_prints_what_it_says(capsys):
-    section = PAGE.read_text(encoding="utf-8").partition("## What the sensors really said")[2]
+    section = PAGE.read_text(encoding="utf-8").partition("## Recordings of real sensors")[2]
     code = section.partition("```python\n")[2].partition("```")[0]
     exec(code, {})
     said = [line.rpartition("  # ")[2] for line in code.splitlines() if "  # " in line]

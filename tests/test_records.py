@@ -31,7 +31,7 @@ from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
-from filtergym.reports.tables.ranking import who_is_best
+from filtergym.reports.tables.ranking import best_competitor
 from filtergym.reports.tables.results import settings_of, write_results
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -192,7 +192,7 @@ def test_comparison_shows_what_the_records_say(recorded, result):
     assert (
         tail.header == consistent.header == ["scenario", *first, "`imm` (paper)", "`known-turn` (reference)"]
     )
-    assert cost.rows[0][1] == who_is_best(records)
+    assert cost.rows[0][1] == best_competitor(records)
     assert tail.rows[0][4].endswith("<br>+0.0")
     assert consistent.rows[0][1].startswith(f"{value(records, 'ppo', 'anees').value:.3g}")
     assert error.header[:-1] == tail.header

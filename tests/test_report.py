@@ -273,12 +273,12 @@ def test_consistency_in_a_word():
         (0.4, 0.3, 0.5): "cautious",
         (1.0, 1.0, 1.0): "no interval",
         (1.0, None, None): "no interval",
-        (None, None, None): "says nothing",
+        (None, None, None): "unknown",
     }
     assert {
         ends: consistency_word(SimpleNamespace(value=ends[0], low=ends[1], high=ends[2])) for ends in words
     } == words
-    assert consistency_word(None) == "says nothing"
+    assert consistency_word(None) == "unknown"
 
 
 def test_only_who_is_consistent_is_called_so(result):

@@ -231,8 +231,8 @@ def test_a_table_has_columns_named_after_the_sensors(make, tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        ({"h": np.eye(3)}, "leave h, R and measured out"),
-        ({"sensors": None}, "said by h and R, or by sensors"),
+        ({"h": np.eye(3)}, "leave out h, R and measured"),
+        ({"sensors": None}, "give the measurement by h and R, or by sensors"),
         ({"sensors": {}}, "sensors must name at least one"),
         ({"sensors": {"gps": np.eye(3)}}, "sensors must be a mapping from names to Sensor"),
         ({"sensors": {"gps": Sensor(np.eye(2), 1.0)}}, "h of the sensor 'gps' must be finite numbers of shape"),
@@ -240,7 +240,7 @@ def test_a_table_has_columns_named_after_the_sensors(make, tmp_path):
         ({"sensors": {"gps": Sensor([[1, 0, 0]], 1.0, names=("x", "y"))}}, "the sensor 'gps' must be 1 each"),
         ({"sensors": {"process": Sensor([[1, 0, 0]], 1.0)}}, "cannot be called process or measurement"),
         ({"sampling_interval": 0.5}, "'odometry' is due every 0.2 s, and measurements are 0.5 s apart"),
-        ({"filter_model": {"R": np.eye(4)}}, "filter_model says f, Q or sensors, got 'R'"),
+        ({"filter_model": {"R": np.eye(4)}}, "filter_model can contain f, Q or sensors, got 'R'"),
         ({"filter_model": {"sensors": {"sonar": Sensor([[1, 0, 0]], 1.0)}}}, "got 'sonar'"),
     ],
 )  # fmt: skip

@@ -290,4 +290,4 @@ def test_the_command_prints_a_line_each_and_writes_both_files(command, tmp_path,
     page = written[1].read_text()
     assert "nothing is received for 10 scans" in page
     assert "<script" not in page
-    assert "has answered already" in command("stress", "filtergym/ManeuveringTarget-v0", "file:mine.csv")[2]
+    assert "is a file of estimates" in command("stress", "filtergym/ManeuveringTarget-v0", "file:mine.csv")[2]

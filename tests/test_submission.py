@@ -486,7 +486,7 @@ def test_source_runs_only_when_it_is_trusted(trap, edited, command):
         content["competitor"]["text"] = SPRING.format(str(trap)) + MINE
 
     path = edited("source", spring)
-    assert "holds source code, and to verify it is to execute it" in refused(command, path)
+    assert "contains source code, which a verification executes" in refused(command, path)
     code, shown, _ = command("verify", path, "--source", "read_me.py")
     assert code == 0
     assert "its class Mine" in shown
@@ -541,9 +541,9 @@ def test_what_is_told_the_truth_is_refused(edited, command):
     def name(content):
         content["competitor"]["name"] = "known-turn"
 
-    assert "holds a reference" in refused(command, edited("shipped", name))
+    assert "names a reference" in refused(command, edited("shipped", name))
     assert (
-        "holds a reference"
+        "names a reference"
         in command("submit", ID, "known-turn", "--protocol", "trial", "--out", "x.json")[2]
     )
 
@@ -556,20 +556,20 @@ def test_a_truncated_file_is_refused(honest, command, tmp_path):
     path = tmp_path / "half.json"
     for share in (0.0, 0.99):
         path.write_bytes(content[: int(share * len(content))])
-        assert "holds no submission of filtergym" in refused(command, path)
+        assert "contains no submission of filtergym" in refused(command, path)
 
 
 def test_what_is_packed_or_large_is_refused(command, tmp_path):
     packed = tmp_path / "bomb.json"
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("../../outside.py", b"0" * 10_000_000)
-    assert "holds no submission" in refused(command, packed)
+    assert "contains no submission" in refused(command, packed)
     large = tmp_path / "large.json"
     with large.open("wb") as file:
         file.truncate(100 * MOST_BYTES)  # takes no room on the disk
     assert "is larger than 8 MB" in refused(command, large)
     (tmp_path / "deep.json").write_bytes(b'{"card":' + b'{"title":' * 100_000)
-    assert "holds no submission" in refused(command, tmp_path / "deep.json")
+    assert "contains no submission" in refused(command, tmp_path / "deep.json")
     (tmp_path / "named.json").write_text(json.dumps({"x" * 10_000: 0}))
     assert len(refused(command, tmp_path / "named.json")) < 1000
     assert "there is no file" in refused(command, tmp_path / "none.json")
@@ -594,7 +594,9 @@ def test_damaged_files_end_in_a_sentence(honest, tmp_path):
 
 @pytest.mark.parametrize("title", ["\x1b[2J", "<script>", "[x](y)", "", "x" * 81, "a\n"])
 def test_a_title_is_words(title, edited, command):
-    assert "holds no submission" in refused(command, edited("agent", lambda c: c["card"].update(title=title)))
+    assert "contains no submission" in refused(
+        command, edited("agent", lambda c: c["card"].update(title=title))
+    )
     if title:  # without one it is the name
         code, _, errors = command(
             "submit", ID, "imm", "--protocol", "trial", "--out", "x.json", "--title", title

@@ -1,4 +1,4 @@
-"""filterpy's Kalman filter in the closed loop of UavAutopilot: it is told its control, and loses sensors now and then.
+"""filterpy's Kalman filter in the closed loop of UavAutopilot: its control is known, and sensors drop out at times.
 
 filtergym evaluate filtergym/UavAutopilot-v0 --policy autopilot_kalman:Kalman --policy kalman --policy matched
 """

@@ -5,7 +5,7 @@
 
 Each target flies along a line of its own, at constant velocity and now and then with an acceleration that lasts for
 3 to 12 s. A semi-Markov bank follows each (:mod:`filtergym.filters.semi_markov`). The action is which target the next
-measurement is of. Nobody is shown what the others would have said, so noise is the same whatever is chosen.
+measurement is of. The measurements of the others remain hidden, so the noise does not depend on the choice.
 """
 
 import math
@@ -37,7 +37,7 @@ TARGETS, BEGIN, SHORTEST, LONGEST = 4, 0.04, 3, 12
 HAZARDS = semi_markov.hazards([0.0] * (SHORTEST - 1) + [1.0] * (LONGEST - SHORTEST + 1), 5)
 NUMBERS = tuple(map(str, range(1, TARGETS + 1)))
 ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Of a covariance of position, velocity and acceleration, as the observation shows them."""
+"""Entries of a covariance of position, velocity and acceleration, as the observation contains them."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class BudgetedSensingParameters(TaskParameters):
     agility: tuple[float, float] = parameter((1.0, 10.0), above=0.0, ascending=True)
     """Limits of the standard deviation of a target's accelerations, m/s^2, drawn log-uniformly; it is known."""
     sigma: tuple[float, float] = parameter((5.0, 50.0), above=0.0, ascending=True)
-    """Likewise of its measured position, m."""
+    """Limits of the standard deviation of its measured position, m, drawn log-uniformly; it is known."""
     beam: float = parameter(1e6, above=0.0)
     """A target that is further from its prediction, m, gives no echo."""
     lost: float = parameter(1000.0, above=0.0)
@@ -69,7 +69,7 @@ class Truth(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What the beam would say of each target, of which one is looked at; arrays ``(4, N)``."""
+    """The beam's measurement of each target, of which the filter receives one; arrays ``(4, N)``."""
 
     position: Array
     sigma: Array
@@ -85,7 +85,7 @@ class Targets(World[Task, Truth, Measurement]):
     row_uniforms = 2 * TARGETS
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Everyone starts at zero, within 50 m and 30 m/s."""
+        """Start all estimates at zero, within 50 m and 30 m/s."""
         p, xp, zero = self.parameters, self.xp, 0.0 * normals[:TARGETS]
         agility, sigma = (
             xp.stack([draws.log_uniform(f"{what} {j}", limits) for j in NUMBERS])
@@ -114,26 +114,26 @@ class Targets(World[Task, Truth, Measurement]):
         return truth, Measurement(read, truth.sigma, truth.agility)
 
     def state(self, truth: Truth) -> Array:
-        """Positions."""
+        """Return the positions."""
         return truth.position
 
     def error_cost(self, error: Array) -> Array:
-        """Mean squared error of the positions, none larger than of a lost target."""
+        """Return the mean squared error of the positions, limited to that of a lost target."""
         squares = self.xp.minimum(error**2, self.parameters.lost**2 + 0.0 * error)
         return sum(squares[j] for j in range(TARGETS)) / TARGETS
 
 
 class Track(NamedTuple):
-    """Hypotheses of one target, by their age."""
+    """Hypotheses on one target, by their age."""
 
     steady: AgedHypotheses
     """Position and velocity."""
     thrust: AgedHypotheses
-    """With the acceleration."""
+    """Position, velocity and acceleration."""
 
 
 class Tracks(NamedTuple):
-    """What is known of all targets."""
+    """The estimates of all targets."""
 
     tracks: tuple[Track, ...]
     mean: Array
@@ -145,14 +145,14 @@ class Tracks(NamedTuple):
 
 
 class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
-    """Control ``beam``: the action says which target is looked at."""
+    """Control ``beam``: the action is the number of the target to look at."""
 
     parameters: BudgetedSensingParameters
     action_space = gymnasium.spaces.Discrete(TARGETS)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """How well each target is known before the look, and what kind of target it is."""
+        """Return the covariance of each target before the look, and its agility and noise."""
         places = tuple(f"{j}_{a}{b}" for a, b in ENTRIES for j in NUMBERS)
         return (
             Block(
@@ -188,7 +188,7 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
         return self._together(tuple(tracks), xp.stack([zero] * TARGETS))
 
     def _together(self, tracks: tuple[Track, ...], waited: Array) -> Tracks:
-        """With mean and covariance of each target over its hypotheses."""
+        """Return the tracks with mean and covariance of each target over its hypotheses."""
         xp, means, covariances = self.xp, [], []
         for track in tracks:
             steady, zero = track.steady, 0.0 * track.steady.probability
@@ -223,7 +223,7 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
         return self.look(state, measurement, looked)
 
     def look(self, state: Tracks, measurement: Measurement, looked: Array) -> Tracks:
-        """Take in what the beam says of the targets of which ``looked``, ``(4, N)``, is 1."""
+        """Update with the beam's measurements of the targets of which ``looked``, ``(4, N)``, is 1."""
         xp, tracks = self.xp, []
         within = xp.abs(measurement.position - state.mean[0]) <= self.parameters.beam
         for j, track in enumerate(state.tracks):
@@ -245,11 +245,11 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
         return self._together(tuple(tracks), xp.where(looked > 0.0, 0.0 * state.waited, state.waited))
 
     def mean(self, state: Tracks) -> Array:
-        """Positions."""
+        """Return the positions."""
         return state.mean[0]
 
     def covariance(self, state: Tracks) -> Array:
-        """Of them: targets are independent."""
+        """Return the covariance of the positions: targets are independent."""
         zero = 0.0 * state.waited[0]
         size = range(TARGETS)
         return _matrix(self.xp, [[state.covariance[0, 0, i] if i == j else zero for j in size] for i in size])
@@ -260,7 +260,7 @@ def _matrix(xp: Any, rows: Sequence[Sequence[Array]]) -> Array:
 
 
 def _accelerated(xp: Any, mean: Array, covariance: Array, variance: Array) -> tuple[Array, Array]:
-    """State of a manoeuvre whose acceleration has this variance, from position and velocity."""
+    """Return the state of a manoeuvre whose acceleration has this variance, from position and velocity."""
     zero = 0.0 * mean[0]
     rows = [[covariance[i, 0], covariance[i, 1], zero] for i in range(2)]
     return xp.concat([mean, zero[None]]), _matrix(xp, [*rows, [zero, zero, variance + zero]])
@@ -272,7 +272,7 @@ def _flown(table: AgedHypotheses, F: Array) -> AgedHypotheses:
 
 
 def _update(table: AgedHypotheses, measurement: Measurement, j: int) -> kalman.Update:
-    """Kalman filter of every hypothesis with a measured position."""
+    """Update the Kalman filter of every hypothesis with a measured position."""
     S = table.covariance[0, 0] + measurement.sigma[j] ** 2
     innovation = measurement.position[j] - table.mean[0]
     K = table.covariance[:, 0] / S
@@ -324,7 +324,7 @@ def later(P: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
 
 
 def updated(P: numpy.ndarray, R: numpy.ndarray, share: Any = 1.0) -> numpy.ndarray:
-    """Covariance after a look, or after a share of one."""
+    """Return the covariance after a look, or after a share of one."""
     return P - share * P[:, None, 0] * P[None, :, 0] / (P[0, 0] + R)
 
 
@@ -341,28 +341,28 @@ class Manager(Policy):
         self.readers = {name: model.reader(name) for name in names}
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Choose."""
-        said = {name: read(observation).T for name, read in self.readers.items()}
-        entries = dict(zip(ENTRIES, said.pop("covariance").reshape(len(ENTRIES), TARGETS, -1), strict=True))
+        """Choose the target of the largest index."""
+        rest = {name: read(observation).T for name, read in self.readers.items()}
+        entries = dict(zip(ENTRIES, rest.pop("covariance").reshape(len(ENTRIES), TARGETS, -1), strict=True))
         P = numpy.array([[entries[min(a, b), max(a, b)] for b in range(3)] for a in range(3)])
-        return self.index(P, said["sigma"] ** 2, said).argmax(axis=0), None
+        return self.index(P, rest["sigma"] ** 2, rest).argmax(axis=0), None
 
-    def index(self, P: numpy.ndarray, R: numpy.ndarray, said: Mapping[str, numpy.ndarray]) -> numpy.ndarray:
-        """Of each target, ``(4, N)``.
+    def index(self, P: numpy.ndarray, R: numpy.ndarray, rest: Mapping[str, numpy.ndarray]) -> numpy.ndarray:
+        """Return the index of each target, ``(4, N)``.
 
         Args:
             P: predicted covariance of each, ``(3, 3, 4, N)``.
             R: variance of a measurement of it, ``(4, N)``.
-            said: the rest of the observation.
+            rest: the rest of the observation.
         """
         raise NotImplementedError
 
     def found(self, P: numpy.ndarray, R: numpy.ndarray) -> numpy.ndarray:
-        """Probability that the beam finds it."""
+        """Return the probability that the beam finds it."""
         return erf(self.beam / numpy.sqrt(2.0 * (P[0, 0] + R)))
 
     def cost(self, P: numpy.ndarray) -> numpy.ndarray:
-        """Expected squared error, none larger than of a lost target."""
+        """Return the expected squared error, limited to that of a lost target."""
         ratio = self.lost / numpy.sqrt(P[0, 0])
         within = erf(ratio / math.sqrt(2.0))
         density = numpy.exp(-0.5 * ratio**2) / math.sqrt(2.0 * math.pi)
@@ -372,48 +372,48 @@ class Manager(Policy):
 class RoundRobin(Manager):
     """The target that has waited longest."""
 
-    def index(self, P: Any, R: Any, said: Any) -> numpy.ndarray:
-        """Seconds since the last look."""
-        return said["waited"]
+    def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
+        """Return the seconds since the last look."""
+        return rest["waited"]
 
 
 class GreedyInformation(Manager):
-    """The look that is expected to tell most about the position, in nats."""
+    """The look of the largest expected information about the position, nats."""
 
-    def index(self, P: Any, R: Any, said: Any) -> numpy.ndarray:
-        """Half the log of the variance before over that after."""
+    def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
+        """Return half the logarithm of the variance before over that after."""
         return self.found(P, R) * 0.5 * numpy.log1p(P[0, 0] / R)
 
 
 class Greedy(Manager):
-    """The look that is expected to cost least now."""
+    """The look of the least expected cost now."""
 
-    def index(self, P: Any, R: Any, said: Any) -> numpy.ndarray:
-        """Expected cost before less that after."""
+    def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
+        """Return the expected cost before less that after."""
         return self.found(P, R) * (self.cost(P) - self.cost(updated(P, R)))
 
 
 class Deferral(Manager):
-    """A Whittle-type index: what it costs over some seconds not to look now, if nobody looks in them."""
+    """A Whittle-type index: the cost of not looking now, over some seconds without looks."""
 
     seconds = TARGETS
 
-    def index(self, P: Any, R: Any, said: Any) -> numpy.ndarray:
+    def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
         """Sum of the differences, as in P. Whittle, Restless bandits, J. Applied Probability 25A (1988), 287-298."""
         found, active, total = self.found(P, R), updated(P, R), 0.0
         for _ in range(self.seconds):
             total = total + self.cost(P) - self.cost(active)
-            P, active = later(P, said["agility"]), later(active, said["agility"])
+            P, active = later(P, rest["agility"]), later(active, rest["agility"])
         return found * total
 
 
 class Rollout(Manager):
-    """Every pair of looks, and then what `greedy` would do for some seconds."""
+    """Every pair of looks, followed by some seconds of `greedy`."""
 
     seconds = TARGETS
 
-    def index(self, P: Any, R: Any, said: Any) -> numpy.ndarray:
-        """Cost of the best sequence that begins with each, negative."""
+    def index(self, P: Any, R: Any, rest: Any) -> numpy.ndarray:
+        """Return the negative cost of the best sequence that begins with each."""
         pairs = numpy.eye(TARGETS)
         best = []
         for first in pairs:
@@ -428,13 +428,13 @@ class Rollout(Manager):
                         looked = (first, second)[k][:, None]
                     state = updated(state, R, looked * self.found(state, R))
                     total = total + self.cost(state).sum(axis=0)
-                    state = later(state, said["agility"])
+                    state = later(state, rest["agility"])
                 costs.append(total)
             best.append(-numpy.min(costs, axis=0))
         return numpy.array(best)
 
 
-# --- what knows more
+# --- references
 
 
 class AllBeams:
@@ -448,7 +448,7 @@ class AllBeams:
         self.bank, self.xp = BeamBank(task, "beam"), task.xp
 
     def start(self, initial: Initial, truth: Truth) -> Tracks:
-        """Start where everyone starts."""
+        """Start at the common initial estimate."""
         return self.bank.start(initial)
 
     def update(self, memory: Tracks, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Tracks]:
@@ -459,20 +459,20 @@ class AllBeams:
         return self.bank.mean(after), self.bank.covariance(after), after
 
     def choose(self, predicted: Tracks, seen: Tracks, measurement: Measurement, truth: Truth) -> Tracks:
-        """All of them."""
+        """Choose all targets."""
         return seen
 
 
 class Clairvoyant(AllBeams):
     """The same beam, and of each target is known where it is and what the look would change: of the looks the one
-    whose true errors are least over the next seconds, if nobody looks in them.
+    whose true errors are least over the next seconds without looks.
     """
 
     knows = "the true state of every target, and what the beam would say of it"
     seconds = TARGETS
 
     def choose(self, predicted: Tracks, seen: Tracks, measurement: Measurement, truth: Truth) -> Tracks:
-        """Look at one."""
+        """Choose one target."""
         xp = self.xp
         state = xp.stack([truth.position, truth.velocity, truth.acceleration])
         gain = self._errors(predicted.mean - state) - self._errors(seen.mean - state)
@@ -485,7 +485,7 @@ class Clairvoyant(AllBeams):
         return self.bank.look(predicted, measurement, xp.stack(looked))
 
     def _errors(self, error: Array) -> Array:
-        """Sum of the squared errors of the positions as they go on, ``(4, N)``."""
+        """Return the sum of the squared future errors of the positions, ``(4, N)``."""
         total, limit = 0.0, self.bank.parameters.lost**2 + 0.0 * error[0]
         for k in range(self.seconds):
             ahead = error[0] + k * error[1] + 0.5 * k * k * error[2]

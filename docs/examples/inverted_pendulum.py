@@ -1,10 +1,10 @@
-"""An environment of one's own in one file: a pendulum is held upright by the estimate of a Kalman filter.
+"""An environment in one file: the estimate of a Kalman filter holds a pendulum upright.
 
     filtergym list inverted_pendulum:mine/InvertedPendulum-v0
     filtergym evaluate inverted_pendulum:mine/InvertedPendulum-v0 --policy kalman --policy matching --policy known-gusts
 
-Gusts push the pendulum, sometimes hard and sometimes hardly, and nobody says when. A sensor reads the angle. The
-torque follows from the estimate, so the loop is closed; the action scales the process noise of the filter.
+Gusts of unknown, changing strength push the pendulum. A sensor reads the angle. The torque follows from the estimate,
+so the loop is closed; the action scales the process noise of the filter.
 """
 
 import math
@@ -38,11 +38,11 @@ class InvertedPendulumParameters(TaskParameters):
     sampling_interval: float = parameter(0.05, above=0.0)
     """T, s."""
     length: float = parameter(1.0, above=0.0)
-    """m."""
+    """Length of the pendulum, m."""
     angle_sigma: float = parameter(0.01, above=0.0)
     """Standard deviation of the angle sensor, rad."""
     gust: float = parameter(0.5, above=0.0)
-    """Standard deviation of the angular acceleration by gusts that the filter believes, rad/s^2."""
+    """Standard deviation of the angular acceleration by gusts in the filter's model, rad/s^2."""
     gust_levels: tuple[float, float] = parameter((0.1, 10.0), above=0.0, ascending=True)
     """Limits of its true factor, drawn log-uniformly before and after a change."""
     gains: tuple[float, float] = (20.0, 6.0)
@@ -55,7 +55,7 @@ class Truth(NamedTuple):
     """The pendulum, and the gusts of the episode."""
 
     number: Array
-    """Of the measurement, ``(N,)``."""
+    """Number of the measurement, ``(N,)``."""
     state: Array
     """Angle from upright, rad, and rate, rad/s, ``(2, N)``."""
     levels: Array
@@ -65,12 +65,12 @@ class Truth(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What the sensor says, and the torque that is known because it was commanded."""
+    """The sensor's reading, and the torque, which is known because it was commanded."""
 
     angle: Array
-    """rad, ``(1, N)``; its variance is ``angle_sigma`` squared."""
+    """Angle, rad, ``(1, N)``; its variance is ``angle_sigma`` squared."""
     torque: Array
-    """In force since the measurement before, over the moment of inertia, rad/s^2, ``(N,)``."""
+    """Torque since the measurement before, over the moment of inertia, rad/s^2, ``(N,)``."""
 
 
 class PendulumWorld(World[Task, Truth, Measurement]):
@@ -81,7 +81,7 @@ class PendulumWorld(World[Task, Truth, Measurement]):
     normals = 2
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Nearly upright and nearly at rest; everyone starts at zero."""
+        """Start nearly upright and nearly at rest; all estimates start at zero."""
         p, xp = self.parameters, self.xp
         levels = xp.stack(
             [draws.log_uniform(name, p.gust_levels) for name in ("level before", "level after")]
@@ -93,7 +93,7 @@ class PendulumWorld(World[Task, Truth, Measurement]):
         return Truth(zero[0], sigma * normals, levels, change), Initial(zero, covariance)
 
     def level(self, truth: Truth) -> Array:
-        """Factor on the gusts in the interval before this measurement."""
+        """Return the factor on the gusts in the interval before this measurement."""
         return self.xp.where(truth.number < truth.change, truth.levels[0], truth.levels[1])
 
     def advance(self, truth: Truth, noise: Array, feedback: Array) -> tuple[Truth, Measurement]:
@@ -110,7 +110,7 @@ class PendulumWorld(World[Task, Truth, Measurement]):
         return truth._replace(state=state), Measurement(reading, feedback)
 
     def cost(self, truth: Truth, mean: Array) -> Array:
-        """Squared angle, over the variance of the sensor: what matters is to stay upright."""
+        """Return the squared angle, over the variance of the sensor."""
         return (truth.state[0] / self.parameters.angle_sigma) ** 2
 
     def records(self, truth: Truth) -> dict[str, Array]:
@@ -124,11 +124,11 @@ class Filter(NamedTuple):
     mean: Array
     """Predicted with the nominal noise after ``predict``, estimated after ``act``, ``(2, N)``."""
     covariance: Array
-    """Likewise, ``(2, 2, N)``; predicted without process noise."""
+    """Covariance of the mean, ``(2, 2, N)``; predicted without process noise."""
     nis: Array
     """Normalised innovation squared, with the process noise of the last action, ``(N,)``."""
     innovation: Array
-    """Over its sigma, ``(N,)``."""
+    """Innovation over its sigma, ``(N,)``."""
     scale: Array
     """Factor on the process noise in the last update, ``(N,)``."""
 
@@ -141,7 +141,7 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What the agent is shown."""
+        """Return the observation blocks of the agent."""
         decades = self.parameters.noise_decades * math.log(10.0)
         return (
             Block("innovation", lambda f, _: f.innovation, "innovation over its sigma", shown=SIGNED_LOG),
@@ -150,7 +150,7 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         )
 
     def start(self, initial: Initial) -> Filter:
-        """Start where everyone starts."""
+        """Start at the common initial estimate."""
         zero = 0.0 * initial.mean[0]
         return Filter(initial.mean, initial.covariance, zero, zero, zero + 1.0)
 
@@ -164,7 +164,7 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         return Filter(mean, covariance, innovation * innovation, innovation, state.scale)
 
     def act(self, state: Filter, measurement: Measurement, action: Array) -> Filter:
-        """Update with the process noise that the action asks for."""
+        """Update with the process noise of the action."""
         task = self.task
         scale = self.xp.exp(
             self.parameters.noise_decades * math.log(10.0) * self.xp.clip(action[0], -1.0, 1.0)
@@ -174,7 +174,7 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         return state._replace(mean=result.mean, covariance=result.covariance, scale=scale)
 
     def records(self, state: Filter, measurement: Measurement) -> dict[str, Array]:
-        """NIS and the factor on the process noise."""
+        """Return NIS and the factor on the process noise."""
         return {"nis": state.nis, "nis_degrees": 1.0 + 0.0 * state.nis, "scale": state.scale}
 
 
@@ -197,7 +197,7 @@ class InvertedPendulum(Task):
     companions = (Actions({"gain": "decades of the process noise; 0 is the Kalman filter"}),)
 
     def set_up(self) -> None:
-        """Compute the model that the filter believes: the pendulum for small angles."""
+        """Compute the model of the filter: the pendulum for small angles."""
         p, T = self.parameters, self.parameters.sampling_interval
         stiffness = 9.81 / p.length
         self.F = self.constant([[1.0 + 0.5 * T**2 * stiffness, T], [T * stiffness, 1.0]])
@@ -207,7 +207,7 @@ class InvertedPendulum(Task):
         self.R = self.constant([[p.angle_sigma**2]])
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
-        """Torque over the moment of inertia, rad/s^2, ``(N,)``."""
+        """Return the torque over the moment of inertia, rad/s^2, ``(N,)``."""
         angle_gain, rate_gain = self.parameters.gains
         return -(angle_gain * mean[0] + rate_gain * mean[1])
 
@@ -235,7 +235,7 @@ class Matching(Policy):
 
 
 class KnownGusts:
-    """The Kalman filter that is told the strength of the gusts."""
+    """The Kalman filter that knows the strength of the gusts."""
 
     kind = "reference"
     knows = "the factor on the gusts at every moment"
@@ -244,11 +244,11 @@ class KnownGusts:
         self.task = task
 
     def start(self, initial: Initial, truth: Truth) -> Initial:
-        """Start where everyone starts."""
+        """Start at the common initial estimate."""
         return initial
 
     def update(self, memory: Initial, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Initial]:
-        """Kalman filter with the true noise."""
+        """Predict and update with the true noise."""
         task: Any = self.task
         Q = task.world.level(truth) ** 2 * task.Q[:, :, None]
         offset = task.push * measurement.torque

@@ -1,4 +1,4 @@
-"""A radar track in a loop of one's own: start, update, predict, save, restore."""
+"""A radar track in your own loop: start, update, predict, save, restore."""
 
 import pickle
 
@@ -24,7 +24,7 @@ again = filtergym.online("filtergym/ManeuveringTarget-v0", "kalman-imm-turn", sa
 again.restore(pickle.loads(state))
 assert (again.update(20.0, x=17_480.0, y=31_300.0).mean == filter.update(20.0, x=17_480.0, y=31_300.0).mean).all()
 
-# Many tracks side by side: the tracks are the last axis, and a new one takes the place of another.
+# Many tracks side by side: the tracks are the last axis, and a new one can replace another.
 many = filtergym.online("filtergym/ManeuveringTarget-v0", "imm", tracks=2)
 start = numpy.array([[21_000.0, 30_500.0, -180.0, 40.0], [5_000.0, 8_000.0, 90.0, 0.0]]).T
 spread = numpy.repeat(numpy.diag([2e4, 2e4, 1e3, 1e3])[:, :, None], 2, axis=2)

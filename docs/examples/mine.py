@@ -1,4 +1,4 @@
-"""A Kalman filter of one's own for ManeuveringTarget, in plain NumPy.
+"""A Kalman filter for ManeuveringTarget, in plain NumPy.
 
 filtergym evaluate filtergym/ManeuveringTarget-v0 --policy mine:Mine --policy imm --policy bptt --policy known-turn
 """

@@ -39,7 +39,7 @@ Target = filtergym.state_space(
         {"f": turn, "Q": np.diag([0.01, 0.01, 0.1, 1e-5, 1e-3])}
     ],  # the world switches to it, and back
     transition=[[0.95, 0.05], [0.1, 0.9]],
-    filter_model={"R": np.diag([100.0, 4e-4, 4e-4])},  # the filters think less of the radar than it deserves
+    filter_model={"R": np.diag([100.0, 4e-4, 4e-4])},  # the filters overestimate the radar's noise
     process_noise=(0.3, 3.0),  # the true Q of an episode, as a factor
     availability=0.9,  # of ten measurements one is missed
 )

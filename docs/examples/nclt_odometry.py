@@ -25,7 +25,7 @@ def write_drives(data: Path, folder: Path) -> None:
             # Of the wheels left and right speeds, m/s; of the IMU the heading from x to y, rad.
             speed, heading = wheels[:, :2].mean(axis=1), wheels[:, 2]
             moved = speed[:, None] * numpy.stack([numpy.cos(heading), numpy.sin(heading)], axis=1)
-            # The fixes come without deviations; what is missing repeats the one before, and is left out as such.
+            # The fixes have no deviations; a missing one repeats its predecessor, and is left out as a repetition.
             columns = [numpy.arange(len(fixes)), fixes, numpy.full_like(fixes, 5.0), moved, truth]
             file = folder / f"{drive['data_date']}.csv"
             numpy.savetxt(file, numpy.column_stack(columns), "%.6f", ",", header=NAMES, comments="")

@@ -1,4 +1,4 @@
-"""Radar plots of two aircraft as a table, as they could come out of a radar: range, azimuth, and nothing true.
+"""Radar plots of two aircraft as a table, as a radar could write them: range, azimuth, no truth.
 
 python docs/examples/plots.py plots.csv
 """

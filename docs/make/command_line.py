@@ -18,7 +18,7 @@ def command_functions() -> dict[str, Callable[..., None]]:
 
 
 def command_line_markdown() -> str:
-    """What ``--help`` says of every command, as sections of a page."""
+    """Return the ``--help`` of every command, as sections of a page."""
     program = application()
     lines = [*_options(_general_options(program), program.callback)]
     for name, function in command_functions().items():
@@ -32,12 +32,11 @@ def command_line_markdown() -> str:
 
 
 def _general_options(program: Any) -> list[Any]:
-    """Options before the command; what the shell's completion brings is none of ours."""
+    """Return the options before the command, without those of the shell's completion."""
     return [parameter for parameter in program.params if parameter.name in ("version", "no_cache")]
 
 
 def _options(parameters: list[Any], function: Callable[..., Any]) -> list[str]:
-    """Table of a command's arguments and options."""
     annotations = {name: p.annotation for name, p in inspect.signature(function).parameters.items()}
     rows = []
     for parameter in parameters:
@@ -52,7 +51,6 @@ def _options(parameters: list[Any], function: Callable[..., Any]) -> list[str]:
 
 
 def _kind(annotation: Any) -> str:
-    """Word for the values that an option takes."""
     if hasattr(annotation, "__metadata__"):
         annotation = annotation.__origin__
     if get_origin(annotation) is UnionType:

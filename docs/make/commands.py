@@ -1,4 +1,4 @@
-"""Commands that make what this project's pages are rendered from: ``python docs/make COMMAND``."""
+"""Commands that make the sources of this project's pages: ``python docs/make COMMAND``."""
 
 import itertools
 import math
@@ -74,7 +74,7 @@ def record(
     ] = None,
     into: Folder = FOLDER,
 ) -> None:
-    """Make a record of every environment that a full benchmark has measured: what pages show of it.
+    """Make a record of every environment of a full benchmark, with the results that pages show.
 
     With --add results.json are of ``filtergym evaluate --out``, with the scenario's best competitor among its policies.
 
@@ -149,7 +149,7 @@ def notebooks(
         list[Path] | None, typer.Argument(help="Notebooks. Default: all of the documentation.")
     ] = None,
 ) -> None:
-    """Execute notebooks and write them with what their cells print and draw; a minute or two each.
+    """Execute notebooks and write them with the output of their cells; a minute or two each.
 
     Example: python docs/make notebooks
     """
@@ -194,7 +194,7 @@ def seeds(
     """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
 
     A run's best agent is plain arrays; where it is a model only, loading can execute code and needs --trust. With --out
-    what is scored is kept beside it until all is done: after an interruption the same command goes on.
+    finished scores are stored beside it: after an interruption the same command continues.
 
     Example: python docs/make seeds runs/ppo-0 runs/ppo-1 runs/ppo-2 --split validation
     """
@@ -244,7 +244,7 @@ def ship(
     into: Annotated[Path, typer.Option(help="Folder of what is shipped.")] = Path("agents/pretrained"),
     trust: Trust = False,
 ) -> None:
-    """Export of every algorithm the run with the lowest validation cost, over what was shipped of it.
+    """Export the run of lowest validation cost of every algorithm, in place of the shipped one.
 
     Example: python docs/make ship runs/ManeuveringTarget/*-?
     """
@@ -282,5 +282,5 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 
 def main() -> None:
-    """Run one of them; mistakes end as those of ``filtergym`` do."""
+    """Run a command; errors end as those of ``filtergym`` do."""
     run(lambda: program_of({"Commands": COMMANDS}), PROGRAM)

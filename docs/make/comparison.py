@@ -12,7 +12,7 @@ from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import FRONT_MARK, PYTHON_MARK, TIME_TITLE, column_of_times
 from filtergym.papers.grid import Grid, markdown_table
-from filtergym.reports.tables.ranking import HARM, ranking, ranking_sentence, who_is_best
+from filtergym.reports.tables.ranking import HARM, best_competitor, ranking, ranking_sentence
 from filtergym.reports.tables.terminal_tables import (
     HEADLINE,
     INCONSISTENT,
@@ -27,7 +27,7 @@ STRONGEST = 4
 
 
 class Comparison(NamedTuple):
-    """What the page shows of one environment."""
+    """The shown results of one environment."""
 
     environment: str
     grids: list[Grid]
@@ -35,11 +35,11 @@ class Comparison(NamedTuple):
 
 
 def compared_policies(measured: BenchmarkRecords) -> list[str]:
-    """Names that the page shows, of those in the records, in the order of its columns.
+    """Return the names on the page, among those in the records, in the order of its columns.
 
-    Learned agents; what costs least of all others in the training distribution, of any control and kind; the paper's
+    Learned agents; the cheapest of all others in the training distribution, of any control and kind; the paper's
     algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
-    stand in the records. On a narrow screen only the first columns are seen without scrolling.
+    are in the records. A narrow screen shows only the first columns without scrolling.
     """
     problem, records = measured
     known, paper = problem.baselines, measured.paper
@@ -56,12 +56,12 @@ def compared_policies(measured: BenchmarkRecords) -> list[str]:
 
 
 def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
-    """Records of one scenario over all times, as the tables look for them."""
+    """Return the records of one scenario over all times, by competitor, metric and component."""
     return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Cost against the paper's algorithm, lost tracks, means, ANEES and time of a competitor in one scenario."""
+    """Return cost against the paper's algorithm, lost tracks, means, ANEES and time of a competitor in one scenario."""
     values = _by_name(records)
     return [
         with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),
@@ -72,7 +72,9 @@ def _cells(name: str, records: Sequence[Record]) -> list[str]:
 
 
 def summary(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Best of every origin on the training distribution of each environment, and the reference."""
+    """Return a table of the best of every origin on the training distribution of each environment, and the
+    reference.
+    """
     rows = []
     for problem, every in found:
         reference, learned = problem.baselines.score_reference, pretrained_agents(problem.id)
@@ -109,7 +111,7 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def harm(found: Sequence[BenchmarkRecords]) -> Grid:
-    """The scenario in which each learned agent stands worst against the paper's algorithm."""
+    """Return a table of the scenario in which each learned agent is worst against the paper's algorithm."""
     rows = []
     for problem, records in found:
         for name in pretrained_agents(problem.id):
@@ -133,7 +135,9 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Whose covariance does not fit the errors on the training distribution, of all ranked but random actions."""
+    """Return a table of the competitors whose covariance does not fit the errors on the training distribution, of all
+    ranked but random actions.
+    """
     rows = []
     for measured in found:
         records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
@@ -150,14 +154,14 @@ def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
-    """Tables of one environment: cost against the paper's algorithm, and the physical error.
+    """Return the tables of one environment: cost against the paper's algorithm, and the physical error.
 
     Args:
         measured: the environment and its records.
-        width: of the figure, 1 or 2 columns of a paper.
+        width: width of the figure, 1 or 2 columns of a paper.
 
     Raises:
-        ValueError: if the paper's algorithm, or what is compared with it, is not among the records.
+        ValueError: if the paper's algorithm, or its opponents, are not among the records.
     """
     problem, records = measured
     cls, known = problem.task, problem.baselines
@@ -177,12 +181,12 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
     by_window = {(s, p, m, c, "all"): r for (s, p, m, c), r in found.items()}
     bounds = [name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found]
     kinds, learned = {r.policy: r.kind for r in records}, pretrained_agents(cls.id)
-    verdicts = {s: who_is_best([record for record in records if record.scenario == s]) for s in sizes}
+    verdicts = {s: best_competitor([record for record in records if record.scenario == s]) for s in sizes}
 
     times = {s: column_of_times([record for record in records if record.scenario == s]) for s in sizes}
 
     def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
-        """Table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
+        """Return the table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
         heads = [f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in names]
         return Grid(
             title,
@@ -257,15 +261,16 @@ def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
 
 
 def _two_lines(record: Record | None, scale: float) -> str:
-    """Value above interval, so that columns stay narrow."""
-    # Percentages to a hundredth: what is smaller is rounding.
+    """Return the value above its interval, so that columns stay narrow."""
+    # Percentages to a hundredth: smaller values are rounding.
     negligible = 0.005 if scale == 100.0 else 0.0
     shown = with_interval(record, scale, negligible=negligible)
     return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
 
 
 def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
-    """Table over all environments, in Markdown: "best" of every origin, where agents do "harm", or "covariances".
+    """Return the table over all environments, in Markdown: "best" of every origin, where agents do "harm", or
+    "covariances".
 
     Raises:
         ValueError: for another word.
@@ -278,7 +283,7 @@ def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
 
 
 def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
-    """Sentences and tables of one environment, with the command that made the records."""
+    """Return the sentences and tables of one environment, with the command of the records."""
     records, paper = measured.records, measured.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})

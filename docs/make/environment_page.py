@@ -1,4 +1,4 @@
-"""The tables of an environment's page, made from its code: what stands in the code stands on the page.
+"""The tables of an environment's page, made from its code.
 
 Texts are those of the code: the meaning of controls (:class:`.Actions`), the observation blocks, the docstrings under
 the fields of parameters and measurement, the scenarios' descriptions, the first lines of policies' docstrings
@@ -21,17 +21,17 @@ from filtergym.envs.engine.catalogue import catalogue, nearest
 from filtergym.papers.grid import markdown_table
 
 PARTS_SHOWN = 4
-"""Fields of one block that are named one by one; more are told by their endings."""
+"""Fields of one block that are named one by one; of more their endings are named."""
 
 
 def field_documentation(cls: type) -> dict[str, str]:
-    """Docstrings under the fields of a NamedTuple or dataclass, in one line each, inherited ones first."""
+    """Return the docstrings under the fields of a NamedTuple or dataclass, in one line each, inherited ones first."""
     texts = (item for base in reversed(cls.__mro__) for item in field_texts(base).items())
     return {name: text.replace("``", "`") for name, text in texts}
 
 
 def measurement_class(cls: type[Task]) -> Any:
-    """NamedTuple of what the sensors of a task say: the second part of what its world returns."""
+    """Return the NamedTuple of a task's measurement: the second part of its world's result."""
     return typing.get_args(typing.get_type_hints(cls.World.advance)["return"])[1]
 
 
@@ -159,11 +159,11 @@ TABLES = {
     "parameters": _parameters,
     "scenarios": _scenarios,
 }
-"""Of the task, by their names; that of the policies stands beside them."""
+"""Tables of the task, by their names; the table of the policies is beside them."""
 
 
 def causes_table() -> str:
-    """Make the table of what evaluations of all environments split costs by, in Markdown."""
+    """Return a table of the causes by which evaluations of all environments split costs, in Markdown."""
     rows = []
     for cls in catalogue().values():
         causes = Causes.of(cls(cls.Parameters())).causes
@@ -173,10 +173,10 @@ def causes_table() -> str:
 
 
 def environment_table(problem: Problem, name: str) -> str:
-    """Make one table of an environment in Markdown.
+    """Return one table of an environment in Markdown.
 
     Raises:
-        ValueError: if there is none of that name.
+        ValueError: if there is no table of that name.
     """
     if name == "policies":
         return "\n".join(_policies(problem))

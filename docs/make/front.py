@@ -16,11 +16,11 @@ from filtergym.papers.grid import markdown_table
 from filtergym.reports.tables.terminal_tables import HEADLINE
 
 BUDGETS = (100, 300, 1000, 5000)
-"""Nanoseconds that a measurement may take."""
+"""Time limits of a measurement, ns."""
 
 
 def panels_of(found: Sequence[BenchmarkRecords]) -> list[FrontPanel]:
-    """Return what is drawn of each environment that the records have times of, in its training distribution."""
+    """Return the panel of each environment with times in the records, in its training distribution."""
     panels = []
     for measured in found:
         problem, records = measured
@@ -35,11 +35,11 @@ def panels_of(found: Sequence[BenchmarkRecords]) -> list[FrontPanel]:
 
 @in_print
 def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
-    """Draw the fronts of several environments in one picture, and its legend in the place that is left.
+    """Draw the fronts of several environments in one picture, with its legend in the empty place.
 
     Args:
         panels: at least one.
-        columns: of a paper, as wide as which it is.
+        columns: width of the picture in columns of a paper.
     """
     figure, axes = figure_with_pairs(len(panels) // 2 + 1, columns)
     cells = axes.ravel().tolist()
@@ -53,9 +53,10 @@ def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
 
 
 def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
-    """Return who has the lowest error cost in so much time, of classical and of learned competitors, in Markdown.
+    """Return the competitor of lowest error cost within each time, classical and learned, in Markdown.
 
-    A learned one is bold where its whole interval lies below that of the classical one, a classical one likewise.
+    A learned one is bold where its whole interval lies below that of the classical one, and a classical one in the
+    opposite case.
     """
     rows = []
     for problem, records in found:

@@ -1,4 +1,4 @@
-"""Notebooks of the documentation: executed once, by ``python docs/make notebooks``, and shown as they then stand.
+"""Notebooks of the documentation: executed once, by ``python docs/make notebooks``, and shown with those outputs.
 
 The pages are built in every check, and the notebooks take minutes: so their outputs are committed, and `make test-slow`
 executes them again.
@@ -12,9 +12,9 @@ from typing import Any
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 KEPT = ("text/html", "text/plain", "image/png")
-"""Forms of an output that are committed."""
+"""Committed forms of an output."""
 SECONDS = 600
-"""That a cell may take."""
+"""Time limit of a cell, s."""
 
 
 def notebook_files() -> list[Path]:
@@ -23,7 +23,7 @@ def notebook_files() -> list[Path]:
 
 
 def execute(file: Path) -> Any:
-    """Return a notebook with what its cells print and draw, run in an empty folder by this Python.
+    """Return a notebook with the output of its cells, run in an empty folder by this Python.
 
     Raises:
         ValueError: if a cell fails.
@@ -57,7 +57,7 @@ def write_executed(file: Path) -> None:
     """Execute a notebook and write it with its outputs.
 
     Raises:
-        ValueError: as of :func:`execute`.
+        ValueError: if a cell fails.
     """
     import nbformat
 

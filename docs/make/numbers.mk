@@ -2,9 +2,9 @@
 #
 #     make numbers JOBS=2
 #
-# What is done leaves an empty file in build/numbers/. After an interruption the same command goes on, and the long
-# commands go on where they were; to make a part again remove its file. The order is that of what depends on what: values
-# are tuned, agents are trained and shipped, and only then everything is evaluated, on episodes that nobody has seen.
+# Each finished part leaves an empty file in build/numbers/. After an interruption the same command continues, and so do
+# the long commands; to make a part again remove its file. The order follows the dependencies: values are tuned, agents are
+# trained and shipped, and only then everything is evaluated, on unseen episodes.
 
 BIN := .venv/bin
 JOBS ?= 2
@@ -62,7 +62,7 @@ shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark $(DONE)/coverage \
   $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(ENVIRONMENTS:%=$(DONE)/stress-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/students $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/loop $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
-# --- values: what is shipped tells the commands that made it
+# --- values: the shipped files contain their commands
 
 $(DONE)/tune-%:
 	$(BIN)/python -c "import json; [print(own['command']) for own in \

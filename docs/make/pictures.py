@@ -23,19 +23,19 @@ def draw_learning_curves(
     *,
     columns: int = 2,
 ) -> Any:
-    """Cost of validations against the paper's algorithm over training: of each algorithm the median over its runs,
-    and a band from the lowest to the highest.
+    """Draw the cost of validations against the paper's algorithm over training: of each algorithm the median over its
+    runs, and a band from the lowest to the highest.
 
     Args:
         curves: algorithm -> for each of its runs the environment steps, and the relative cost differences there.
-        title: of the figure.
+        title: title of the figure.
         paper: name of the paper's algorithm, whose line is at zero.
-        columns: of a paper, as wide as which it is.
+        columns: width of the figure in columns of a paper.
     """
     figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.2}[columns])
     axis = axes[0]
     for (name, runs), style in zip(curves.items(), styles(list(curves)).values(), strict=True):
-        # Runs of one algorithm are validated at the same steps; where one is shorter, all are shown as far as it goes.
+        # Runs of one algorithm are validated at the same steps; all are drawn up to the end of the shortest.
         steps = numpy.unique(numpy.concatenate([own for own, _ in runs]))
         steps = steps[(steps >= max(own[0] for own, _ in runs)) & (steps <= min(own[-1] for own, _ in runs))]
         percent = 100.0 * numpy.array([numpy.interp(steps, *own) for own in runs])
@@ -46,7 +46,7 @@ def draw_learning_curves(
     axis.axhline(0.0, color="0.3", lw=1.0)
     everything = numpy.concatenate([values for runs in curves.values() for _, values in runs])
     if everything.max() > 1.0:
-        # An untrained agent can cost a hundred times as much; what is learned is told apart near zero.
+        # An untrained agent can cost a hundred times as much; trained ones differ near zero.
         axis.set_yscale("symlog", linthresh=10.0, linscale=1.5)
         axis.yaxis.set_major_formatter("{x:g}")
         axis.set_ylim(bottom=min(1.2 * 100.0 * everything.min(), -2.0))
@@ -63,13 +63,13 @@ def draw_learning_curves(
 def draw_profiles(
     limits: numpy.ndarray, profiles: Mapping[str, numpy.ndarray], title: str, *, columns: int = 2
 ) -> Any:
-    """Share of training runs with a score above each limit, with pointwise 95 % bands.
+    """Draw the share of training runs with a score above each limit, with pointwise 95 % bands.
 
     Args:
-        limits: of the score, ``(limits,)``.
+        limits: limits of the score, ``(limits,)``.
         profiles: algorithm -> share, lower and upper end of its interval, ``(3, limits)``.
-        title: of the figure.
-        columns: of a paper, as wide as which it is.
+        title: title of the figure.
+        columns: width of the figure in columns of a paper.
     """
     figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.0}[columns])
     axis = axes[0]
@@ -97,16 +97,16 @@ def draw_differences(
     *,
     columns: int = 2,
 ) -> Any:
-    """Dots with intervals: cost of policies against the paper's algorithm, scenario by scenario.
+    """Draw dots with intervals: cost of policies against the paper's algorithm, scenario by scenario.
 
     Args:
         differences: scenario -> policy -> difference in percent, lower and upper end of its interval.
         names: policies in the order of the legend.
-        learned: those that are drawn as diamonds.
-        unranked: references, which are drawn as grey squares.
-        title: of the figure.
+        learned: policies drawn as diamonds.
+        unranked: references, drawn as grey squares.
+        title: title of the figure.
         paper: name of the paper's algorithm, whose line is at zero.
-        columns: of a paper, as wide as which it is.
+        columns: width of the figure in columns of a paper.
     """
     height = 0.8 + len(differences) * (0.25 + 0.07 * len(names))
     figure, axes = figure_with_axes(columns=columns, height=height)
@@ -155,7 +155,7 @@ def draw_differences(
 
 
 PUBLIC_FILTERS = ("extended", "extended, tuned", "kalman-imm, tuned", "OKF", "kalman-net", "known-model")
-"""Of those on KalmanNet's problems: as written, rivals that are tuned, the learned one, and the reference."""
+"""Filters on KalmanNet's problems: as written, tuned rivals, the learned one, and the reference."""
 LEARNED = "kalman-net", "KalmanNet"
 
 
@@ -163,12 +163,13 @@ LEARNED = "kalman-net", "KalmanNet"
 def draw_public_problems(
     rows: Sequence[Mapping[str, Any]], drives: Mapping[str, Sequence[float]], *, columns: int = 2
 ) -> Any:
-    """Dots with intervals: the mean squared error of filters on KalmanNet's problems; and of each of NCLT's drives.
+    """Draw dots with intervals: the mean squared error of filters on KalmanNet's problems; and of each of NCLT's
+    drives.
 
     Args:
-        rows: of the records, all with ``problem``, ``name``, ``mse_db``, ``low_db`` and ``high_db``.
+        rows: rows of the records, all with ``problem``, ``name``, ``mse_db``, ``low_db`` and ``high_db``.
         drives: filter -> RMSE a coordinate of every test drive, m.
-        columns: of a paper, as wide as which it is.
+        columns: width of the figure in columns of a paper.
     """
     [exact] = [row for row in rows if row["problem"] == "linear, exact"]
     panels = list(dict.fromkeys(row["problem"] for row in rows if row is not exact))
@@ -201,11 +202,11 @@ def draw_public_problems(
 
 @in_print
 def draw_update_times(rows: Sequence[Sequence[str]], *, columns: int = 2) -> Any:
-    """Bars of the time that an update takes, the quickest first; those of other libraries are grey.
+    """Draw bars of the time of an update, the quickest first; those of other libraries are grey.
 
     Args:
-        rows: of the record: what is updated, in quotes where it is ours, and the median in microseconds.
-        columns: of a paper, as wide as which it is.
+        rows: rows of the record: the filter, in quotes where it is ours, and the median time in microseconds.
+        columns: width of the figure in columns of a paper.
     """
     shown = sorted(rows, key=lambda row: float(row[1]))
     median = [float(row[1]) for row in shown]

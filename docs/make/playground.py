@@ -1,8 +1,8 @@
 """The playground's filters: exported C, unchanged, compiled to WebAssembly.
 
-``pip install ziglang``, then ``python docs/make playground`` writes ``docs/playground/NAME.wasm``. The first page holds
-them as text, for a page that is opened from the disk may not read files. Where zig's C compiler is not installed, the
-committed files stand in.
+``pip install ziglang``, then ``python docs/make playground`` writes ``docs/playground/NAME.wasm``. The first page
+contains them as text, since a page that is opened from the disk may not read files. Where zig's C compiler is not
+installed, the committed files replace them.
 """
 
 import base64
@@ -34,8 +34,9 @@ FILTERS = {
     },
     "bptt-small": {"gain": ("bank_alpha", 0, 1)},
 }
-"""Filter -> what weighs its hypotheses: the member of its state, the first number of it, and how many are summed.
-``bptt-small`` has no hypotheses, and shows the gain that its network sets."""
+"""Filter -> weights of its hypotheses: the member of its state, its first number, and how many are summed. ``bptt-
+small`` has no hypotheses, and shows the gain that its network sets.
+"""
 
 EXPORTED = """\
 #include "{stem}.h"
@@ -72,7 +73,7 @@ FLAGS = (
 
 
 def has_compiler() -> bool:
-    """Whether zig's C compiler is installed."""
+    """Return whether zig's C compiler is installed."""
     return importlib.util.find_spec("ziglang") is not None
 
 
@@ -80,7 +81,7 @@ def compile_filter(name: str) -> bytes:
     """Export a filter as C, and compile it.
 
     Raises:
-        subprocess.CalledProcessError: if the compiler refuses it.
+        subprocess.CalledProcessError: if the compiler fails.
     """
     stem = file_stem(name)
     sums = [
@@ -98,7 +99,7 @@ def compile_filter(name: str) -> bytes:
 
 
 def page_script(modules: dict[str, bytes]) -> str:
-    """Return the script that holds the filters: names, what their weights are of, and WebAssembly in base 64."""
+    """Return the script of the filters: their names, their weights, and WebAssembly in base 64."""
     filters = {
         name: {"weights": list(FILTERS[name]), "module": base64.b64encode(module).decode("ascii")}
         for name, module in modules.items()
@@ -107,7 +108,7 @@ def page_script(modules: dict[str, bytes]) -> str:
 
 
 def module_file(name: str) -> Path:
-    """Return where the committed module of a filter is."""
+    """Return the path of a filter's committed module."""
     return FOLDER / f"{name}.wasm"
 
 

@@ -1,9 +1,9 @@
-"""README's numbers: it is shown as it stands, so what it has of the records is copied into it, and tested.
+"""README's numbers: since it is not rendered, numbers of the records are copied into it, and tested.
 
 A number stands between comments that no reader sees, ``<!-- value: PATH -->-43.6 %<!-- end -->``, with ``number`` in
-place of ``value`` where its interval is shown too. Paths are those of :mod:`sentence_numbers`. What the command before
-``<!-- printed: begin -->`` prints stands between that and ``<!-- printed: end -->``. A comment that begins a line ends
-a paragraph, so a number stands behind a word.
+place of ``value`` where its interval is shown too. Paths are those of :mod:`sentence_numbers`. The output of the
+command before ``<!-- printed: begin -->`` stands between that and ``<!-- printed: end -->``. A comment that begins a
+line ends a paragraph, so a number stands behind a word.
 """
 
 import os
@@ -20,10 +20,10 @@ NUMBER = re.compile(r"(<!-- (value|number): (\S+(?: \S+)*?) -->).*?(<!-- end -->
 
 
 def with_numbers(page: Path) -> str:
-    """Return the text of a page with every number as its record has it.
+    """Return the text of a page with every number as in its record.
 
     Raises:
-        ValueError: if there is no such page, it holds no number of a record, a number begins a line, or a path leads
+        ValueError: if there is no such page, it contains no number of a record, a number begins a line, or a path leads
             nowhere.
     """
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
@@ -40,14 +40,14 @@ def with_numbers(page: Path) -> str:
 PRINTED = re.compile(
     r"(```sh\n(filtergym [^\n]+)\n```\n\n<!-- printed: begin -->\n)(.*?)(<!-- printed: end -->)", re.S
 )
-"""A command of one line, and what it prints."""
+"""A command of one line, and its output."""
 MODULE = re.compile(r"In `(\w+\.py)`:\n\n```python\n(.*?)```", re.S)
-"""A file that the page tells to write."""
+"""A file that the page asks readers to write."""
 WIDTH = 100
 
 
 def with_printed(page: Path) -> str:
-    """Return the text of a page with what its commands print, run beside the files that it tells to write.
+    """Return the text of a page with the output of its commands, run beside the files of the page.
 
     Raises:
         ValueError: if it has no such command, or one fails.

@@ -47,7 +47,7 @@ def _words(text: str) -> list[str]:
 
 
 class _Rendered(SphinxDirective):
-    """What is rendered in Markdown by :meth:`markdown`, and shown by :meth:`figure` if it draws anything."""
+    """A directive that renders Markdown from :meth:`markdown`, and the picture of :meth:`figure`, if any."""
 
     required_arguments = 0
     optional_arguments = 1
@@ -55,19 +55,19 @@ class _Rendered(SphinxDirective):
 
     @property
     def name_given(self) -> str:
-        """The argument, or nothing."""
+        """The argument, or empty."""
         return self.arguments[0].strip() if self.arguments else ""
 
     def markdown(self) -> str:
-        """Return what is shown, in Markdown."""
+        """Return the Markdown."""
         return ""
 
     def figure(self) -> tuple[str, str, Any] | None:
-        """Return a name, words for who does not see it, and the figure."""
+        """Return a name, an alternative text, and the figure."""
         return None
 
     def run(self) -> list[nodes.Node]:
-        """Render; a mistake is reported where the page has it."""
+        """Render; report a mistake at its place on the page."""
         try:
             text, drawn = self.markdown(), self.figure()
         except ValueError as error:
@@ -83,12 +83,12 @@ class _Rendered(SphinxDirective):
     with_headings: ClassVar[bool] = False
 
     def benchmark(self, name: str) -> tuple[BenchmarkRecords, ResultRecord]:
-        """Read the record of a benchmark, which the page depends on from now on."""
+        """Read the record of a benchmark, on which the page depends from now on."""
         self.env.note_dependency(record_file(f"{BENCHMARK}/{name}"))
         return read_benchmark(name)
 
     def record(self, name: str) -> ResultRecord:
-        """Read a record, which the page depends on from now on."""
+        """Read a record, on which the page depends from now on."""
         self.env.note_dependency(record_file(name))
         return read_record(name)
 
@@ -131,7 +131,7 @@ class ComparisonTables(_Rendered):
         return comparison.comparison_markdown(self.compared, measured, record)
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return cost in every scenario."""
+        """Return the cost in every scenario."""
         words = f"Cost against the paper's algorithm in every scenario, {self.name_given}"
         return f"comparison_{self.name_given}", words, self.compared.figure
 
@@ -186,7 +186,7 @@ class UpdateTimes(_Rendered):
 
 
 class BudgetsTable(_Rendered):
-    """``{budgets-table}``: who has the lowest error cost in so much time, classical and learned, everywhere."""
+    """``{budgets-table}``: the lowest error cost within a time, of classical and learned competitors, everywhere."""
 
     def markdown(self) -> str:
         """Return one table."""
@@ -224,13 +224,13 @@ class TrainingCurves(_Rendered):
 
     @property
     def data(self) -> dict[str, Any]:
-        """Of the record, without the runs that have no curve."""
+        """Data of the record, without runs that have no curve."""
         environment_id(self.name_given)
         data = self.record(f"{SEEDS}/{self.name_given}").data
         return {**data, "runs": [run for run in data["runs"] if run[0] in data.get("curves", {})]}
 
     def markdown(self) -> str:
-        """Say whose curves are not there."""
+        """Return a sentence on the runs without a curve."""
         shown = {run[1] for run in self.data["runs"]}
         every = dict.fromkeys(run[1] for run in self.record(f"{SEEDS}/{self.name_given}").data["runs"])
         missing = ", ".join(f"`{name}`" for name in every if name not in shown)
@@ -250,7 +250,7 @@ class RecordTable(_Rendered):
     option_spec: ClassVar[Any] = {"columns": directives.unchanged, "bare": directives.flag}
 
     def markdown(self) -> str:
-        """Return the table, and unless it is bare who made it."""
+        """Return the table, and unless it is bare its origin."""
         record = self.record(self.name_given)
         titles, rows = record.data["columns"], record.data["rows"]
         if "columns" in self.options:
@@ -261,7 +261,7 @@ class RecordTable(_Rendered):
 
 
 class EnvironmentTable(_Rendered):
-    """``{environment-table} NAME``: actions, fields, measurement, parameters, scenarios or policies, of the code; and
+    """``{environment-table} NAME``: actions, fields, measurement, parameters, scenarios or policies, from the code; and
     ``{environment-table} causes``, of all environments.
     """
 
@@ -277,12 +277,12 @@ class EnvironmentTable(_Rendered):
 
 
 class CommandLine(_Rendered):
-    """``{command-line}``: all commands, of the code."""
+    """``{command-line}``: all commands, from the code."""
 
     with_headings: ClassVar[bool] = True
 
     def markdown(self) -> str:
-        """Return what ``--help`` says."""
+        """Return the ``--help`` of all commands."""
         return command_line_markdown()
 
 
@@ -300,10 +300,10 @@ class NumberRole(SphinxRole):
 
 
 class RecordRole(SphinxRole):
-    """``{record}`NAME```: the record that numbers of this section are of, to be opened."""
+    """``{record}`NAME```: the record of a section's numbers, as a link."""
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-        """Render a link, which tells the command."""
+        """Render a link with the command of the record."""
         return _in_sentence(self, self._link, self.text)
 
     def _link(self) -> Sequence[nodes.Node]:
@@ -323,7 +323,7 @@ class Playground(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Return the place for it, its scripts and its colours."""
+        """Return the playground's element, scripts and colours."""
         page = Path(self.env.doc2path(self.env.docname)).parent
         static = os.path.relpath(Path(self.env.srcdir) / "_static", page)
         picture = nodes.image(uri=self.arguments[0], alt="Tracks of four filters, their errors and weights")
@@ -370,7 +370,6 @@ DIRECTIVES = {
 
 
 def _write_playground(app: Any) -> None:
-    """Write the filters of the playground beside its script."""
     write_text(Path(app.outdir) / "_static" / "playground_filters.js", page_script(read_modules()))
 
 

@@ -1,8 +1,8 @@
-"""Records: what commands have measured, committed once as small files, from which pages are rendered.
+"""Records: results of commands, committed as small files, from which pages are rendered.
 
 A record is JSON: the command that made it, the day, the versions of the libraries, a note, and the data. There are
-three kinds of data: ``benchmark/ENVIRONMENT`` holds what pages show of ``filtergym benchmark --full``,
-``seeds/ENVIRONMENT`` what ``python docs/make seeds`` has computed, and every other record is a table of text.
+three kinds of data: ``benchmark/ENVIRONMENT`` contains the shown results of ``filtergym benchmark --full``,
+``seeds/ENVIRONMENT`` those of ``python docs/make seeds``, and every other record is a table of text.
 """
 
 import datetime
@@ -38,45 +38,45 @@ METRICS = (
     ),
     "lost_episodes",
 )
-"""Of a benchmark that pages show, beside the ANEES of the whole state and the errors of the main components."""
+"""Metrics of a benchmark that pages show, beside the ANEES of the whole state and the errors of the main components."""
 DIGITS = 6
-"""Significant ones that are kept; pages show three."""
+"""Stored significant digits; pages show three."""
 
 
 class ResultRecord(NamedTuple):
     """One file."""
 
     command: str
-    """That makes the data again."""
+    """Command that makes the data again."""
     made: str
     """Day, ISO 8601."""
     versions: dict[str, str]
-    """Of Python and the libraries."""
+    """Versions of Python and the libraries."""
     note: str
-    """What a reader must know before they use it; empty: nothing."""
+    """Note that readers need before they use it; empty: none."""
     data: dict[str, Any]
 
     @property
     def origin(self) -> str:
-        """Sentences below a table that say where it is from, in Markdown."""
+        """Sentences below a table on its origin, in Markdown."""
         note = f" **{self.note}**" if self.note else ""
         return f"Made by `{self.command}` on {self.made}.{note}"
 
 
 class BenchmarkRecords(NamedTuple):
-    """What a benchmark has measured in one environment."""
+    """Results of a benchmark in one environment."""
 
     problem: Problem
     records: list[Record]
 
     @property
     def paper(self) -> str:
-        """Name of the paper's algorithm that costs are compared with."""
+        """Name of the paper's algorithm, with which costs are compared."""
         return self.problem.paper_among(dict.fromkeys(record.policy for record in self.records))
 
 
 def environment_id(name: str) -> str:
-    """Return the id of an environment that pages call by its short name.
+    """Return the id of an environment with a short name.
 
     Raises:
         ValueError: if there is none.
@@ -91,7 +91,7 @@ def record_file(name: str, folder: Path = FOLDER) -> Path:
     """Return the file of a record.
 
     Raises:
-        ValueError: if that is no name of a record, such as ``benchmark/ManeuveringTarget`` or ``plain_ppo``.
+        ValueError: if there is no such name of a record, such as ``benchmark/ManeuveringTarget`` or ``plain_ppo``.
     """
     if not re.fullmatch(r"(\w+/)?\w+", name):
         raise ValueError(f"no name of a record: {name!r}; it has letters, digits, _ and at most one /")
@@ -110,7 +110,7 @@ def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
     """Read a record.
 
     Raises:
-        ValueError: if there is none of that name, or the file holds something else.
+        ValueError: if there is none of that name, or the file has other content.
     """
     path = record_file(name, folder)
     if not path.is_file():
@@ -122,7 +122,7 @@ def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
 
 
 def without_place(command: str) -> str:
-    """Return a command without where and on how many processors it ran, of which its results say nothing."""
+    """Return a command without folders and number of processes, which do not affect its results."""
     return re.sub(r" --(out|jobs|threads|cluster)[ =]\S+", "", command)
 
 
@@ -132,12 +132,12 @@ def today() -> str:
 
 
 def round_number(value: float | None) -> float | None:
-    """Return a number in the digits that are kept."""
+    """Return a number in the stored digits."""
     return None if value is None else float(f"{value:.{DIGITS}g}")
 
 
 def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
-    """JSON in lines; what holds nothing nested, or lies deeper, stands in one."""
+    """Return JSON in lines, with a line for each flat or deeply nested entry."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     if depth == 0 or not any(isinstance(each, (dict, list)) for each in inside):
         return json.dumps(value, ensure_ascii=False)
@@ -152,7 +152,7 @@ def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
 
 
 def benchmark_data(problem: Problem, records: Sequence[Record]) -> dict[str, Any]:
-    """Return what pages show of a benchmark in one environment: over whole episodes, by scenario and competitor.
+    """Return the shown results of a benchmark in one environment: over whole episodes, by scenario and competitor.
 
     Raises:
         ValueError: if scenarios are unknown, or the records are of several experiments.
@@ -189,14 +189,14 @@ def with_competitors(
     """Return a benchmark's data with the rows of competitors that were measured later, over the same episodes.
 
     Args:
-        data: of the whole benchmark.
-        added: of the same environment, with some competitors; the best of each scenario is among them, since all
+        data: data of the whole benchmark.
+        added: data of the same environment with some competitors, among them the best of each scenario, since all
             others are compared with it.
-        names: of those that are added or replaced; the others are there to be compared.
+        names: names of the added or replaced competitors; the others serve the comparison.
 
     Raises:
-        ValueError: if the episodes are others, a competitor that is not named costs something else than it did, or one
-            that is named costs less than the best: then the whole scenario has to be measured again.
+        ValueError: if the episodes differ, the cost of a competitor that is not named differs, or one that is
+            named costs less than the best: then the whole scenario has to be measured again.
     """
     for key in ("environment", "split", "seed"):
         if data[key] != added[key]:
@@ -226,7 +226,7 @@ def _same_cost(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _best(scenario: Mapping[str, Any]) -> str:
-    """Name of whom the others are compared with."""
+    """Return the name of the competitor with which the others are compared."""
     [name] = {
         key.partition(" ")[2]
         for each in scenario["competitors"].values()
@@ -244,7 +244,7 @@ def _is_shown(record: Record, components: set[str], problem: Problem) -> bool:
 
 
 def benchmark_records(data: Mapping[str, Any]) -> BenchmarkRecords:
-    """Return the tidy records of one environment that a benchmark's data holds."""
+    """Return the tidy records of one environment in a benchmark's data."""
     found = []
     for scenario, each in data["scenarios"].items():
         for name, own in each["competitors"].items():
@@ -277,7 +277,7 @@ def read_benchmark(name: str, folder: Path = FOLDER) -> tuple[BenchmarkRecords, 
 
 
 def recorded_environments(kind: str = BENCHMARK, folder: Path = FOLDER) -> list[str]:
-    """Short names of all environments with a record of that kind, in the catalogue's order."""
+    """Return the short names of all environments with a record of that kind, in the catalogue's order."""
     names = map(bare_name, catalogue())
     return [name for name in names if record_file(f"{kind}/{name}", folder).is_file()]
 
@@ -302,7 +302,7 @@ def table_cell(data: Mapping[str, Any], row: str, column: str) -> str:
     """Return a cell of a table of text.
 
     Args:
-        data: of the record.
+        data: data of the record.
         row: its first cell without marks of code, or first and second cell with a space between; an empty first cell
             is that of the row above.
         column: its title, or a beginning of it that no other column has.

@@ -22,21 +22,21 @@ from filtergym.reports.tables.terminal_tables import (
 )
 
 COLUMNS = ("difference", "lost", "means", "ns", "control", "cost", "rmse", "anees", "score")
-"""Of the table, in their order; a page may choose."""
+"""Columns of the table, in their order; a page may choose."""
 
 
 def scenario_records(
     found: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
 ) -> list[Record]:
-    """Return what a benchmark has measured in one scenario, of all but random actions.
+    """Return the results of a benchmark in one scenario, of all but random actions.
 
     Args:
-        found: what it has measured in an environment.
+        found: results in an environment.
         scenario: default: the training distribution.
-        policies: names of those that are wanted and there. Default: everybody.
+        policies: names of competitors. Default: all.
 
     Raises:
-        ValueError: if there is nothing.
+        ValueError: if there are no results.
     """
     scenario = scenario or found.problem.task.default_scenario
     records = [
@@ -96,7 +96,9 @@ def results_grid(
 
 
 def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
-    """Return the whole table of one environment and scenario, who is best, and what the columns are, in Markdown."""
+    """Return the whole table of one environment and scenario, the best competitor, and the meaning of the columns, in
+    Markdown.
+    """
     records, paper = scenario_records(found, scenario), found.paper
     note = (
         f"{ranking_sentence(records, paper)} Lowest cost first. {COST_NOTE} ANEES is the mean NEES over the dimension; "
@@ -117,11 +119,11 @@ def chosen_markdown(
     Args:
         found: records of the environments by their short names.
         scenario: default: the training distribution of each.
-        policies: names of competitors. Default: everybody.
+        policies: names of competitors. Default: all.
         columns: some of :data:`COLUMNS`. Default: those whose titles are the same in every environment.
 
     Raises:
-        ValueError: for an unknown column, one that several environments cannot share, and if there is nothing.
+        ValueError: for an unknown column, one that several environments cannot share, and if there are no results.
     """
     columns = columns or ("difference", "lost", "means", "ns", "anees", "score")
     if wrong := [column for column in columns if column not in COLUMNS]:

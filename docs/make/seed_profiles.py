@@ -37,13 +37,13 @@ Scores = Mapping[str, Mapping[str, numpy.ndarray]]
 
 
 def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] = ()) -> Scores:
-    """Return the scores of all runs in the environments that every algorithm has runs in.
+    """Return the scores of all runs in the environments in which every algorithm has runs.
 
-    What is around an agent, a gate or a policy that it corrects, is not told apart.
+    Agents are not distinguished by a gate or by a policy that they correct.
 
     Args:
-        records: of training seeds; the scores are those of their first scenario, the training distribution.
-        algorithms: whose; default: all.
+        records: records of training seeds; the scores are those of their first scenario, the training distribution.
+        algorithms: names of algorithms; default: all.
 
     Raises:
         ValueError: if there is no such algorithm, or no environment that all of them have.
@@ -71,22 +71,23 @@ def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] =
 
 
 def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndarray:
-    """Weights of runs (1), and those of every resample within environments, ``(1 + resamples, sum of counts)``.
+    """Return the weights of runs (1), and those of every resample within environments, ``(1 + resamples, sum of
+    counts)``.
 
     Args:
         counts: runs of each environment.
-        resamples: of the bootstrap.
+        resamples: number of resamples of the bootstrap.
     """
     each = [Bootstrap(count, resamples, seed).weights for seed, count in enumerate(counts)]
     return numpy.concatenate(each, axis=1) / len(counts)
 
 
 def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.ndarray:
-    """Mean of the middle half of weighted scores (2), ``(n,)``.
+    """Return the mean of the middle half of weighted scores (2), ``(n,)``.
 
     Args:
         scores: ``(runs,)``.
-        weights: that sum up to one, ``(n, runs)``.
+        weights: weights that sum to one, ``(n, runs)``.
     """
     order = numpy.argsort(scores)
     ends = numpy.cumsum(weights[:, order], axis=1)
@@ -98,7 +99,9 @@ def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.n
 def performance_profile(
     scores: numpy.ndarray, weights: numpy.ndarray, limits: numpy.ndarray
 ) -> numpy.ndarray:
-    """Share of runs with a score above each limit (2), ``(n, limits)``; arguments as of :func:`interquartile_mean`."""
+    """Return the share of runs with a score above each limit (2), ``(n, limits)``; arguments as of
+    :func:`interquartile_mean`.
+    """
     found: numpy.ndarray = weights @ (scores[:, None] > limits)
     return found
 

@@ -37,7 +37,7 @@ QUANTITIES = {
 
 
 def record_of(path: str) -> str:
-    """Return the name of the record that a path leads into."""
+    """Return the name of the record of a path."""
     first, _, rest = path.partition("/")
     if first == SEEDS:
         return f"{SEEDS}/{rest.partition('/')[0]}"
@@ -48,9 +48,9 @@ def number_text(path: str, interval: bool = True, folder: Path = FOLDER) -> str:
     """Return a number in words of a sentence: ``-43.6 % [-45.0, -42.1]``.
 
     Args:
-        path: of the number.
-        interval: with it, where there is one.
-        folder: of the records.
+        path: path of the number.
+        interval: whether to add the interval, where there is one.
+        folder: folder of the records.
 
     Raises:
         ValueError: if the path leads nowhere.

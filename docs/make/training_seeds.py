@@ -1,7 +1,7 @@
 """Training seeds: every run of an algorithm against the papers' algorithms, on the same episodes.
 
-One agent says little about its algorithm. Here the runs of several training seeds meet the same episodes, so
-that what comes from the training seed and what comes from the episodes can be told apart.
+One agent is weak evidence on its algorithm. Here the runs of several training seeds act in the same episodes, so that
+the effects of training seed and episodes can be separated.
 """
 
 import functools
@@ -65,7 +65,7 @@ class SeedRun(NamedTuple):
     """One training run among those of its algorithm."""
 
     algorithm: str
-    """With its control, where runs of one algorithm have several."""
+    """Name of the algorithm, with the control where its runs have several."""
     run: TrainingRun
     agent: Path
     """File of the best agent."""
@@ -73,20 +73,20 @@ class SeedRun(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name among the policies, which no opponent has."""
+        """Name among the policies, different from all opponents."""
         return f"{self.algorithm} seed {self.run.seed}"
 
 
 class Trained(NamedTuple):
-    """What pages say of one training run."""
+    """Description of one training run on pages."""
 
     name: str
     algorithm: str
     seed: int
     steps: int | None
-    """At which its best agent was found; None: it is not known."""
+    """Step at which its best agent was found; None: unknown."""
     command: str
-    """That trained it, without the seed."""
+    """Training command, without the seed."""
 
 
 class EpisodeMeans(NamedTuple):
@@ -110,21 +110,21 @@ class PolicyMeans(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Mean over seeds and episodes, and what it varies with."""
+    """Mean over seeds and episodes, and its sources of variation."""
 
     mean: IntervalEstimate
     between_seeds: float
-    """Standard deviation between training seeds, without what the episodes' noise adds to it."""
+    """Standard deviation between training seeds, without the part of the episodes' noise."""
     over_episodes: float
     """Standard error of the mean of just these runs, over episodes."""
 
 
 def spread(values: numpy.ndarray) -> Spread:
-    """Tell the variance of training seeds and of episodes apart (two-way random effects, one value a cell).
+    """Separate the variances of training seeds and of episodes (two-way random effects, one value a cell).
 
     The moment estimates are those of the analysis of variance. The interval of the mean covers new seeds
-    and new episodes: Student's t with Satterthwaite's degrees of freedom. With five seeds a bootstrap over
-    them would promise too much.
+    and new episodes: Student's t with Satterthwaite's degrees of freedom. A bootstrap over five seeds would
+    give too narrow an interval.
 
     Args:
         values: ``(seeds, episodes)``.
@@ -155,8 +155,8 @@ def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
     """Read training runs of one environment, sorted by algorithm and seed.
 
     Args:
-        folders: of the runs.
-        trust: import the modules that their records name; see :func:`.load_run`.
+        folders: folders of the runs.
+        trust: whether to import the modules that their records name; see :func:`.load_run`.
 
     Raises:
         ValueError: if they are of different environments, or runs of one algorithm differ in more than the
@@ -189,7 +189,7 @@ def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
 
 
 def _algorithm(run: TrainingRun) -> str:
-    """Name of a run's algorithm, with what is around the agent."""
+    """Return the name of a run's algorithm, with its gate or corrected policy."""
     around = f" on {run.residual_to}" if run.residual_to else ""
     return run.algorithm + around + (" gated" if run.gated else "")
 
@@ -205,11 +205,11 @@ def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
 
 
 def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
-    """Picture of the validations of every algorithm, 1 or 2 columns of a paper wide.
+    """Draw the validations of every algorithm, 1 or 2 columns of a paper wide.
 
     Args:
-        data: of a record of training seeds, or what :func:`runs_data` has of runs.
-        columns: of a paper, as wide as which it is.
+        data: data of a record of training seeds, or from :func:`runs_data`.
+        columns: width of the picture in columns of a paper.
 
     Raises:
         ValueError: if a run has no validations.
@@ -225,7 +225,7 @@ def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
 
 
 def default_opponents(problem: Problem) -> list[str]:
-    """Names that runs are compared with: paper, strong policies, untuned and tuned, references."""
+    """Return the names that runs are compared with: paper, strong policies, untuned and tuned, references."""
     known = problem.baselines
     untuned = [name for name in known.tunable if name != known.best_constant]
     names = [problem.paper, *known.compared, *untuned, *problem.tuned_policies, *known.references]
@@ -233,7 +233,7 @@ def default_opponents(problem: Problem) -> list[str]:
 
 
 class Study(NamedTuple):
-    """Which runs are compared with whom, over which episodes of every scenario."""
+    """A comparison of runs with opponents, over the same episodes of every scenario."""
 
     runs: Sequence[SeedRun]
     opponents: Sequence[str]
@@ -242,11 +242,11 @@ class Study(NamedTuple):
     """Number of the experiment."""
     split: str = "test"
     trust: bool = False
-    """Load models that can execute code."""
+    """Whether to load models that can execute code."""
 
     @property
     def problem(self) -> Problem:
-        """That all runs are of."""
+        """Problem of all runs."""
         return self.runs[0].run.problem
 
 
@@ -257,14 +257,14 @@ def episode_means(
     store: Store | None = None,
     workers: Workers | None = None,
 ) -> EpisodeMeans:
-    """Evaluate runs and opponents on the same episodes, each by itself to save memory.
+    """Evaluate runs and opponents on the same episodes, one by one to save memory.
 
     Args:
-        study: whom, and over what.
+        study: runs, opponents and episodes.
         scenario: name of the scenario.
-        progress: told of measurements done.
-        store: keeps the means of each as soon as they are there. Default: nothing is kept.
-        workers: who share them.
+        progress: function that is called with the number of measurements done.
+        store: storage of the means of each. Default: none.
+        workers: processes that share the work.
 
     Raises:
         ValueError: for unknown names, and for bounds, which have no cost.
@@ -280,8 +280,10 @@ def episode_means(
     if not workers.alone:
         for _, asked, _ in missing:
             check_sendable(asked.experiment.task, {asked.name: asked.maker})
-    everyone = [asked for _, asked, _ in missing]
-    for i, means in workers.run(_means_of, everyone, [asked.measurements for asked in everyone], progress):
+    requests = [request for _, request, _ in missing]
+    for i, means in workers.run(
+        _means_of, requests, [request.measurements for request in requests], progress
+    ):
         name, _, work = missing[i]
         store.write(work, means)
         found[name] = means
@@ -297,7 +299,7 @@ def episode_means(
 
 
 def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationRequest, Work | None]]:
-    """Return every run and opponent over the episodes of a scenario, and the piece of work that its means are."""
+    """Return every run and opponent over the episodes of a scenario, with the work item of its means."""
     problem = study.problem
     entered = {m.name: find_competitor(problem, str(m.agent), study.trust) for m in study.runs}
     for name in dict.fromkeys([problem.paper, *study.opponents]):
@@ -325,7 +327,7 @@ def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[Evaluati
 
 @functools.cache
 def _own_digest() -> str:
-    """Return a digest of the code of this folder, which is no part of the package."""
+    """Return a digest of the code of this folder, which is outside the package."""
     return files_digest([Path(__file__).parent])
 
 
@@ -337,7 +339,7 @@ def _means_of(asked: EvaluationRequest, tick: Callable[[int], None]) -> PolicyMe
 
 
 def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
-    """Declare the mean cost of every episode, and the mean square of every component that is shown."""
+    """Return statistics for the mean cost of every episode, and the mean square of every shown component."""
     yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     first, last = windows_of(run)["all"]
     for component in select_components(list(components_and_groups(run))):
@@ -346,7 +348,7 @@ def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
 
 
 def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison]:
-    """Every number of the tables, from the episodes' means.
+    """Return every number of the tables, from the episodes' means.
 
     Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; only
     the mean's interval is over training seeds as well (:func:`spread`).
@@ -370,7 +372,7 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
         values: Any,
         component: str = "",
     ) -> None:
-        """Keep an estimate, or the interval of a statistic and its resamples."""
+        """Add an estimate, or the interval of a statistic and its resamples."""
         estimate = values if isinstance(values, IntervalEstimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
         where = (problem.id, scenario, study.split, study.seed, episodes)
@@ -433,7 +435,9 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
 def comparison_grids(
     problem: Problem, runs: Sequence[Trained], comparisons: Sequence[Comparison]
 ) -> list[Grid]:
-    """Tables of one scenario: every run and opponent; the spread of each algorithm; medians and opponents."""
+    """Return the tables of one scenario: every run and opponent; the spread of each algorithm; medians and
+    opponents.
+    """
     first = comparisons[0]
     paper, references = problem.paper, problem.baselines.references
     found = {(c.policy, c.statistic, c.against, c.metric, c.component): c for c in comparisons}
@@ -499,7 +503,7 @@ def compare_scenarios(
     store: Store | None = None,
     workers: Workers | None = None,
 ) -> tuple[list[Comparison], list[Grid]]:
-    """Evaluate runs and opponents in every scenario; return all numbers, and the tables of them.
+    """Evaluate runs and opponents in every scenario; return all numbers, and their tables.
 
     Arguments as of :func:`episode_means`.
     """
@@ -515,7 +519,7 @@ def compare_scenarios(
 
 
 def trained_of(runs: Sequence[SeedRun]) -> list[Trained]:
-    """Return what pages say of training runs."""
+    """Return the descriptions of training runs."""
     return [
         Trained(
             member.name,
@@ -529,7 +533,7 @@ def trained_of(runs: Sequence[SeedRun]) -> list[Trained]:
 
 
 def runs_data(runs: Sequence[SeedRun]) -> dict[str, Any]:
-    """Return what a record holds of the runs alone: who they are, and their validation curves."""
+    """Return a record's data on the runs alone: their descriptions, and their validation curves."""
     curves = {member.name: validation_curve(member.run) for member in runs}
     return {
         "environment": runs[0].run.problem.id,
@@ -540,7 +544,7 @@ def runs_data(runs: Sequence[SeedRun]) -> dict[str, Any]:
 
 
 def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """Return what a record holds of training seeds: the runs, and every number by scenario."""
+    """Return a record's data on training seeds: the runs, and every number by scenario."""
     scenarios: dict[str, list[list[Any]]] = {}
     for c in comparisons:
         numbers = [round_number(x) for x in (c.value, c.low, c.high)]
@@ -561,7 +565,7 @@ def with_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, An
     """Return a record's data with algorithms that were scored later, over the same episodes: added or replaced.
 
     Raises:
-        ValueError: if environment, episodes or scenarios are others.
+        ValueError: if environment, episodes or scenarios differ.
     """
     for key in ("environment", "split", "seed", "episodes"):
         if data[key] != added[key]:
@@ -587,7 +591,7 @@ def with_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, An
 
 
 def seeds_markdown(record: ResultRecord) -> str:
-    """Return the tables of training seeds in Markdown, with the commands that made them and the runs."""
+    """Return the tables of training seeds in Markdown, with the commands of the tables and the runs."""
     data = record.data
     problem, runs = problem_of(data["environment"]), [Trained(*each) for each in data["runs"]]
     grids: list[Grid] = []
@@ -601,8 +605,8 @@ def seeds_markdown(record: ResultRecord) -> str:
 def seeds_overview(records: Sequence[ResultRecord]) -> str:
     """Return the mean over training seeds of every algorithm in every environment, in Markdown.
 
-    Beside them stands the opponent of the lowest cost that is no reference. What is around an agent, a gate or a
-    policy that it corrects, is not told apart.
+    Beside them stands the opponent of the lowest cost that is no reference. Agents are not distinguished by a gate or
+    by a policy that they correct.
     """
     means: dict[str, dict[str, str]] = {}
     for record in records:
@@ -633,7 +637,7 @@ def _percent(values: Sequence[float | None]) -> str:
 
 
 def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[Trained], origin: str) -> str:
-    """Tables, the first shown and the others folded, and the commands that made them and the runs."""
+    """Return the tables, the first shown and the others folded, and the commands of the tables and the runs."""
     lines: list[str] = []
     for i, grid in enumerate(grids):
         table = markdown_table(grid.header, grid.rows)

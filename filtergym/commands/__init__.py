@@ -1,1 +1,1 @@
-"""The commands: options in, tables and files out; what they do stands in the rooms."""
+"""The commands: options in, tables and files out; the rooms do the work."""

@@ -1,4 +1,4 @@
-"""The command that advises which filter to take for a log."""
+"""The command that recommends a filter for a log."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -29,7 +29,7 @@ from ..reports.tables.advice import (
 )
 from ..reports.tables.results import settings_of
 from .evaluation import causal_competitors, departure_lines
-from .shown import report_maker
+from .result_output import report_maker
 from .terminal import (
     Parameters,
     RenameOption,
@@ -39,17 +39,17 @@ from .terminal import (
     TruthOption,
     command_line,
     console,
-    pair,
+    parse_pair,
+    parse_renames,
     parse_settings,
     progress_bar,
-    renamed,
 )
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
 
 
 def price_words(price: Mapping[str, int] | None) -> str:
-    """Say what an update of a filter costs in C; nothing where it is not known."""
+    """Return the cost of an update of a filter in C, in words; empty where it is unknown."""
     if price is None:
         return ""
     return (
@@ -59,7 +59,7 @@ def price_words(price: Mapping[str, int] | None) -> str:
 
 
 def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any], Mapping[str, int] | None]:
-    """Return what says what an update of a competitor costs in C, by its name and what makes it."""
+    """Return a function of a competitor's name and maker that gives the cost of an update in C, in words."""
     parameters = log_setup(problem, recording).parameters
 
     def price(name: str, maker: Any) -> Mapping[str, int] | None:
@@ -72,7 +72,7 @@ def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any]
 
 
 def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path, seed: int) -> None:
-    """Fit one filter to all of a recording, say its parameters, and write them.
+    """Fit one filter to a whole recording, print its parameters, and write them.
 
     Args:
         problem: of the recording.
@@ -107,15 +107,15 @@ def advise_on_log(
     recording: Annotated[
         str,
         typer.Argument(
-            help="What sensors really said, NetCDF or tables (CSV): a file, a folder, or a pattern in quotes."
+            help="Measurements of real sensors, NetCDF or tables (CSV): a file, a folder, or a pattern in quotes."
         ),
     ],
     environment: Annotated[
-        str, typer.Option(help="Environment whose measurements they are; NetCDF names its own.")
+        str, typer.Option(help="Environment of the measurements; a NetCDF file names its own.")
     ] = "filtergym/ManeuveringTarget-v0",
     out: Annotated[
         Path | None,
-        typer.Option(help=f"File for the advised filter, *{SUFFIX}; evaluate, online and export take it."),
+        typer.Option(help=f"File for the advised filter, *{SUFFIX}, for evaluate, online and export."),
     ] = None,
     report: Annotated[
         Path | None,
@@ -135,13 +135,13 @@ def advise_on_log(
     ] = None,
     settings: Parameters = None,
     noise: Annotated[bool, typer.Option(help="Fit the scale of the measurement noise, too.")] = True,
-    seed: Annotated[int, typer.Option(help="Of the starts of the fits.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the starts of the fits.")] = 0,
     speeds: Speeds = "0.01,1000",
     agents: Annotated[
         bool, typer.Option("--agents", help="Compare the shipped learned agents, too; it takes longer.")
     ] = False,
 ) -> None:
-    """Fit every family of filters to a log, and say which one to take, with which numbers.
+    """Fit every family of filters to a log, and recommend one with its parameters.
 
     Example: filtergym advise log.csv --out mine.filter.json
     """
@@ -150,16 +150,16 @@ def advise_on_log(
         if not out.name.endswith(SUFFIX):
             raise ValueError(f"the name of a fitted filter ends in {SUFFIX}, got {str(out)!r}")
         writable_file(out)
-    make_page = None if report is None else _advice_maker()  # what it lacks is said before anything else
+    make_page = None if report is None else _advice_maker()  # reports missing packages before any work
     if report is not None:
         writable_file(report)
     found = read_recording(
         recording,
         environment,
-        speeds=pair("--speeds", speeds),
+        speeds=parse_pair("--speeds", speeds),
         truth=truth,
         truth_offset=truth_offset,
-        rename=renamed(rename),
+        rename=parse_renames(rename),
         sort=sort,
         **keywords,
     )
@@ -177,7 +177,7 @@ def advise_on_log(
         def progress(what: str, share: float) -> None:
             bar.update(fits, completed=share)
             if what:
-                bar.say(what)
+                bar.write_line(what)
 
         prices = update_prices(problem, found)
         advice = advise(FittedLog(problem, found, noise, seed, keywords), makers, own, progress, prices)
@@ -225,7 +225,7 @@ def advise_on_log(
 
 
 def _advice_maker() -> Callable[..., str]:
-    """Return what makes the report of an advice; refusals as of :func:`.shown.report_maker`."""
+    """Return the function that makes the report of an advice; errors as of :func:`.result_output.report_maker`."""
     report_maker()
     from ..reports.pages.advice_report import advice_html
 

@@ -1,4 +1,4 @@
-"""Command that says what an issue needs to know of a machine."""
+"""The command that prints what a bug report should state of a machine."""
 
 import importlib.metadata
 import os
@@ -12,11 +12,11 @@ from .terminal import console
 
 PACKAGE = "filtergym"
 DEVELOPMENT = ("dev",)
-"""Extras that are not for users."""
+"""Extras for developers only."""
 
 
 def examine() -> None:
-    """Say versions, processor, cache of compiled code and extras: what an issue needs. Paste it there.
+    """Print versions, processor, cache of compiled code and extras, for a bug report.
 
     Example: filtergym doctor
     """
@@ -39,7 +39,7 @@ def _machine() -> Iterator[tuple[str, str]]:
 
 
 def _cache() -> str:
-    """Where compiled code is kept, and how much of it."""
+    """Return the folder and the size of the cache of compiled code."""
     place = cache.folder()
     if place is None:
         return f"off by {cache.SWITCH}"
@@ -48,17 +48,17 @@ def _cache() -> str:
 
 
 def _libraries() -> Iterator[tuple[str, str]]:
-    """Versions of what is needed, and of each extra, or what of it is not there."""
+    """Return the versions of the required packages and of each extra, or the packages that are missing."""
     requirements = [Requirement(text) for text in importlib.metadata.requires(PACKAGE) or ()]
     extras = importlib.metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()
     for extra in ("", *(name for name in extras if name not in DEVELOPMENT)):
-        wanted = [each for each in requirements if _belongs(each, extra)]
+        wanted = [each for each in requirements if _is_in_extra(each, extra)]
         found = [f"{each.name} {_version(each)}" for each in wanted]
         yield f"[{extra}]" if extra else "libraries", ", ".join(found)
 
 
-def _belongs(requirement: Requirement, extra: str) -> bool:
-    """Whether an extra asks for it; of what is always needed no extra, named by nothing."""
+def _is_in_extra(requirement: Requirement, extra: str) -> bool:
+    """Return whether a requirement belongs to an extra; the empty name means the packages that are always required."""
     if requirement.marker is None:
         return not extra
     return bool(extra) and requirement.marker.evaluate({"extra": extra})

@@ -1,4 +1,4 @@
-"""The steps of ``filtergym evaluate``: find what is evaluated, run it, make tables, write and print."""
+"""The steps of ``filtergym evaluate``: find data and competitors, run them, make tables, write and print."""
 
 import os
 import tempfile
@@ -42,30 +42,30 @@ from ..reports.tables.recording_tables import recording_tables
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of, write_results
 from ..reports.tables.terminal_tables import flights_table, results_tables
 from ..reports.tables.worst import worst_figures
-from .shown import REPORT, make_report
+from .result_output import REPORT, make_report
 from .terminal import (
     check_no_recording_options,
     command_line,
     console,
-    pair,
+    parse_pair,
+    parse_renames,
     print_sentence,
     print_table,
     progress_bar,
-    renamed,
 )
 
 LARGE = 200_000_000
-"""Bytes of a file that nobody expects without having asked for it."""
+"""Size of a file, bytes, above which it is written only on request."""
 RESERVE = 64_000_000
-"""Bytes that no competitor takes of the disk, for what is written at last."""
+"""Bytes of the disk that are reserved for the files that are written last."""
 MOST_PREDICTIONS = 2_000_000
-"""Measurements of all competitors whose estimates are kept, some 200 bytes each."""
+"""Largest number of measurements, over all competitors, whose estimates are stored, some 200 bytes each."""
 TRACKS = ("truth", "estimate", "covariance")
-"""What is kept of measurements for predictions, and not written unless estimates are asked for."""
+"""Data of measurements that predictions need; written only if estimates are requested."""
 
 
 class FileOptions(NamedTuple):
-    """How flights and recordings are read from files, as options of a command."""
+    """Options of a command for reading flights and recordings from files."""
 
     site: str | None
     longest_gap: float
@@ -73,30 +73,30 @@ class FileOptions(NamedTuple):
     smoothing: float
     fewest_scans: int
     truth: Path | None = None
-    """Of a recording, in a file of its own."""
+    """File of a recording's truth, where it is separate."""
     truth_offset: float = 0.0
     rename: str | None = None
-    """Of the columns of a recording."""
+    """New names of the columns of a recording."""
     sort: bool = False
     """Whether the rows of a recording are sorted by time."""
 
 
 class Outputs(NamedTuple):
-    """What an evaluation writes, and where."""
+    """Files that an evaluation writes."""
 
     folder: Path | None
-    """For records, a table, the whole result and figures."""
+    """Folder for records, a table, the whole result and figures."""
     netcdf: bool | None
     """Whether the whole result is written; None: unless it is large."""
     formats: Sequence[str]
-    """Of figures."""
+    """File formats of the figures."""
     columns: int
-    """Of a page, that figures are wide."""
+    """Width of the figures, in columns of a page."""
     records: Path | None
     estimates: Path | None
 
     def check(self) -> None:
-        """Raise ValueError for what cannot be written."""
+        """Raise ValueError for an output that cannot be written."""
         check_formats(list(self.formats))
         check_columns(self.columns)
         if self.folder is not None:
@@ -109,7 +109,9 @@ class Outputs(NamedTuple):
 
     @contextmanager
     def reserve_space(self, competitors: Sequence[Competitor]) -> Iterator[None]:
-        """Take the space of what is written at last, as much as there is, while programs run, which could fill it."""
+        """Reserve disk space for the last outputs, as far as there is any, since the programs that run could fill the
+        disk.
+        """
         place = self.folder or self.records or self.estimates
         if place is None or not any(is_program(one.maker) for one in competitors):
             yield
@@ -128,24 +130,24 @@ def find_data(
     options: FileOptions,
     keywords: Mapping[str, Any],
 ) -> tuple[Problem, Any]:
-    """Return the problem, and the scenario: its name, flights, or a recording.
+    """Return the problem and the data: the name of a scenario, flights, or a recording.
 
     Raises:
-        ValueError: if nothing names the environment, or a file cannot be read.
+        ValueError: if the environment is not named, or a file cannot be read.
     """
     if recording is not None and scenario is not None:
         raise ValueError("--recording takes the place of --scenario: leave one of them out")
     problem = problem_of(environment) if environment else None
     named = problem.task.scenarios if problem else {}
     if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
-        speeds = pair("--speeds", options.speeds)
+        speeds = parse_pair("--speeds", options.speeds)
         found = read_recording(
             recording or str(scenario),
             environment,
             speeds=speeds,
             truth=options.truth,
             truth_offset=options.truth_offset,
-            rename=renamed(options.rename),
+            rename=parse_renames(options.rename),
             sort=options.sort,
             **keywords,
         )
@@ -161,9 +163,9 @@ def find_data(
         return problem, scenario
     return problem, read_flights(
         scenario,
-        None if options.site is None else pair("--site", options.site),
+        None if options.site is None else parse_pair("--site", options.site),
         longest_gap=options.longest_gap,
-        speeds=pair("--speeds", options.speeds),
+        speeds=parse_pair("--speeds", options.speeds),
         fewest_scans=options.fewest_scans,
         smoothing=options.smoothing,
     )
@@ -174,9 +176,7 @@ def _no_flights(name: str | None) -> ValueError:
 
 
 def assumed_parameters(environment: str | None, names: Sequence[str]) -> dict[str, float]:
-    """Return the parameters under which a log without deviations is read as the one of an advised filter was; of the
-    first file among the names that holds any.
-    """
+    """Return the parameters for a log without standard deviations, from the first named file of an advised filter."""
     if environment is None:
         return {}
     advised = [name for name in names if name.endswith(SUFFIX)]
@@ -187,12 +187,12 @@ def assumed_parameters(environment: str | None, names: Sequence[str]) -> dict[st
 def find_participants(
     problem: Problem, data: Any, policies: Sequence[str] | None, trust: bool
 ) -> list[Competitor]:
-    """Return the competitors that are evaluated: those that are named, or those of the quick benchmark.
+    """Return the competitors to evaluate: the named ones, or those of the quick benchmark.
 
     Args:
-        problem: whose they are.
+        problem: the environment with its competitors.
         data: of :func:`find_data`. On a recording every shipped competitor runs that can, tuned and learned ones, too;
-            references and bounds need what it does not hold.
+            references and bounds need the truth.
         policies: names that are given.
         trust: load models that can execute code.
     """
@@ -207,19 +207,19 @@ def find_participants(
 
 
 def causal_competitors(problem: Problem, recording: Recording, agents: bool = True) -> list[Competitor]:
-    """Return what is shipped and can run on a recording as it comes: classical, tuned and, if wanted, learned."""
+    """Return the shipped competitors that can run causally on a recording: classical, tuned and, if wanted, learned."""
     found = find_competitors(problem, ranked_names(problem))
     # Random actions show nothing of a sensor.
     return [
         one
         for one in found
         if one.maker is not RandomPolicy
-        and (not one.learned or (agents and _knows_fields(problem, one.maker, recording)))
+        and (not one.learned or (agents and _has_fields(problem, one.maker, recording)))
     ]
 
 
-def _knows_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
-    """Whether an agent was trained on fields that are shown of a recording: one of other axes shows others."""
+def _has_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
+    """Return whether an agent was trained on the fields that a recording with these axes gives."""
     stored = getattr(maker, "policy", maker)
     header, control = getattr(stored, "header", None), getattr(stored, "control", None)
     if header is None or control is None:
@@ -228,8 +228,8 @@ def _knows_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
     return {*header["fields"]} <= {field.name for field in model.fields}
 
 
-def keeps_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
-    """Whether estimates are kept to say what they predicted: of recordings that are not huge.
+def has_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
+    """Return whether estimates are stored to score their predictions: for recordings that are not huge.
 
     Args:
         problem: that is evaluated.
@@ -248,7 +248,7 @@ def tables_of(
     width: int,
     own: Sequence[str] = (),
 ) -> list[Table]:
-    """Return the tables in so many columns, widest first, with the rows of the user's own competitors marked."""
+    """Return the tables in at most so many columns, widest first, with the rows of the user's competitors marked."""
     tables = [flights_table(found.dataset, found.flights, found.records, width)] if found.flights else []
     if found.has_truth:
         paper = found.dataset.attrs["paper"]
@@ -262,13 +262,13 @@ def tables_of(
 
 
 def own_names(problem: Problem, policies: Sequence[str]) -> list[str]:
-    """Of names of competitors those that are not shipped: the user's own."""
+    """Return the names that are not shipped: the user's own competitors."""
     shipped = shipped_names(problem)
     return [name for name in dict.fromkeys(policies) if name not in shipped]
 
 
 def _without_comparison(problem: Problem) -> str:
-    """Explain why costs are compared with none, where no reading of the paper's algorithm takes part."""
+    """Explain why costs are not compared where no reading of the paper's algorithm takes part."""
     paper = problem.baselines.compared_paper
     if not paper:
         return "Costs are not compared: the environment names no paper's algorithm."
@@ -278,18 +278,18 @@ def _without_comparison(problem: Problem) -> str:
 def run(
     requests: Sequence[EvaluationRequest], outputs: Outputs, workers: Workers, store: Store
 ) -> tuple[Evaluation, str, dict[str, str]]:
-    """Run the competitors of an evaluation; one that fails costs its own row.
+    """Run the competitors of an evaluation; one that fails loses only its own row.
 
-    Every number of every episode is kept only where it is asked for.
+    Every number of every episode is stored only on request.
 
     Args:
         requests: one for each competitor.
         outputs: what will be written.
-        workers: who share the work.
-        store: keeps what is done until all is written.
+        workers: processes that share the work.
+        store: storage of finished results until all is written.
 
     Returns:
-        The evaluation, why the whole of it is not written, empty where it is, and the errors of those that failed.
+        The evaluation, why it is not written as a whole (empty if it is), and the errors of failed competitors.
 
     Raises:
         ValueError: if all of them fail, or one does and the experiment is strict.
@@ -330,7 +330,7 @@ def run(
 
 
 def check_explained(wanted: Sequence[str], names: Sequence[str]) -> None:
-    """Raise ValueError for a name to explain that is not evaluated."""
+    """Raise ValueError if a name to explain is not evaluated."""
     for name in wanted:
         if name not in names:
             raise nearest("competitor to explain", name, names)
@@ -345,16 +345,16 @@ def write(
     worst: Mapping[str, Sequence[WorstTrack]],
     own: Sequence[str],
 ) -> None:
-    """Write what was asked for, print sentences on the user's own competitors, tables and the largest reasons, and say
-    where the files are.
+    """Write the requested files; print sentences on the user's own competitors, the tables, the largest reasons, and
+    the paths of the files.
 
     Args:
-        problem: that was evaluated.
-        found: of :func:`run`.
-        refusal: likewise.
-        outputs: what is written.
-        learned: names that are learned.
-        worst: by the names of those whose cost is explained their worst episodes.
+        problem: the evaluated problem.
+        found: the evaluation of :func:`run`.
+        refusal: why the whole of it is not written, from :func:`run`.
+        outputs: files to write.
+        learned: names of learned agents.
+        worst: worst episodes of the competitors whose cost is explained, by name.
         own: names of the user's own.
     """
     printed, in_file = (
@@ -416,19 +416,19 @@ def write(
 
 
 def missing_rows(records: Sequence[Any]) -> Iterator[str]:
-    """Say in a sentence how much of what was measured a file of estimates says nothing of."""
+    """State in a sentence how many measurements a file of estimates lacks."""
     for record in records:
         if record.metric == "missing" and record.value:
             yield (
-                f"{record.policy}: {100.0 * record.value:.3g} % of the measurements have no row in the file; the last "
-                "estimate before each, or the initial one, is held"
+                f"{record.policy}: {100.0 * record.value:.3g} % of the measurements have no row in the file; each "
+                "repeats the estimate before it, or the initial one"
             )
 
 
 def departure_lines(
     problem: Problem, data: Any, learned: Sequence[Competitor], keywords: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Say what agents are shown follows from a log, and how it departs from what each was trained on, in a line.
+    """Return lines that state which deviations agents observe from a log, and how it departs from their training.
 
     Args:
         problem: whose agents they are.
@@ -439,8 +439,8 @@ def departure_lines(
     typical = data.typical if learned and isinstance(data, Recording) else {}
     for name in typical.keys() - keywords.keys():
         yield (
-            f"{name} is {typical[name]:g}, the median of what the log states: agents are shown deviations over it, and "
-            f"costs count in its square; --set {name}=VALUE names another"
+            f"{name} is {typical[name]:g}, the median of what the log states: agents observe deviations over it, and "
+            f"costs have its square as unit; --set {name}=VALUE sets another"
         )
     for agent in learned:
         for departure in load_present(DEPARTURES):
@@ -450,7 +450,9 @@ def departure_lines(
 
 
 def _size_warning(size: int, largest: int, asked: bool | None) -> str:
-    """Say why a dataset of so many bytes, and so many in its largest variable, is no NetCDF file; empty if it is."""
+    """Explain why a dataset of so many bytes, and so many in its largest variable, is not written as NetCDF; empty if
+    it is.
+    """
     if asked is False:
         return "--no-netcdf"
     if largest > MOST_BYTES:

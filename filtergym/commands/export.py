@@ -1,4 +1,4 @@
-"""The command that writes what leaves the package: agents as arrays, filters as programs."""
+"""The command that exports agents as arrays or networks and filters as programs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,20 +19,20 @@ from .terminal import (
     Trust,
     command_line,
     complete_environment,
+    complete_from,
     complete_policy,
     console,
     import_environments,
-    one_of,
-    pair,
+    parse_pair,
+    parse_renames,
     parse_settings,
-    renamed,
 )
 
 if TYPE_CHECKING:
     from ..exports.request import ExportRequest
 
 FORMS = ("safetensors", "c", "onnx")
-"""What can be written."""
+"""Formats of an export."""
 
 
 def export(
@@ -56,9 +56,9 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; onnx, the "
+            help="Format: safetensors, an agent's arrays; c, a whole filter as C99; onnx, the "
             "network of an agent.",
-            autocompletion=one_of(*FORMS),
+            autocompletion=complete_from(*FORMS),
         ),
     ] = "safetensors",
     out: Annotated[
@@ -69,14 +69,15 @@ def export(
         ),
     ] = None,
     single: Annotated[
-        bool, typer.Option("--float", help="Of C: float in place of double; refused where it is wrong.")
+        bool,
+        typer.Option("--float", help="Of C: float in place of double; an error where its results are wrong."),
     ] = False,
     scenario: ScenarioName = None,
     recording: Annotated[
         Path | None,
         typer.Option(
             help="In place of a scenario: a log, NetCDF or a table (CSV), whose parameters the filter has and whose "
-            "measurements it is tried on. What was fitted to a second sensor needs one that has it."
+            "measurements it is compared on. A filter with a second sensor needs a log of both."
         ),
     ] = None,
     speeds: Speeds = "1,1000",
@@ -87,10 +88,10 @@ def export(
 ) -> None:
     """Write a filter as C99, an agent's network as ONNX, or a run's agent as plain arrays.
 
-    Arrays evaluate without torch and cannot execute anything. Nothing is executed either: training has left them beside
-    the model. A folder with the model only takes --trust.
+    Arrays evaluate without torch and execute nothing. Training writes them beside the model; a folder that contains the
+    model only needs --trust.
 
-    C needs nothing but math.h. What is written was run beside the filter itself, measurement by measurement, over
+    C needs math.h only. Before it is written, it is compared with the filter itself, measurement by measurement, over
     episodes of the scenario, or over a log.
 
     Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
@@ -121,8 +122,8 @@ def export(
         data = read_recording(
             recording,
             problem.id,
-            speeds=pair("--speeds", speeds),
-            rename=renamed(rename),
+            speeds=parse_pair("--speeds", speeds),
+            rename=parse_renames(rename),
             sort=sort,
             **keywords,
         )
@@ -140,14 +141,13 @@ def export(
 
 
 def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> None:
-    """Write a filter as C99, and say what it costs."""
     from ..exports.c_filter import file_stem
     from ..exports.c_source import export_c
     from ..exports.figures import operation_words
 
     stem = file_stem(request.name)
     folder = out or Path(stem)
-    writable_folder(folder)  # what it refuses is said before anything is compared
+    writable_folder(folder)  # reports an unusable folder before the comparison
     figures = export_c(request, folder, precision, command_line())
     for line in (
         f"saved in {folder}: {stem}.h, {stem}.c",
@@ -172,7 +172,6 @@ def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> Non
 
 
 def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:
-    """Write a run's best agent as arrays."""
     path = out or folder / "agent.safetensors"
     run = export_run(folder, path, trust)
     console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")

@@ -1,4 +1,4 @@
-"""Commands that search for something better: tuned values and trained agents."""
+"""Commands that search for better filters: tuned parameters and trained agents."""
 
 from pathlib import Path
 from typing import Annotated
@@ -34,11 +34,11 @@ from .terminal import (
     check_no_recording_options,
     complete_policy,
     console,
-    pair,
+    parse_pair,
+    parse_renames,
+    parse_whole_numbers,
     print_table,
     progress_bar,
-    renamed,
-    whole_numbers,
 )
 from .training import open_run, open_runs, print_standing, train_runs, trainer_of
 
@@ -48,14 +48,14 @@ def tune_policy(
     policy: Annotated[str, typer.Option(help="Policy to tune.", autocompletion=complete_policy)],
     budget: Annotated[int, typer.Option(help="Environment steps to spend.")] = 4_000_000,
     scenario: TrainingScenario = None,
-    seed: Annotated[int, typer.Option(help="Of the training episodes and the search.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the training episodes and the search.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the tuned values.")] = FOLDER,
     backend: Backend = "auto",
     jobs: Jobs = 1,
     cluster: Cluster = None,
     recording: Annotated[
         str | None,
-        typer.Option(help="What sensors really said, NetCDF or tables (CSV): fit an estimator to it."),
+        typer.Option(help="Measurements of real sensors, NetCDF or tables (CSV): fit an estimator to them."),
     ] = None,
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
@@ -75,10 +75,10 @@ def tune_policy(
         found = read_recording(
             recording,
             problem.id,
-            speeds=pair("--speeds", speeds),
+            speeds=parse_pair("--speeds", speeds),
             truth=truth,
             truth_offset=truth_offset,
-            rename=renamed(rename),
+            rename=parse_renames(rename),
             sort=sort,
         )
         fit_to_recording(problem, policy, found, out, seed)
@@ -119,7 +119,7 @@ def train(
     steps: Annotated[int | None, typer.Option(help="Environment steps in all.")] = None,
     envs: Annotated[int | None, typer.Option(help="Environments side by side.")] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Of the training episodes and the network; default: 0.")
+        int | None, typer.Option(help="Seed of the training episodes and the network; default: 0.")
     ] = None,
     seeds: Annotated[
         str | None,
@@ -128,7 +128,7 @@ def train(
             "skipped, unfinished ones resumed."
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")] = False,
     validate_every: Annotated[
         int | None, typer.Option(help="Environment steps between validations; default: a twentieth.")
     ] = None,
@@ -151,23 +151,23 @@ def train(
     residual_to: Annotated[
         str, typer.Option(metavar="POLICY", help="Policy of the environment that the agent corrects.")
     ] = "",
-    gated: Annotated[
-        bool, typer.Option("--gated", help="The agent acts only where an alarm says that something is wrong.")
-    ] = False,
+    gated: Annotated[bool, typer.Option("--gated", help="The agent acts only after an alarm.")] = False,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     compare: Annotated[
         bool,
-        typer.Option(help="Say at the end how the best agent stands against paper, classical and reference."),
+        typer.Option(
+            help="Report at the end how the best agent compares with paper, classical and reference."
+        ),
     ] = True,
 ) -> None:
-    """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
+    """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint from which --resume continues.
 
-    A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one, with --resume or --seeds, also
-    takes --trust. One of bptt, kalman-net or student cannot.
+    A checkpoint of Stable-Baselines3 can execute code when it is loaded: resuming one, with --resume or --seeds, also
+    needs --trust. One of bptt, kalman-net or student cannot.
 
-    Settings go before those of --config, and these before the shipped hyperparameters. --resume goes on with the
-    settings of the run, and refuses others.
+    --set overrides --config, and --config the shipped hyperparameters. --resume continues with the settings of the run,
+    and refuses others.
 
     Example: filtergym train filtergym/ManeuveringTarget-v0 --algo ppo --steps 1000000 --out runs/ppo
 
@@ -179,10 +179,12 @@ def train(
     trainer = trainer_of(algo)
     if seeds is not None and (seed is not None or resume):
         raise ValueError(
-            "--seeds names every seed, and goes on with runs by itself: leave out --seed and --resume"
+            "--seeds names every seed, and continues runs by itself: leave out --seed and --resume"
         )
     if seeds is None and not (jobs == 1 and cluster is None):
-        raise ValueError("a run is trained in one process: --jobs and --cluster share the runs of --seeds")
+        raise ValueError(
+            "a single run is trained in one process: --jobs and --cluster share the runs of --seeds"
+        )
     keywords, hyperparameters = parse_settings(set_ or [])
     if reward is not None:
         keywords["reward"] = reward
@@ -206,7 +208,7 @@ def train(
     if seeds is None:
         opened = [open_run(problem, options, session)]
     else:
-        opened = open_runs(problem, options, session, whole_numbers("--seeds", seeds))
+        opened = open_runs(problem, options, session, parse_whole_numbers("--seeds", seeds))
     with Workers(jobs, cluster) as workers:
         runs = train_runs(opened, trainer, workers)
     if compare and all(run.is_complete for run in runs):  # unless somebody wished to stop

@@ -1,4 +1,4 @@
-"""Command that says what there is."""
+"""The command that lists environments."""
 
 from typing import Annotated
 

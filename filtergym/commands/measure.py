@@ -1,4 +1,4 @@
-"""Commands that measure: what there is, and how it compares on the same noise."""
+"""Commands that evaluate, record, benchmark and animate competitors on the same noise."""
 
 from pathlib import Path
 from typing import Annotated
@@ -36,7 +36,7 @@ from ..protocol import protocol_names
 from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
 from ..reports.tables.headline import headline_table
-from ..reports.tables.reasons import explained_by_default
+from ..reports.tables.reasons import default_explained
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of
 from ..reports.tables.terminal_tables import results_tables
 from ..reports.tables.worst import find_worst
@@ -48,13 +48,13 @@ from .evaluation import (
     departure_lines,
     find_data,
     find_participants,
-    keeps_predictions,
+    has_predictions,
     own_names,
     run,
     write,
 )
 from .protocol import check_options, evaluate_protocol
-from .shown import REPORT, make_report, print_headline, print_outcome
+from .result_output import REPORT, make_report, print_headline, print_outcome
 from .terminal import (
     Backend,
     Cluster,
@@ -76,10 +76,10 @@ from .terminal import (
     TruthOption,
     command_line,
     complete_environment,
+    complete_from,
     complete_policy,
     console,
     import_environments,
-    one_of,
     parse_settings,
     print_sentence,
     print_table,
@@ -112,7 +112,7 @@ def evaluate_policies(
         typer.Option(
             help="In place of an environment: a frozen protocol over several of them, filtergym-1, whose row can be "
             "quoted; --policy NAME, or ENVIRONMENT=NAME for one of them.",
-            autocompletion=one_of(*protocol_names()),
+            autocompletion=complete_from(*protocol_names()),
         ),
     ] = None,
     scenario: ScenarioName = None,
@@ -128,7 +128,7 @@ def evaluate_policies(
         bool | None,
         typer.Option(
             "--netcdf/--no-netcdf",
-            help="With --out, write results.nc however large it is, or not at all; default: up to 200 MB.",
+            help="With --out, write results.nc of any size, or not at all; default: up to 200 MB.",
         ),
     ] = None,
     format: Formats = None,
@@ -137,8 +137,8 @@ def evaluate_policies(
     recording: Annotated[
         str | None,
         typer.Option(
-            help="In place of a scenario: what sensors really said, NetCDF, tables (CSV) or logs of receivers (.pos, "
-            ".nmea): a file, a folder, or a pattern in quotes."
+            help="In place of a scenario: measurements of real sensors, NetCDF, tables (CSV) or logs of receivers "
+            "(.pos, .nmea): a file, a folder, or a pattern in quotes."
         ),
     ] = None,
     truth: TruthOption = None,
@@ -157,25 +157,26 @@ def evaluate_policies(
         bool,
         typer.Option(
             "--strict",
-            help="Stop where an estimator's answer is not finite or no covariance; default: the episode is lost.",
+            help="Stop at an estimate that is not finite or has no covariance; default: the episode is lost.",
         ),
     ] = False,
     isolated: Annotated[
         bool,
         typer.Option(
             "--isolated",
-            help="Run every module:Class in a process of its own, which is told the measurements and nothing else.",
+            help="Run every module:Class in a process of its own, which receives the measurements only.",
         ),
     ] = False,
     time_limit: Annotated[
         float,
         typer.Option(
-            help="For each answer of programs, isolated estimators and, on Linux with --jobs 1, any module:Class, s."
+            help="Limit for each estimate of programs, isolated estimators and, on Linux with --jobs 1, any "
+            "module:Class, s."
         ),
     ] = 10.0,
     memory_limit: Annotated[
         float,
-        typer.Option(help="Of programs and isolated estimators: address space, MB, on Linux; 0: no limit."),
+        typer.Option(help="Address space of programs and isolated estimators, MB, on Linux; 0: no limit."),
     ] = 4000.0,
     backend: Backend = "auto",
     threads: Threads = 1,
@@ -184,7 +185,8 @@ def evaluate_policies(
     why: Annotated[
         list[str] | None,
         typer.Option(
-            help="Whose cost is explained; repeat for several; default: yours, the first --policy, else the paper's "
+            help="Competitor whose cost is explained; repeat for several; default: yours, the first --policy, else the "
+            "paper's "
             "algorithm.",
             autocompletion=complete_policy,
         ),
@@ -195,12 +197,12 @@ def evaluate_policies(
             help="Of flights in latitude and longitude: those of the radar, degrees, such as 48.72,2.38."
         ),
     ] = None,
-    longest_gap: Annotated[float, typer.Option(help="Of flights: longest gap that is not cut, s.")] = 60.0,
+    longest_gap: Annotated[
+        float, typer.Option(help="Of flights: longest gap at which a flight is not cut, s.")
+    ] = 60.0,
     speeds: Annotated[
         str,
-        typer.Option(
-            help="Of flights and recordings: speeds that are possible, m/s, from the lowest to the highest."
-        ),
+        typer.Option(help="Of flights and recordings: lowest and highest possible speed, m/s."),
     ] = "1,1000",
     smoothing: Annotated[
         float,
@@ -217,7 +219,7 @@ def evaluate_policies(
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
     if isolated and trust:
-        raise ValueError("--trust lets code run here, and --isolated does not: leave one of them out")
+        raise ValueError("--trust runs code in this process, and --isolated does not: leave one of them out")
     if protocol is not None:
         check_options(ctx)
         isolating = isolate_names if isolated else None
@@ -253,7 +255,7 @@ def evaluate_policies(
         seed,
         split,
         control,
-        tracks=estimates is not None or keeps_predictions(problem, data, names),
+        tracks=estimates is not None or has_predictions(problem, data, names),
         drawn_episodes=int(out is not None),
         backend=backend,
         threads=threads,
@@ -267,7 +269,7 @@ def evaluate_policies(
         with Workers(jobs, cluster) as workers:
             found, refusal, failures = run(requests, outputs, workers, store)
         own, paper = own_names(problem, policy or []), found.dataset.attrs["paper"]
-        explained = why or explained_by_default(found.records, [*own, *(policy or [])], paper)
+        explained = why or default_explained(found.records, [*own, *(policy or [])], paper)
         worst: dict[str, list[WorstTrack]] = {name: [] for name in explained}
         if out is not None:
             worst = find_worst(experiment, found, competitors, explained)
@@ -292,12 +294,12 @@ def record_scenario(
         typer.Option(
             "--blind",
             help="Without the truth, for programs outside Python: measurements.csv, start.csv and measurements.nc. "
-            "What they estimate is judged by filtergym evaluate --policy file:ESTIMATES.",
+            "filtergym evaluate --policy file:ESTIMATES evaluates their estimates.",
         ),
     ] = False,
     backend: Backend = "auto",
 ) -> None:
-    """Record what the sensors say in episodes of the simulation, with the truth or, for competitors, without.
+    """Record the measurements of simulated episodes, with the truth or, for competitors, without.
 
     Example: filtergym record filtergym/ManeuveringTarget-v0 --scenario paper --episodes 20 --out plots.nc
     """
@@ -318,7 +320,7 @@ def record_scenario(
     write_blind(out, recording, experiment.make_task())
     chosen = [f"--scenario {scenario}"] * (scenario is not None) + [f"--set {one}" for one in settings or []]
     judged = f"--episodes {episodes} --seed {seed} --split {split} --policy file:ESTIMATES.csv"
-    console.print(f"{episodes} episodes in {out}; what estimates them is judged by", soft_wrap=True)
+    console.print(f"{episodes} episodes in {out}; to evaluate estimates of them:", soft_wrap=True)
     console.print(f"  filtergym evaluate {' '.join([environment, *chosen, judged])}", soft_wrap=True)
 
 
@@ -340,19 +342,17 @@ def write_offline(
         str,
         typer.Option(
             help="train, validation or test; only test takes held-out scenarios and flights of your own.",
-            autocompletion=one_of("train", "validation", "test"),
+            autocompletion=complete_from("train", "validation", "test"),
         ),
     ] = "train",
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Parameter of the task, reward or dtype, name=value; repeat for several."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of data sets; default: where Minari keeps them.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of data sets; default: that of Minari.")] = None,
     namespace: Annotated[
         str | None,
-        typer.Option(help="What names begin with; default: filtergym/maneuvering-target and the like."),
+        typer.Option(help="Beginning of the names; default: filtergym/maneuvering-target and the like."),
     ] = None,
     trust: Trust = False,
 ) -> None:
@@ -415,7 +415,7 @@ def benchmark(
     """
     if policy:
         raise ValueError(
-            f"benchmark runs what is shipped, and --policy {policy[0]} names another competitor: filtergym evaluate "
+            f"benchmark runs shipped competitors only, and --policy {policy[0]} names another: filtergym evaluate "
             f"--protocol filtergym-1 --policy {policy[0]} runs it in every environment, and filtergym evaluate "
             f"ENVIRONMENT --policy {policy[0]} in one"
         )
@@ -433,7 +433,7 @@ def benchmark(
         def tell_result(result: Result) -> None:
             first = result.records[0]
             count = len({record.policy for record in result.records})
-            bar.say(
+            bar.write_line(
                 f"{result.short}, {result.scenario}: {count} competitor{'s' * (count > 1)} over "
                 f"{first.episodes:,} episodes"
             )
@@ -456,9 +456,7 @@ def benchmark(
     console.print()
     make_report(results, settings_of(options.command), out / REPORT)
     console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
-    print_sentence(
-        "what the environments are, and who competes in them: filtergym list, docs/environments.md"
-    )
+    print_sentence("environments and their competitors: filtergym list, docs/environments.md")
     console.print()
     print_headline(results)
 

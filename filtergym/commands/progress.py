@@ -1,4 +1,4 @@
-"""How far a command has come: a bar in a terminal, and lines where standard error is a file or a pipe."""
+"""Progress of a command: a bar in a terminal, and lines where standard error is a file or a pipe."""
 
 import time
 from collections.abc import Callable
@@ -8,24 +8,24 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 FEWEST_SECONDS, MOST_SECONDS = 10.0, 60.0
-"""Between two lines: no sooner than the first, and not later than the second where there is something new."""
+"""Least and largest time between two lines, s."""
 STEP = 0.05
-"""Share of the work that is worth a line."""
+"""Share of the work after which a line is printed."""
 
 
 class _Bar(Progress):
-    """A bar that goes when all is done; it shows by itself what :class:`ProgressLines` says."""
+    """A progress bar that disappears at the end; it shows by itself what :class:`ProgressLines` writes."""
 
-    def say(self, text: str) -> None:
-        """Leave the bar alone."""
+    def write_line(self, text: str) -> None:
+        """Ignore the line: the bar shows the progress."""
 
 
 class ProgressLines:
-    """Lines with the time that is left: few, and none of what takes seconds.
+    """Few lines with the remaining time; none for tasks of seconds.
 
     Args:
-        write: of a line.
-        clock: seconds.
+        write: function that writes a line.
+        clock: function that returns the time, s.
     """
 
     def __init__(self, write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
@@ -34,8 +34,8 @@ class ProgressLines:
 
     def _begin(self, description: str, total: float) -> None:
         self._description, self._total = description, total
-        self._done = self._told = 0.0
-        self._begun = self._told_at = self._clock()
+        self._done = self._reported = 0.0
+        self._begun = self._reported_at = self._clock()
 
     def __enter__(self) -> Self:
         return self
@@ -57,23 +57,23 @@ class ProgressLines:
         completed: float | None = None,
         description: str | None = None,
     ) -> None:
-        """Say how much more, or how much in all, is done, and of what; what is new of these is a line at once."""
+        """Set the progress of the task and its description; a new description is written at once."""
         self._done = self._done + (advance or 0.0) if completed is None else completed
         if description is not None and description != self._description:
             self._description = description
-            self.say(description)
-        since = self._clock() - self._told_at
-        if self._total <= 0.0 or since < FEWEST_SECONDS or self._done <= self._told:
+            self.write_line(description)
+        since = self._clock() - self._reported_at
+        if self._total <= 0.0 or since < FEWEST_SECONDS or self._done <= self._reported:
             return
-        if since >= MOST_SECONDS or self._done - self._told >= STEP * self._total:
+        if since >= MOST_SECONDS or self._done - self._reported >= STEP * self._total:
             self._write(f"{self._description}: {self._standing()}")
-            self._told_at, self._told = self._clock(), self._done
+            self._reported_at, self._reported = self._clock(), self._done
 
-    def say(self, text: str) -> None:
+    def write_line(self, text: str) -> None:
         """Write a line of its own."""
         standing = f" ({self._standing()})" if 0.0 < self._done < self._total else ""
         self._write(f"{text}{standing}")
-        self._told_at, self._told = self._clock(), self._done
+        self._reported_at, self._reported = self._clock(), self._done
 
     def _standing(self) -> str:
         share = min(self._done / self._total, 1.0)
@@ -83,7 +83,7 @@ class ProgressLines:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as one says them: ``42 s``, ``3 min 20 s``, ``2 h 5 min``."""
+    """Return a duration in words: ``42 s``, ``3 min 20 s``, ``2 h 5 min``."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
@@ -93,7 +93,7 @@ def duration(seconds: float) -> str:
 
 
 def progress_bar() -> "_Bar | ProgressLines":
-    """Return what shows progress on standard error, so that tables can be piped: a bar, or lines where nobody looks."""
+    """Return the progress display on standard error, so that tables can be piped: a bar in a terminal, else lines."""
     errors = Console(stderr=True, highlight=False, markup=False, emoji=False)
     if not errors.is_terminal:
         return ProgressLines(lambda line: errors.print(line, soft_wrap=True))

@@ -32,12 +32,12 @@ OPTIONS = {
 
 
 def check_options(ctx: typer.Context) -> None:
-    """Raise ValueError for what is given beside ``--protocol`` and is the protocol's own."""
+    """Raise ValueError for options beside ``--protocol`` that the protocol itself fixes."""
     for parameter in ctx.command.params:
         source = ctx.get_parameter_source(str(parameter.name))
         if parameter.name not in OPTIONS and source is not None and source.name == "COMMANDLINE":
             given = parameter.opts[0] if parameter.opts[0].startswith("-") else "the environment"
-            raise ValueError(f"a protocol says itself what is run: leave out {given}")
+            raise ValueError(f"a protocol fixes the experiment: leave out {given}")
 
 
 def evaluate_protocol(
@@ -52,9 +52,9 @@ def evaluate_protocol(
     """Run a protocol and print its table, the row to quote and a BibTeX entry.
 
     Args:
-        name: of the protocol, or the path of one.
+        name: name of the protocol, or a path.
         policies: words as of :func:`..protocol.find_entries`.
-        workers: who shares the work.
+        workers: processes that share the work.
         json: file for the records of all scenarios; None: none.
         trust: load models that can execute code.
         rename: as of :func:`..protocol.find_entries`.
@@ -82,7 +82,7 @@ def evaluate_protocol(
 
 
 def quoted_row(found: ProtocolResult) -> list[str]:
-    """Return the row to quote with its head, in Markdown; the time, which does not repeat, stands last."""
+    """Return the row to quote with its head, in Markdown; the time, which differs from run to run, stands last."""
     cells = {
         found.protocol.name: found.title,
         "cost against the papers, %": _percent(found.cost),
@@ -100,7 +100,6 @@ def _percent(estimate: Any) -> str:
 
 
 def _table(found: ProtocolResult) -> Table:
-    """Compare what was entered with the paper's algorithm in each environment."""
     table = plain_table(
         f"{found.protocol.name}: {found.title} ({found.protocol.episodes} episodes each, {found.protocol.split} split, "
         f"seed {found.protocol.seed}; 95 % intervals)"
@@ -121,12 +120,12 @@ def _table(found: ProtocolResult) -> Table:
         "Cost is the geometric mean of the ratios of the episodes' costs to those of the paper's algorithm, which "
         "stands below the environment, less one. "
         "A track is lost where an episode's mean cost is beyond the bound of the environment. ANEES is 1 if errors are "
-        "as large as the covariance says; ! marks one that is off by more than a factor of two. Of the scenarios that "
+        "as large as the covariance states; ! marks a factor above two or below a half. Of the scenarios that "
         "are held out from training the worst is named. ns is the processor time of a measurement on one core of this "
         "machine, of world and competitor."
     )
     if not found.complete:
-        table.caption += "\nNot all environments were entered: there is no number over all of them."
+        table.caption += "\nNot all environments were entered: there is no number over all."
     return table
 
 

@@ -1,4 +1,4 @@
-"""Commands on what is known already: one page of results, and a paper's experiments again."""
+"""Commands on existing results: one page of them, and a paper's experiments again."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,24 +10,24 @@ from ..evaluation.running.parallel import Workers
 from ..evaluation.storage.files import writable_file, writable_folder
 from ..reports.tables.results import read_all_results
 from ..reproductions import paper_module, papers
-from .shown import REPORT, make_report, print_headline, print_outcome, report_maker
-from .terminal import Cluster, Formats, Jobs, console, one_of, progress_bar
+from .result_output import REPORT, make_report, print_headline, print_outcome, report_maker
+from .terminal import Cluster, Formats, Jobs, complete_from, console, progress_bar
 
 
 def make(
     results: Annotated[
         list[Path],
-        typer.Argument(help="Files of results, or folders that hold one; several make one report."),
+        typer.Argument(help="Files of results, or folders that contain one; several make one report."),
     ],
     out: Annotated[Path, typer.Option(help="HTML file.")] = Path(REPORT),
 ) -> None:
     """Make one self-contained page of results, to open offline and to send: tables, figures, a track to look at.
 
-    What the files say is shown and never executed, so that one may open what somebody else has sent.
+    The page shows the content of the files and executes nothing, so that files from others are safe to open.
 
     Example: filtergym report results --out report.html
     """
-    report_maker()  # what it lacks is said before anything else
+    report_maker()  # reports missing packages before any work
     writable_file(out)
     found, settings = read_all_results(results)
     print_outcome(found)
@@ -42,7 +42,7 @@ def reproduce(
         str,
         typer.Argument(
             help=f"One of: {', '.join(papers()) or 'none, outside a clone'}.",
-            autocompletion=one_of(*papers()),
+            autocompletion=complete_from(*papers()),
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="Folder for report and figures.")] = None,

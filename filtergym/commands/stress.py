@@ -1,4 +1,4 @@
-"""Command that runs filters through everything that happens to measurements in the field."""
+"""The command that runs filters through the faults of measurements in the field."""
 
 from pathlib import Path
 from typing import Annotated
@@ -33,7 +33,7 @@ from .terminal import (
 NOTE = (
     "Errors are roots of mean squares over components, in units of the paper's algorithm's, and ratios geometric means "
     "over episodes. Degraded: errors more than 25 % larger than without, or more than twice overconfident. Failed: an "
-    "estimate that is none, or errors three times as large in a tenth of the episodes 50 measurements after it is over."
+    "invalid estimate, or errors three times as large in a tenth of the episodes 50 measurements after it is over."
 )
 
 
@@ -60,9 +60,9 @@ def stress(
     backend: Backend = "auto",
     trust: Trust = False,
 ) -> None:
-    """Crash test: run filters on measurements that are late, wrong, missing or repeated, and say what fails.
+    """Crash test: run filters on measurements that are late, wrong, missing or repeated, and report failures.
 
-    Each line says passed, degraded (how much, beside the paper's algorithm), or failed (how). Ends with exit code 1 if
+    Each line states passed, degraded (how much, beside the paper's algorithm), or failed (how). The exit code is 1 if
     anything failed.
 
     Example: filtergym stress filtergym/ManeuveringTarget-v0 kalman-imm --steps 0
@@ -71,7 +71,7 @@ def stress(
     keywords = parse_settings(settings, problem.task)
     for name in policy:
         if name.startswith("file:"):
-            raise ValueError(f"{name!r} has answered already, and a crash test asks: name a filter")
+            raise ValueError(f"{name!r} is a file of estimates, and a crash test runs filters: name a filter")
     for path in (json, html):
         if path is not None:
             writable_file(path)

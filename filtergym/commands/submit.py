@@ -1,4 +1,4 @@
-"""The commands that hand in a competitor with its results, and run again what somebody has handed in."""
+"""Commands that submit a competitor with its results, and verify the submissions of others."""
 
 from pathlib import Path
 from typing import Annotated
@@ -31,9 +31,9 @@ from .terminal import (
     Environment,
     Jobs,
     Trust,
+    complete_from,
     complete_policy,
     console,
-    one_of,
     print_table,
     progress_bar,
 )
@@ -49,16 +49,16 @@ def submit(
             autocompletion=complete_policy,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="File that is handed in, .json.")],
+    out: Annotated[Path, typer.Option(help="File of the submission, .json.")],
     protocol: Annotated[
         str,
         typer.Option(
             help="filtergym-1: its 2,000 episodes of the training distribution and 500 of every other scenario; trial: "
             "32 of the training distribution.",
-            autocompletion=one_of(FROZEN, TRIAL),
+            autocompletion=complete_from(FROZEN, TRIAL),
         ),
     ] = FROZEN,
-    title: Annotated[str | None, typer.Option(help="Of the competitor; default: the name.")] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the competitor; default: the name.")] = None,
     author: Annotated[str, typer.Option(help="Who hands it in.")] = "-",
     jobs: Jobs = 1,
 ) -> None:
@@ -108,15 +108,15 @@ def verify_file(
 ) -> None:
     """Run a submission again on its own and on fresh episodes, and decide whether its numbers hold.
 
-    On the same episodes costs repeat but for rounding, whatever the processor; on fresh ones their intervals have to
-    agree. Times are not compared. A submission that holds source code needs --trust.
+    On the same episodes costs repeat up to rounding on any processor; on fresh ones their intervals must agree. Times
+    are not compared. A submission that contains source code needs --trust.
 
     Example: filtergym verify bptt.json
     """
     if source is not None:
         held = read_submission(file)[0].competitor
         if not isinstance(held, Source):
-            raise ValueError(f"{file} holds no source code")
+            raise ValueError(f"{file} contains no source code")
         write_text(source, held.text)
         console.print(f"source code in {source}, its class {held.name}", soft_wrap=True)
         return
@@ -164,7 +164,9 @@ def verify_file(
 
 
 def _results_table(title: str, protocol: Protocol, columns: dict[str, tuple[Figure, ...]]) -> Table:
-    """Cost against the paper's algorithm and consistency in every scenario, from several runs side by side."""
+    """Return the cost against the paper's algorithm and the consistency in every scenario, of several runs side by
+    side.
+    """
     [own] = protocol.environments
     held_out = f" and {protocol.held_out_episodes:,} of every other scenario" if own.held_out else ""
     table = plain_table(
@@ -198,7 +200,7 @@ def _percent(figure: Figure | None) -> str:
 
 
 def _time_line(columns: dict[str, tuple[Figure, ...]]) -> str:
-    """Say how long a measurement takes in each run, of which each may be on another machine."""
+    """Return the times of a measurement in words; each run may be from another machine."""
     times = {
         name: f.value for name, figures in columns.items() for f in figures if f.metric == TIME and f.value
     }

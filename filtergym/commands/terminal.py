@@ -1,4 +1,4 @@
-"""What the commands share: the terminal, and the arguments that several of them take."""
+"""Terminal output, and the arguments that several commands share."""
 
 import ast
 import io
@@ -22,11 +22,11 @@ from .progress import progress_bar as progress_bar
 if TYPE_CHECKING:
     from ..envs.contract.task import Task
 
-# --- what a shell completes; imports wait until it asks
+# --- completion by a shell; imports wait until it is used
 
 
 def complete_environment(incomplete: str) -> list[str]:
-    """Environment ids; without ``filtergym/`` where that is how a word begins."""
+    """Return the environment ids; without ``filtergym/`` where that is how a word begins."""
     from ..envs.engine.catalogue import catalogue
 
     ids = list(catalogue())
@@ -35,7 +35,7 @@ def complete_environment(incomplete: str) -> list[str]:
 
 
 def import_environments(given: Any) -> Any:
-    """Import the modules of environments that the command line names as ``module:id``; returns what was given."""
+    """Import the modules of environments that the command line names as ``module:id``; return the ids unchanged."""
     from ..envs.engine.catalogue import import_task
 
     for word in [given] if isinstance(given, str) else given or ():
@@ -45,11 +45,11 @@ def import_environments(given: Any) -> Any:
 
 
 def _environments_of(ctx: typer.Context) -> list[str]:
-    """Ids of the environment that the words so far name, or of all if they name none."""
+    """Return the environment id of the words so far, or all ids if they contain none."""
     from ..envs.engine.catalogue import catalogue, task_class
 
     named = ctx.params.get("environment")
-    # An option that still lacks its value keeps click from telling the arguments: then the words as shells give them.
+    # Before an option has its value, click cannot parse the arguments: then the words as shells pass them.
     words = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
     for word in [named] if isinstance(named, str) else words.split():
         with suppress(ValueError):
@@ -58,7 +58,7 @@ def _environments_of(ctx: typer.Context) -> list[str]:
 
 
 def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Names of the environment's scenarios."""
+    """Return the names of the environment's scenarios."""
     from ..envs.engine.catalogue import catalogue
 
     names = dict.fromkeys(name for id in _environments_of(ctx) for name in catalogue()[id].scenarios)
@@ -66,7 +66,7 @@ def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Names of the environment's scenarios that agents may be trained on."""
+    """Return the names of the environment's scenarios that agents may be trained on."""
     from ..envs.engine.catalogue import catalogue
 
     scenarios = [own for id in _environments_of(ctx) for own in catalogue()[id].scenarios.values()]
@@ -75,7 +75,9 @@ def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]
 
 
 def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Names of the environment's policies, estimators, references and bounds, tuned ones, and shipped agents."""
+    """Return the names of the environment's policies, estimators, references and bounds, tuned ones, and shipped
+    agents.
+    """
     from ..baselines.problem import problem_of
     from ..names import shipped_names
 
@@ -84,8 +86,8 @@ def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
 
 
-def one_of(*words: str) -> Callable[[str], list[str]]:
-    """Return what completes one of a few words."""
+def complete_from(*words: str) -> Callable[[str], list[str]]:
+    """Return a function that completes one of a few words."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in words if word.startswith(incomplete)]
@@ -120,12 +122,13 @@ Experiment = Annotated[int, typer.Option(help="Number of the experiment.")]
 Trust = Annotated[
     bool,
     typer.Option(
-        "--trust", help="Load files and modules that can execute code: you made them, or know who did."
+        "--trust",
+        help="Load files and modules that can execute code; use it only if you trust their authors.",
     ),
 ]
-Control = Annotated[str | None, typer.Option(help="Demand this control.")]
+Control = Annotated[str | None, typer.Option(help="Control of all policies.")]
 TrainedControl = Annotated[
-    str | None, typer.Option(help="What the agent steers; default: the environment's first.")
+    str | None, typer.Option(help="Control of the agent; default: the environment's first.")
 ]
 Parameters = Annotated[
     list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
@@ -134,28 +137,26 @@ TruthOption = Annotated[
     Path | None,
     typer.Option(
         "--truth",
-        help="Of a recording in tables: the truth in a file of its own (CSV, .pos), matched by time; a note says how "
-        "much of it has one.",
+        help="File (CSV, .pos) with the truth of a recording in tables, matched by time; a note reports the share "
+        "of measurements with a truth.",
     ),
 ]
 RenameOption = Annotated[
     str | None,
     typer.Option(
         "--rename",
-        help="What columns of a table are, where they have other names: 't=time,pos=x'. One column may be several: "
+        help="Meaning of renamed columns of a table: 't=time,pos=x'. One column may be several: "
         "'accuracy=sigma_x,accuracy=sigma_y'; 'speed=-' ignores one.",
     ),
 ]
 SortOption = Annotated[bool, typer.Option("--sort", help="Sort the rows of a table by time.")]
-TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
-Speeds = Annotated[
-    str, typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest.")
-]
+TruthOffset = Annotated[float, typer.Option(help="Offset that is added to the times of --truth, s.")]
+Speeds = Annotated[str, typer.Option(help="Of recordings: lowest and highest possible speed, m/s.")]
 Backend = Annotated[
     str,
     typer.Option(
-        help="What computes the steps: auto, compiled (with filtergym[fast]) or numpy.",
-        autocompletion=one_of("auto", "compiled", "numpy"),
+        help="Implementation of the steps: auto, compiled (with filtergym[fast]) or numpy.",
+        autocompletion=complete_from("auto", "compiled", "numpy"),
     ),
 ]
 Threads = Annotated[int, typer.Option(help="Threads that share the episodes of the compiled backend.")]
@@ -171,15 +172,15 @@ Cluster = Annotated[
         metavar="ADDRESS",
         help="Share the work over a cluster (with filtergym[cluster]): ray or dask for a new one on "
         "this machine; ray://HOST:PORT, ray://auto, tcp://HOST:PORT or tls://HOST:PORT for one that runs.",
-        autocompletion=one_of("ray", "dask"),
+        autocompletion=complete_from("ray", "dask"),
     ),
 ]
 Formats = Annotated[
     list[str] | None,
     typer.Option(
         "--format",
-        help="Of figures: png, svg (text stays text) or pdf (fonts embedded); repeat for several.",
-        autocompletion=one_of("png", "svg", "pdf"),
+        help="Format of figures: png, svg (text stays text) or pdf (fonts embedded); repeat for several.",
+        autocompletion=complete_from("png", "svg", "pdf"),
     ),
 ]
 Columns = Annotated[
@@ -187,22 +188,24 @@ Columns = Annotated[
 ]
 Split = Annotated[
     str,
-    typer.Option(help="test, validation or train.", autocompletion=one_of("test", "validation", "train")),
+    typer.Option(
+        help="test, validation or train.", autocompletion=complete_from("test", "validation", "train")
+    ),
 ]
 
 
 PAGE_WIDTH = 100
-"""Columns of what is printed into a file, and of sentences in a wide terminal."""
+"""Columns of output into a file, and of sentences in a wide terminal."""
 
 
 class Output(Console):
-    """Standard output that never stops the work: where it takes no more, the rest is not printed."""
+    """Standard output whose failure does not stop the work: the rest is then not printed."""
 
     refusal: OSError | None = None
-    """Why it took no more; None also where the reader of a pipe has left, who wanted no more."""
+    """Error that ended the output; None also where the reader of a pipe has closed it."""
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print, unless standard output takes no more."""
+        """Print, unless standard output has failed."""
         try:
             super().print(*objects, **options)
         except OSError as error:
@@ -210,20 +213,20 @@ class Output(Console):
             self._end()
 
     def on_broken_pipe(self) -> None:
-        """Go on without a reader."""
+        """Continue without a reader."""
         self._end()
 
     def _end(self) -> None:
         self.quiet = True
-        # What is still buffered would be refused again when Python ends.
+        # Buffered text would fail again when Python ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def output_width() -> int | None:
-    """Width of what is printed, in characters; None: that of the terminal, or what COLUMNS says."""
-    said = os.environ.get("COLUMNS", "")
+    """Return the width of the output, in characters; None: that of the terminal, or of the variable COLUMNS."""
+    columns = os.environ.get("COLUMNS", "")
     terminal = sys.stdout is not None and sys.stdout.isatty()
-    return None if terminal or (said.isdigit() and int(said) > 0) else PAGE_WIDTH
+    return None if terminal or (columns.isdigit() and int(columns) > 0) else PAGE_WIDTH
 
 
 # No markup: names and paths are printed as they are.
@@ -231,20 +234,20 @@ console: Output = Output(width=output_width(), markup=False, emoji=False)
 
 
 def fill(sentence: str, width: int) -> str:
-    """Break a sentence into lines, no number from its unit and no interval apart."""
+    """Break a sentence into lines, with each number beside its unit and each interval whole."""
     kept = re.sub(r"\[[^\]]*\]| %| ns\b", lambda found: found[0].replace(" ", "\xa0"), sentence)
     return textwrap.fill(kept, width, break_on_hyphens=False).replace("\xa0", " ")
 
 
 def print_sentence(sentence: str, width: int = PAGE_WIDTH, bold: int = 0) -> None:
-    """Print a sentence in lines of at most so many columns, no number apart from its unit, its first letters bold."""
+    """Print a sentence in lines of at most so many columns, each number beside its unit, its first letters bold."""
     text = Text(fill(sentence, min(console.width, width)))
     text.stylize("bold", 0, bold)
     console.print(text, soft_wrap=True)
 
 
 def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
-    """Print a table, its title above and its notes below as sentences, however narrow it is."""
+    """Print a table of any width, its title above and its notes below as sentences."""
     title, notes = table.title, table.caption
     table.title = table.caption = None
     if title:
@@ -259,13 +262,13 @@ def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
 
 
 def open_output() -> None:
-    """Let a standard output of few characters, such as ASCII, escape what it has none for."""
+    """Escape characters that the encoding of standard output lacks, such as ASCII."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def close_output(*_: Any, **__: Any) -> None:
-    """Say at the end of a command what became of its standard output.
+    """Report at the end of a command that its standard output failed.
 
     Raises:
         ValueError: if it could not be written.
@@ -283,8 +286,8 @@ def check_no_recording_options(truth: Any, rename: str | None, sort: bool) -> No
             raise ValueError(f"{option} is for a recording: --recording FILE {option} ...")
 
 
-def renamed(text: str | None) -> dict[str, list[str]]:
-    """What columns of a file are by their names there, of an option such as ``t=time,pos=x``.
+def parse_renames(text: str | None) -> dict[str, list[str]]:
+    """Return the columns of a file by their names in it, from an option such as ``t=time,pos=x``.
 
     Raises:
         ValueError: for what is none.
@@ -301,8 +304,8 @@ def renamed(text: str | None) -> dict[str, list[str]]:
     return names
 
 
-def pair(option: str, text: str) -> tuple[float, float]:
-    """Turn ``48.72,2.38`` into two numbers."""
+def parse_pair(option: str, text: str) -> tuple[float, float]:
+    """Parse two numbers such as ``48.72,2.38``."""
     try:
         first, second = map(float, text.split(","))
     except ValueError:
@@ -310,8 +313,8 @@ def pair(option: str, text: str) -> tuple[float, float]:
     return first, second
 
 
-def whole_numbers(option: str, text: str) -> list[int]:
-    """Turn ``0-2,7`` into 0, 1, 2 and 7, each once."""
+def parse_whole_numbers(option: str, text: str) -> list[int]:
+    """Parse whole numbers such as ``0-2,7`` into 0, 1, 2 and 7, each once."""
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
@@ -326,16 +329,16 @@ def whole_numbers(option: str, text: str) -> list[int]:
 
 
 def command_line() -> str:
-    """Return the command that runs, as one would type it again."""
+    """Return the running command as a user would type it."""
     return shlex.join(["filtergym", *sys.argv[1:]])
 
 
 def parse_settings(settings: list[str] | None, task: type["Task"] | None = None) -> dict[str, Any]:
-    """Turn ``name=value`` into keywords; a value is a Python literal, or else a word.
+    """Parse ``name=value`` into keywords; a value is a Python literal, or else a word.
 
     Args:
-        settings: as they were typed; None: none.
-        task: whose parameters they must be; None: anything.
+        settings: words of the command line; None: none.
+        task: task whose parameters are allowed; None: any name.
     """
     keywords: dict[str, Any] = {}
     for setting in settings or []:

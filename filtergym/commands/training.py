@@ -1,4 +1,4 @@
-"""The steps of ``filtergym train``: open the runs, train them, say how their best agents stand."""
+"""The steps of ``filtergym train``: open the runs, train them, and report the standing of their best agents."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,21 +15,21 @@ from ..reports.tables import standing
 from .terminal import console, print_table, progress_bar
 
 Trainer = Callable[[TrainingRun, Session], TrainingRun]
-"""What trains a run."""
+"""Function that trains a run."""
 
 
 class Training(NamedTuple):
-    """A run, and how it is trained."""
+    """A run and its session."""
 
     folder: Path
-    """Of the run, as the user names it."""
+    """Folder of the run, as the user names it."""
     run: TrainingRun
     session: Session
-    """In the same folder, with its absolute path."""
+    """Session in the same folder, with its absolute path."""
 
 
 def trainer_of(algo: str) -> Trainer:
-    """Return what trains with an algorithm: a run and a session in, the run out.
+    """Return the function that trains with an algorithm: from a run and a session to the trained run.
 
     Raises:
         ValueError: if it needs packages that are not installed.
@@ -50,12 +50,12 @@ def trainer_of(algo: str) -> Trainer:
 
 
 def open_run(problem: Problem, options: RunOptions, session: Session) -> Training:
-    """Begin a run in the folder of a session, or go on with the one that is there.
+    """Begin a run in the folder of a session, or continue the one that is there.
 
     Args:
-        problem: that is trained on.
-        options: what is asked of the run.
-        session: how it is trained.
+        problem: training problem.
+        options: options of the run.
+        session: settings of the training.
 
     Raises:
         ValueError: as of :func:`.training_run.new_run` and :func:`.training_run.open_run`.
@@ -68,13 +68,13 @@ def open_run(problem: Problem, options: RunOptions, session: Session) -> Trainin
 def open_runs(
     problem: Problem, options: RunOptions, session: Session, seeds: Sequence[int]
 ) -> list[Training]:
-    """Begin a run for each seed, or go on with it where there is one, in folders that end with a dash and the seed.
+    """Begin or continue a run for each seed, in folders that end with a dash and the seed.
 
     Args:
-        problem: that is trained on.
-        options: what is asked of every run, but for the seed.
-        session: how they are trained; the folders begin with its folder.
-        seeds: of the runs.
+        problem: training problem.
+        options: options of every run, except the seed.
+        session: settings of the training; its folder is the beginning of the runs' folders.
+        seeds: seeds of the runs.
 
     Raises:
         ValueError: as of :func:`open_run`, and for a checkpoint that can execute code and is not trusted.
@@ -87,7 +87,7 @@ def open_runs(
         run = training_run.open_run(folder, asked, begun)
         if begun and not run.is_complete and options.algorithm not in THROUGH_THE_FILTER:
             training_run.check_trust(
-                f"{folder} goes on from a checkpoint that is loaded with pickle", session.trust
+                f"{folder} continues from a checkpoint that is loaded with pickle", session.trust
             )
         found.append(_training(run, replace(session, folder=folder, resume=begun)))
     return found
@@ -99,12 +99,12 @@ def _training(run: TrainingRun, session: Session) -> Training:
 
 
 def train_runs(opened: Sequence[Training], trainer: Trainer, workers: Workers) -> list[TrainingRun]:
-    """Train what is not finished, and return all runs as they are then.
+    """Train the unfinished runs, and return the final state of all runs.
 
     Args:
         opened: runs of one algorithm.
         trainer: of the algorithm.
-        workers: who share the runs.
+        workers: processes that share the runs.
     """
     waiting = []
     for training in opened:
@@ -120,7 +120,7 @@ def train_runs(opened: Sequence[Training], trainer: Trainer, workers: Workers) -
 
 
 def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
-    """Train in this process, up to a wish to stop; the runs say what has become of them."""
+    """Train in this process until a request to stop; each run stores its own state."""
     for training in waiting:
         _train_here(training, trainer)
         if not training.run.is_complete:
@@ -128,7 +128,6 @@ def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
 
 
 def _train_here(training: Training, trainer: Trainer) -> None:
-    """Train a run with its progress and reports on the console."""
     folder, run, session = training
     console.print(f"{folder}: seed {run.seed}")
     with progress_bar() as bar:
@@ -143,7 +142,7 @@ def _train_here(training: Training, trainer: Trainer) -> None:
 
 
 def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[Path, TrainingRun]:
-    """Train in other processes; what each has to say is printed when it has ended."""
+    """Train in other processes; the reports of each are printed when it has ended."""
     found = {}
     sizes = [training.run.steps for training in waiting]
     with progress_bar() as bar:
@@ -163,7 +162,7 @@ def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[P
 
 
 def _train(training: Training, tick: Any) -> list[str]:
-    """Train in a process of its own; returns what there is to say."""
+    """Train in a separate process; return its reports."""
     lines: list[str] = []
     _, run, session = training
     trainer_of(run.algorithm)(run, replace(session, report=lines.append))
@@ -175,7 +174,7 @@ def _print_done(folder: Path, run: TrainingRun) -> None:
 
 
 def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> None:
-    """Print how the best agents of runs that differ in their seed stand against who was not trained.
+    """Print how the best agents of runs that differ in their seed compare with untrained competitors.
 
     Args:
         opened: of :func:`open_run`.
@@ -184,7 +183,7 @@ def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> N
     agents = [best_agent(training.folder) for training in opened]
     trust = opened[0].session.trust
     if any(agent.suffix != ".safetensors" for agent in agents) and not trust:
-        console.print("an agent that plain arrays cannot hold is compared with --trust only")
+        console.print("an agent that is not stored as plain arrays is compared with --trust only")
         return
     names = [str(training.folder) for training in opened]
     found = standing.measure_standing(runs[0], dict(zip(names, agents, strict=True)), trust)

@@ -1,1 +1,1 @@
-"""Filters written out for other programs: what runs without this package."""
+"""Filters exported as programs that run without this package."""

@@ -1,7 +1,7 @@
-"""A filter as a header and a source of C99: its structs, its two functions, and what it costs.
+"""A filter as a header and a source of C99: its structs, its two functions, and its cost.
 
-No allocation, and nothing but ``math.h``; parameters and weights are constants. Whatever a stranger's file calls its
-parts gets into the text as identifiers and comments only, see :mod:`..compiler.c_source`.
+No allocation, and no library but ``math.h``; parameters and weights are constants. Names in a file from others enter
+the text as identifiers and comments only, see :mod:`..compiler.c_source`.
 """
 
 import re
@@ -25,15 +25,15 @@ from .traced_filter import (
     SHOWN,
     STATE,
     TracedFilter,
-    count_answers,
+    action_size,
 )
 
 TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
-"""Names that a filter's files must not have: those of the others."""
+"""File names that a filter must not have, since other files have them."""
 
 
 def file_stem(name: str) -> str:
-    """Return what the files and functions of a filter are called."""
+    """Return the common name of the files and functions of a filter."""
     return identifier(name, TAKEN)
 
 
@@ -41,10 +41,10 @@ class FilterText:
     """A filter as text.
 
     Args:
-        name: of the competitor.
+        name: name of the competitor.
         traced: its programs.
-        scalar: kind of numbers.
-        components: what is estimated, name and unit.
+        scalar: type of the numbers.
+        components: name and unit of the estimated components.
 
     Attributes:
         about: paragraphs for the comment of the header.
@@ -68,7 +68,7 @@ class FilterText:
         self.update, self.update_source = self._update()
 
     def _parameters(self, *parts: str) -> list[Parameter]:
-        """Parameters that point to structs; ``const`` is what is only read."""
+        """Return the parameters that point to structs; read-only ones are ``const``."""
         return [
             Parameter(
                 f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *",
@@ -78,7 +78,7 @@ class FilterText:
         ]
 
     def _rows(self, part: str, name: str = "", qualifier: str = "const ") -> Rows:
-        """Numbers of a struct one after the other: it has no members of another kind."""
+        """Return the numbers of a struct one after the other; it has no members of another kind."""
         pointer = f"(({qualifier}{self.scalar.name} *){name or part})"
         return Rows(pointer, self.structs[part].numbers)
 
@@ -120,7 +120,7 @@ class FilterText:
     def _update(self) -> tuple[str, Any]:
         traced, real, own = self.traced, self.scalar.name, self.name
         state, places = self.structs["state"], self.structs["state"].places
-        given, told = self.structs["measurement"].places, self.structs["estimate"].places
+        given, reported = self.structs["measurement"].places, self.structs["estimate"].places
         inner = [Parameter(f"const {state.name} *", "state"), *self._parameters("measurement")]
         inner += [Parameter(f"{state.name} *", "next"), *self._parameters("estimate")]
         between = []
@@ -139,12 +139,12 @@ class FilterText:
         def write(argument: int, row: int) -> str:
             if argument == SHOWN:
                 return f"shown[{row}]"
-            return f"next->{places[row]}" if argument == STATE else f"estimate->{told[row]}"
+            return f"next->{places[row]}" if argument == STATE else f"estimate->{reported[row]}"
 
         read_rows = {STATE: self._rows("state"), MEASUREMENT: self._rows("measurement")}
         written = {STATE: self._rows("state", "next", ""), ESTIMATE: self._rows("estimate", qualifier="")}
         if traced.network is not None:
-            read_rows[ANSWER] = Rows("answer", range(count_answers(traced.network)))
+            read_rows[ANSWER] = Rows("answer", range(action_size(traced.network)))
             written[SHOWN] = Rows("shown", range(traced.shown))
         arrays = Arrays(read_rows, written)
         source = write_program(
@@ -160,7 +160,7 @@ class FilterText:
         )
         body = list(source.body)
         if self.has_state:
-            # What is written is not what is read.
+            # The written struct differs from the read one.
             start = " = *state" if self.memory or traced.free.kept else ""
             body = [
                 f"{state.name} after{start};",
@@ -176,7 +176,7 @@ class FilterText:
             body.append(self._taken())
         if traced.network is not None:
             zero = literal(0.0, self.scalar)
-            answers = f"{real} answer[{count_answers(traced.network)}] = {{{zero}}};"
+            answers = f"{real} answer[{action_size(traced.network)}] = {{{zero}}};"
             body = [f"{real} shown[{traced.shown}];", answers, *body]
         interval = next((place for place in given.values() if place == "interval"), None)
         if interval is not None:
@@ -191,7 +191,7 @@ class FilterText:
         return f"{source.functions}\n{function_text('int', f'{own}_update', parameters, body)}", source
 
     def _guard(self) -> list[str]:
-        """Statements that leave the state alone where the estimate is no finite number."""
+        """Return the statements that leave the state unchanged where the estimate is not finite."""
         zero = literal(0.0, self.scalar)
         C = len(self.components)
         mean, covariance = ("", "") if C == 1 else ("[i]", "[i][j]")
@@ -211,7 +211,7 @@ class FilterText:
         ]
 
     def _taken(self) -> str:
-        """Statement that returns whether there was a measurement."""
+        """Return the statement that returns whether there was a measurement."""
         own, zero = self.name.upper(), literal(0.0, self.scalar)
         there = [
             p for p in self.structs["measurement"].places.values() if re.fullmatch(r"available(\[\d+\])*", p)
@@ -228,28 +228,28 @@ class FilterText:
         network = self.traced.network
         weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
         after = (len(self.traced.state) + self.memory) * size
-        asked = 0 if network is None else scratch_size(network) + count_answers(network)
+        asked = 0 if network is None else scratch_size(network) + action_size(network)
         scratch = (self.update_source.scratch + self.traced.shown + asked) * size + after
         return self.update_source.operations, after, weights, scratch
 
     @property
     def network_operations(self) -> int:
-        """Operations of a network, where it is asked."""
+        """Operations of a network, where it is evaluated."""
         return 0 if self.traced.network is None else network_operations(self.traced.network)
 
     @property
     def replaced(self) -> tuple[float, ...]:
-        """Constants that the kind of number does not have."""
+        """Constants that the type of the numbers cannot represent."""
         return tuple(sorted({*self.start_source.replaced, *self.update_source.replaced}))
 
     # --- files
 
     def header(self, notes: Sequence[str] = ()) -> str:
-        """Text of the header."""
+        """Return the text of the header."""
         own, scalar, structs = self.name, self.scalar, self.structs
         guard = f"{own.upper()}_H"
         listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
-        remembered = f"{self.scalar.name} network[{self.memory}]; /* what the network remembers */"
+        remembered = f"{self.scalar.name} network[{self.memory}]; /* memory of the network */"
         memory = [remembered] if self.memory else []
         timed = "interval" in structs["measurement"].places.values()
         predicts = (
@@ -267,8 +267,8 @@ class FilterText:
             ),
             "update": (
                 f"Takes in a measurement: {predicts}, and updates. The members of the measurement state what was "
-                "received, as in the environment. Returns what became of it; the state stays as it was where a "
-                "measurement is rejected or refused, and the estimate is then of no use.",
+                "received, as in the environment. Returns the result; the state stays as it was where a "
+                "measurement is rejected or refused, and the estimate is then invalid.",
                 ("state", "measurement", "estimate"),
             ),
         }
@@ -279,21 +279,21 @@ class FilterText:
             struct_text(structs["initial"], scalar, "The estimate at the start of a track."),
             struct_text(structs["parameters"], scalar, parameter_words(self.traced.free)),
             *([f"extern const {own}_parameters {own}_defaults;\n"] if self.traced.free.declared else []),
-            struct_text(structs["measurement"], scalar, "What the sensors say at one time."),
-            struct_text(structs["estimate"], scalar, f"What is estimated of it. Components: {listed}."),
+            struct_text(structs["measurement"], scalar, "Measurement of the sensors at one time."),
+            struct_text(structs["estimate"], scalar, f"Estimate. Components: {listed}."),
             struct_text(
                 structs["state"],
                 scalar,
-                "What is kept from one measurement to the next, one struct for each track; members are named by what "
-                "leads to them in the filter. Copy it to save it.",
+                "State between two measurements, one struct for each track; members are named by the attributes that "
+                "lead to them in the filter. Copy it to save it.",
                 memory,
             ),
         ]
         statuses = ("TAKEN", "MISSED", "REJECTED", "REFUSED")
         text.append(
             comment(
-                "What became of a measurement: taken in; missed, nothing was received; rejected, the estimate would be "
-                f"no number; refused, {refused}."
+                "Result of a measurement: taken in; missed, nothing was received; rejected, the estimate would not be "
+                f"finite; refused, {refused}."
             )
             + "\nenum { "
             + ", ".join(f"{own.upper()}_{name} = {i}" for i, name in enumerate(statuses))
@@ -306,12 +306,12 @@ class FilterText:
         return "\n".join(text)
 
     def source(self) -> str:
-        """Text of the source."""
+        """Return the text of the source."""
         parts = [
             comment(
-                "See the header. A loop goes over the members of array operations, k is the member; where they lie is "
-                "said by tables, whose names end in at and a number. The array w holds what one loop leaves to another."
-                " A comment names the functions whose operations the loops below it have."
+                "See the header. A loop goes over the members of array operations, k is the member; tables, whose "
+                "names end in at and a number, contain their places. The array w passes values from loop to loop. A "
+                "comment names the functions whose operations the loops below it have."
             ),
             f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
             helper_functions([self.traced.start, self.traced.update], self.scalar),

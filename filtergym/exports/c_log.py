@@ -1,4 +1,6 @@
-"""The program that reads a user's log: what it reads and how is taken from where the reader itself declares it."""
+"""Text of the program that reads a user's log; its formats and limits are taken from the declarations of the Python
+reader.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -54,7 +56,7 @@ PLOT_VALUES = {
     "odometry_displacement_1": "row->odometry ? row->moved[1] / scans : 0.0",
     "odometry_available": "row->odometry ? 1.0 : 0.0",
 }
-"""What the numbers of a measurement are of a plot."""
+"""Expressions of a measurement's numbers from a plot."""
 LOOK_VALUES = {
     "scan": "(double)i",
     "radar_0": "cell[0]",
@@ -63,19 +65,19 @@ LOOK_VALUES = {
     "decision": "found[2]",
     "bearing_difference": "found[3]",
 }
-"""What they are of a row of radar and ESM."""
+"""Expressions of a measurement's numbers from a row of radar and ESM."""
 
 
 class LogText(FilterText):
-    """A filter as text, and how it is fed from the rows of a table.
+    """A filter as text, and its input from the rows of a table.
 
     Args:
-        name: as of :class:`.FilterText`, also the next three.
+        name: name of the competitor.
         traced: its programs.
-        scalar: kind of numbers.
-        components: what is estimated.
-        log_format: of the environment; None where it reads no logs.
-        columns: names in the log of the columns that have others there.
+        scalar: type of the numbers.
+        components: name and unit of the estimated components.
+        log_format: log format of the environment; None where it reads no logs.
+        columns: names in the log of renamed columns.
     """
 
     def __init__(
@@ -93,31 +95,31 @@ class LogText(FilterText):
         self.log_columns: Mapping[str, str] = columns or {}
 
     def columns(self, part: str) -> list[str]:
-        """Names of the columns of a table, in the order of the rows of an argument."""
+        """Return the names of the columns of a table, in the order of the rows of an argument."""
         names = self.structs[part].columns
         begin = "initial_" if part == "initial" else ""
         return [f"{begin}{names[row]}" for row in sorted(names)]
 
     @property
     def initial_estimate(self) -> list[float]:
-        """Of all tracks of plain rows, in the order of the rows of its struct."""
+        """Initial estimate of all tracks of plain rows, in the order of the rows of its struct."""
         rows = self.plain_rows
         return [] if rows is None else [*rows.mean.tolist(), *rows.covariance.ravel().tolist()]
 
     def source_of(self, name: str) -> tuple[str, int]:
-        """What a number of a measurement follows from in a plain row: its kind and its place among those."""
+        """Source of a measurement's number in a plain row: its kind and its place among those of that kind."""
         kind, _, place = name.rpartition("_") if name[-1].isdigit() else (name, "", "0")
         kinds = {"values": "received", "available": "there", "inputs": "held", "interval": "interval"}
         return (kinds[kind], int(place)) if kind in kinds else ("other", 0)
 
     def fill(self, received: str, held: str, interval: str, others: Sequence[str] = ()) -> str:
-        """Statements that make a measurement ``given`` of a plain row.
+        """Return the statements that fill a measurement ``given`` from a plain row.
 
         Args:
-            received: expression of the first number that is received; the others follow it.
-            held: likewise of the inputs.
+            received: expression of the first received number; the others follow it.
+            held: expression of the first input; the others follow it.
             interval: expression of the interval.
-            others: expressions of all else, in its order; default: zero.
+            others: expressions of all other numbers, in their order; default: zero.
         """
         lines, rest = [], iter(others)
         for row, name in enumerate(self.columns("measurement")):
@@ -135,8 +137,8 @@ class LogText(FilterText):
     # --- the program
 
     def log_program(self, request: "ExportRequest") -> str:
-        """Text of a program that reads a log of the user; empty where its rows are no plain rows, and no filter was
-        advised for a table.
+        """Return the text of a program that reads a user's log; empty where its rows are no plain rows, and no filter
+        was advised for a table.
         """
         if self.plain_rows is not None:
             return self._plain_log(self.plain_rows, request.keywords.get("sampling_interval"))
@@ -158,15 +160,6 @@ class LogText(FilterText):
         needed: int,
         limits: Mapping[str, float],
     ) -> str:
-        """Text of the program.
-
-        Args:
-            about: how a track starts, for the comment.
-            follow: text of the function of that name.
-            names: of the columns, in lower case.
-            needed: of them, the first ones.
-            limits: further numbers of the reading.
-        """
         shown = [identifier(name) for name, _ in self.components]
         header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
         defined = {**READING, **limits}
@@ -192,7 +185,7 @@ class LogText(FilterText):
         return f"{text}{READER}\n{follow}"
 
     def _plain_log(self, rows: PlainRows, interval: float | None) -> str:
-        """Text of the program for rows that are measurements as they stand.
+        """Return the text of the program for rows that are measurements as they stand.
 
         Args:
             rows: how they are.
@@ -213,7 +206,9 @@ class LogText(FilterText):
         return self._log(about, follow, names, len(names), limits)
 
     def _plot_log(self, rows: PlotRows, log: LogSetup) -> str:
-        """Text of the program for plots, as they were read when a filter was advised; empty for other logs."""
+        """Return the text of the program for plots, as they were read when a filter was advised; empty for
+        other logs.
+        """
         names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
         measured = {*self.structs["measurement"].columns.values()}
         second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), None)
@@ -224,7 +219,7 @@ class LogText(FilterText):
             ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
         )
         first = [*names[:2], *deviations, *names[2:], *(second or ())]
-        # What else the log has says which rows supply each other.
+        # The other columns of the log decide which rows supply each other.
         others = [name for name in log.columns if name not in (*first, "time", RECORDING)]
         columns = [log.columns.get(name, name).lower() for name in (*first, *others)]
         usual = [log.deviations[name] for name in deviations]
@@ -256,7 +251,8 @@ class LogText(FilterText):
         return self._log(about, follow, columns, 2, limits)
 
     def _regular_log(self, numbers: Mapping[str, float], log: LogSetup) -> str:
-        """Text of the program for rows at one rate, as they were read when a filter was advised; empty for other logs.
+        """Return the text of the program for rows at one rate, as they were read when a filter was advised; empty for
+        other logs.
 
         Args:
             numbers: that the reading needs.
@@ -282,12 +278,12 @@ class LogText(FilterText):
         return self._log(about, follow, columns, rows.needed, {"UNEVEN": UNEVEN, **rows.limits})
 
     def _assign(self, part: str, values: Mapping[str, str], indent: str) -> str:
-        """Statements that give every number of a struct its value, zero where none is named."""
+        """Return the statements that set every number of a struct; unnamed ones become zero."""
         columns = sorted(self.structs[part].columns.items())
         return f"\n{indent}".join(f"given[{row}] = {values.get(name, '0.0')};" for row, name in columns)
 
     def _plot_start(self) -> str:
-        """Statements that make the ``initial`` estimate of two plots, as the reader does."""
+        """Return the statements that compute the ``initial`` estimate from two plots, as the reader does."""
         values = {"mean_0": "p[0]", "mean_1": "p[1]"}
         values |= {f"mean_{i + 2}": f"(p[{i}] - p0[{i}]) / lasted" for i in range(2)}
         for i in range(2):
@@ -298,29 +294,31 @@ class LogText(FilterText):
 
 
 class RegularReading(NamedTuple):
-    """How rows at one rate are read."""
+    """Reading of rows at one rate."""
 
     names: list[str]
-    """Of the columns."""
+    """Names of the columns."""
     needed: int
-    """Of them, the first ones."""
+    """Number of required columns, which are the first ones."""
     reading: str
     """Text of the function ``read_values``."""
     values: Mapping[str, str]
-    """What the numbers of a measurement are."""
+    """Expressions of the numbers of a measurement."""
     start: Mapping[str, str]
-    """What those of the initial estimate are in the first row; zero where none is named."""
+    """Expressions of the numbers of the initial estimate in the first row; zero where none is named."""
     limits: Mapping[str, float]
-    """Numbers of the reading; ``WHOLE`` of the first columns have no empty cell."""
+    """Numbers of the reading; the first ``WHOLE`` columns have no empty cell."""
 
 
 def _with_others(first: list[str], columns: Mapping[str, str]) -> list[str]:
-    """Names of columns, and of all others of a log: these say which rows supply each other."""
+    """Return the names of columns, and of all others of a log, since these decide which rows supply each other."""
     return [*first, *(name for name in columns if name not in (*first, "time", RECORDING))]
 
 
 def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading:
-    """Read positions by an INS and by a receiver, whose deviation is the ``usual`` one where no column states it, m."""
+    """Return the reading of positions by an INS and by a receiver, whose deviation, m, is the ``usual`` one without a
+    column of it.
+    """
     ends = [""] if "ins" in columns else sorted(name[3:] for name in columns if name.startswith("ins_"))
     A, stated = len(ends), int("sigma" in columns)
     first = [*(f"ins{end}" for end in ends), *["sigma"] * stated, *(f"fix{end}" for end in ends)]
@@ -342,7 +340,7 @@ def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading
 
 
 def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -> RegularReading:
-    """Read what radar and ESM report, by the ``numbers`` that the format names."""
+    """Return the reading of radar and ESM reports, by the ``numbers`` that the format names."""
     first = ["range", "range_rate", *(name for name in columns if name == "looked")]
     names = _with_others(first, columns)
     optional = ("looked", "decision", "bearing_difference", "radar_bearing", "esm_bearing")
@@ -357,12 +355,12 @@ def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -
 
 
 def _number(value: float) -> str:
-    """A literal of C, of a whole number without a point."""
+    """Return a literal of C, of a whole number without a point."""
     return str(value) if isinstance(value, int) else literal(value)
 
 
 def _quote(text: str) -> str:
-    """A literal of C of any words: what is no letter, digit or plain sign is written in octal."""
+    """Return a literal of C of any text, with characters other than letters, digits and plain signs in octal."""
     return (
         '"'
         + "".join(
@@ -374,7 +372,7 @@ def _quote(text: str) -> str:
 
 
 def name_list(text: str) -> str:
-    """Return a literal of C of words that are identifiers already, with commas between them."""
+    """Return a literal of C of identifiers, with commas between them."""
     assert re.fullmatch(r"[A-Za-z0-9_,]*", text)
     pieces = [text[i : i + 80] for i in range(0, len(text), 80)] or [""]
     return "\n    ".join(f'"{piece}"' for piece in pieces)

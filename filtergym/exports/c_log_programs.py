@@ -1,7 +1,7 @@
-"""Programs of C that read a log as filtergym reads it, with fields for what differs from filter to filter.
+"""Programs of C that read a log as filtergym reads it, with fields for the parts that differ from filter to filter.
 
 A program is :data:`LOG`, :data:`READER` and a function ``follow``. The reader takes the whole file into rows, sorts
-them into tracks, leaves out what comes twice, and calls ``follow`` for each track, which is :data:`PLOTS`,
+them into tracks, leaves out duplicates, and calls ``follow`` for each track, which is :data:`PLOTS`,
 :data:`PLAIN_ROWS` or :data:`REGULAR_ROWS`. Their numbers and names are from :mod:`.c_log`.
 """
 
@@ -25,14 +25,14 @@ LOG = """/* Reads a log (CSV, a file or standard input) as `filtergym evaluate -
 
 {reading}
 #define COLUMNS {count}
-#define NEEDED {needed} /* The first ones; others may lack. */
+#define NEEDED {needed} /* The first ones; others may be missing. */
 
 /* Names of the columns, in lower case: of the times, of which the first counts, and of numbers. */
 static const char *const times[] = {{{times}}};
 static const char *const names[COLUMNS] = {{{names}}};
 static const char recordings[] = {recording};
 static const char delimiters[] = {delimiters};
-static const double units[] = {{{units}}}; /* Of a second, in which numbers since 1970 may count. */
+static const double units[] = {{{units}}}; /* Possible units of numbers since 1970, s. */
 
 /* --- The filter. */
 
@@ -61,9 +61,9 @@ ODOMETRY = {
             row->moved[1] = half * (c * cos(d * DEGREE) + a * cos(b * DEGREE));
         }""",
 }
-"""How a displacement is made of the columns a and b of a second sensor, the first pair that a log has."""
+"""Displacement from the columns a and b of a second sensor, the first pair that a log has."""
 READ_ODOMETRY = """
-/* Makes displacements of the rows of a track, of which those that lack a number have none. */
+/* Computes displacements of the rows of a track; rows without a number have none. */
 static int read_odometry(long n) {{
     long i;
     int k;
@@ -93,7 +93,7 @@ POSITIONS: dict[tuple[str, ...], str] = {
         row->p[0] = row->m[0] = a * sin(b * DEGREE);
         row->p[1] = row->m[1] = a * cos(b * DEGREE);""",
 }
-"""How a position is made of the columns a and b of a log, the first pair that it has; a third one may lack."""
+"""Position from the columns a and b of a log, the first pair that it has; a third one may be missing."""
 PROJECT = """
 /* Latitude and longitude, degrees, around which positions are metres; the altitude of a row that has none, m. */
 static double origin[3];
@@ -143,7 +143,7 @@ PLOTS = """#define INTERVAL {interval} /* s */
 static const double usual[2] = {{{first}, {second}}}; /* deviations of a log that states none */
 static double p0[2], v0[2], last, last_plot, scan;
 {project}
-/* Empties positions that are those of the row before, where noise would hardly ever give both numbers again. */
+/* Empties repeated positions, where noise would hardly ever repeat both numbers. */
 static void leave_out_stale(long n) {{
     const double *before = NULL;
     double gap;
@@ -206,7 +206,7 @@ static int read_plots(long n) {{
     return plots < 3 ? fail("a track starts from two plots and goes on: there are no three", "of them", own[0]) : 0;
 }}
 
-/* Takes in a scan: the last one of several until a row, or one before that misses the target. */
+/* Updates with a scan: the last one of several until a row, or an earlier one that misses the target. */
 static int step(double at, const Row *row, double scans, int is_last, Estimate *estimate) {{
     static const double none[2] = {{0.0, 0.0}}, nominal[2] = {{{nominal}, {nominal}}};
     const double interval = at - last, elapsed = at - last_plot, available = is_last && row->plot ? 1.0 : 0.0;
@@ -380,10 +380,10 @@ static int read_values(const Row *row, long i, double *found) {{
         if (row->cell[k] != row->cell[k]) found[0] = 0.0;
     return 0;
 }}"""
-"""Reads rows with positions by an INS and by a receiver; the last columns that are needed are the latter's."""
+"""Reads rows with positions by an INS and by a receiver; the last required columns are the receiver's."""
 CHECK_SIGMA = """
     if (!(row->cell[{sigma}] > 0.0)) return fail("above zero must be the standard deviation", names[{sigma}], row);"""
-"""Checks what the receiver states of its fix."""
+"""Checks the standard deviation that the receiver states."""
 READ_LOOKS = """#define FOUND 4
 
 /* Finds whether the ESM listened, what it decided for, and the difference of the bearings in degrees. */
@@ -401,4 +401,4 @@ static int read_values(const Row *row, long i, double *found) {{
     found[3] = decided ? apart - 360.0 * floor((apart + 180.0) / 360.0) : 0.0;
     return 0;
 }}"""
-"""Reads rows of a radar with what an ESM reports."""
+"""Reads rows of a radar with the reports of an ESM."""

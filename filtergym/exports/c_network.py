@@ -1,4 +1,4 @@
-"""A learned policy's network as C: loops over constant arrays of float, in which it was trained, summed as all else."""
+"""A learned policy's network as C: loops over constant arrays of float, the type of its training."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +35,7 @@ for (i = 0; i < {units}; ++i) {{
     memory[i] = ({one} - update) * candidate + update * memory[i];
     x[i] = memory[i];
 }}"""
-_LSTM = """/* Long short-term memory: admit, keep, new, show; what it shows, then its cells. */
+_LSTM = """/* Long short-term memory: gates admit (input), keep (forget), show (output); its output, then its cells. */
 {name}_layer(x, {inputs}, &{name}_lstm_input_weight[0][0], {name}_lstm_input_bias, {gates}, a);
 {name}_layer(memory, {units}, &{name}_lstm_memory_weight[0][0], {name}_lstm_memory_bias, {gates}, b);
 for (i = 0; i < {units}; ++i) {{
@@ -50,7 +50,7 @@ for (i = 0; i < {units}; ++i) {{
 
 
 def memory_size(network: "LearnedPolicy") -> int:
-    """Numbers that a network remembers."""
+    """Return the size of a network's memory."""
     arrays = network.arrays
     if "gru_memory_weight" in arrays:
         return int(arrays["gru_memory_weight"].shape[1])
@@ -58,7 +58,7 @@ def memory_size(network: "LearnedPolicy") -> int:
 
 
 def network_operations(network: "LearnedPolicy") -> int:
-    """Multiplications and additions of a network's layers; its activations are not counted."""
+    """Return the multiplications and additions of a network's layers, without its activations."""
     sizes = {key: int(values.size) for key, values in network.arrays.items()}
     return sum(2 * size for key, size in sizes.items() if "weight" in key) + sum(
         size for key, size in sizes.items() if "bias" in key
@@ -66,12 +66,12 @@ def network_operations(network: "LearnedPolicy") -> int:
 
 
 def scratch_size(network: "LearnedPolicy") -> int:
-    """Numbers that a network holds on the stack while it answers."""
+    """Return the number of values that a network needs on the stack."""
     return _width(network) * (3 if memory_size(network) else 2)
 
 
 def _width(network: "LearnedPolicy") -> int:
-    """Numbers of its widest layer, or of what it is shown."""
+    """Return the size of its widest layer or of its input, whichever is larger."""
     outputs = [len(values) for key, values in network.arrays.items() if "weight" in key]
     return max([len(network.arrays["observation_mean"]), *outputs])
 
@@ -80,9 +80,9 @@ def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[s
     """Write a network as ``NAME_network(shown, memory, answer)``.
 
     Args:
-        network: to write.
-        name: that everything begins with.
-        scalar: in which it computes.
+        network: network to write.
+        name: beginning of all names.
+        scalar: type in which it computes.
 
     Returns:
         Its text, and the bytes of its constants.
@@ -139,7 +139,7 @@ def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[s
 
 
 def _answer(network: "LearnedPolicy", count: int, scalar: Scalar) -> list[str]:
-    """Statements that make an action of the last layer."""
+    """Return the statements that compute an action from the last layer."""
     if network.output == "argmax":
         return [
             "{",

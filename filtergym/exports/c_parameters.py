@@ -1,4 +1,4 @@
-"""Parameters of a filter in C: their struct, their limits, and what the start of a track does with them."""
+"""Parameters of a filter in C: their struct, their limits, and their use at the start of a track."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from .traced_filter import DERIVED, FreeParameters, Member
 
 
 def parameter_members(declared: Sequence[Declared]) -> list[Member]:
-    """Members of the struct, with what each is, its default and its limits."""
+    """Return the members of the struct, with the meaning, default and limits of each."""
     found = []
     for one in declared:
         values = [f"{value:.6g}" for value in one.values]
@@ -41,21 +41,21 @@ def _limit_words(limits: ParameterLimits) -> list[tuple[str, float | None]]:
 
 
 def parameter_words(free: FreeParameters) -> str:
-    """Sentences about the struct."""
+    """Return the sentences about the struct."""
     text = (
         "Parameters, given at the start of a track. They have the names and limits of filtergym."
         if free.declared
-        else "Parameters: this filter has none that can be given."
+        else "Parameters: this filter has none."
     )
     if free.condition is not None:
         text += (
-            " Refused are also values that decide a branch of the filter's own code otherwise than the defaults, such "
-            "as their order: another program would follow."
+            " Values that decide a branch of the filter's own code otherwise than the defaults, such as their order, "
+            "are also rejected: they would need another program."
         )
     if free.constant:
         text += (
             " Constant here, since the form of the program depends on them, or they enter through a computation "
-            f"without one, such as that of a matrix equation: {', '.join(free.constant)}."
+            f"that is not exported, such as the solution of a matrix equation: {', '.join(free.constant)}."
         )
     return text
 
@@ -63,14 +63,14 @@ def parameter_words(free: FreeParameters) -> str:
 def parameter_text(
     own: str, free: FreeParameters, scalar: Scalar, struct: Structure
 ) -> tuple[str, list[str]]:
-    """Return tables and functions of the parameters, and the statements with which start begins: they refuse what is
-    outside the limits, and derive ``own``.
+    """Return tables and functions of the parameters, and the first statements of start, which reject values outside the
+    limits and derive ``own``.
 
     Args:
         own: name of the filter.
         free: its parameters.
-        scalar: kind of numbers.
-        struct: of the parameters.
+        scalar: type of the numbers.
+        struct: struct of the parameters.
     """
     if free.derive is None:
         return "", []
@@ -121,7 +121,7 @@ def parameter_text(
     before += min(texts, key=lambda parts: sum(map(len, parts)))
     body.append(f"{own}_derive(parameters, own);")
     if stated := _stated(free, scalar):
-        # The same bits whatever the functions of a library give.
+        # The same bits for every library of functions.
         numbers = numpy.array([free.usual[row] for row in stated])
         before.append(array_text(f"{own}_usual", numbers, scalar))
         place = f"own[{stated.start} + k]" if stated.start else "own[k]"
@@ -132,8 +132,8 @@ def parameter_text(
 
 
 def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
-    """The program with what is as deep in the same operation as one array operation: numbers are derived one by one in
-    Python, and loops go over array operations.
+    """Return the program with equally deep equal operations as one array operation: derivation in Python is number by
+    number, but loops run over array operations.
     """
     depths: list[int] = []
     groups: dict[tuple[int, str], int] = {}
@@ -145,12 +145,14 @@ def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
 
 
 def _stated(free: FreeParameters, scalar: Scalar) -> range:
-    """Rows that are stated where nothing is chosen; of float all, which the filter has from double."""
+    """Return the rows that are stored where no parameter is chosen; of float all, which the filter converts from
+    double.
+    """
     return free.stated if scalar is DOUBLE else range(len(free.usual))
 
 
 def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused: str) -> list[str]:
-    """Statements that refuse pairs that do not ascend, and rows of probabilities that do not sum to one."""
+    """Return the statements that reject pairs that do not ascend, and rows of probabilities that do not sum to one."""
     checks, row = [], 0
     for one in free.declared:
         rows = [f"parameters->{struct.places[row + i]}" for i in range(len(one.values))]
@@ -176,7 +178,6 @@ def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused
 
 
 def _value(one: Declared, scalar: Scalar) -> str:
-    """Default of a member as C writes it."""
 
     def braces(part: numpy.ndarray) -> str:
         if part.ndim == 0:
@@ -187,7 +188,6 @@ def _value(one: Declared, scalar: Scalar) -> str:
 
 
 def _limits(one: Declared, scalar: Scalar) -> tuple[float, float]:
-    """Limits that a kind of number has."""
     if scalar is DOUBLE:
         return one.low, one.high
     largest = float(numpy.finfo(scalar.dtype).max)

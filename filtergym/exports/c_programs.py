@@ -1,4 +1,4 @@
-"""Programs of C around an exported filter, with fields for what differs from filter to filter."""
+"""Programs of C around an exported filter, with fields for the parts that differ from filter to filter."""
 
 MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and writes the estimates.
    {begins} Where the first line is a hello of filtergym, such as
@@ -21,7 +21,7 @@ static const char columns[] =
 
 static char line[1024 + 32 * (COLUMNS + INITIAL + MEASUREMENT) + sizeof columns];
 
-/* The numbers of a line; an empty one is NaN. Returns how many there are, or minus the place of what is none. */
+/* The numbers of a line; an empty one is NaN. Returns their count, or minus the place of an invalid one. */
 static int numbers(const char *text, double *row) {{
     int count = 0;
     for (;;) {{
@@ -43,8 +43,8 @@ static long number_of(const char *name) {{
     return place == NULL ? 0 : strtol(place + strlen(name), NULL, 10);
 }}
 
-/* What was not received comes as NaN. In its place stands what the sensor said last, zero before: an agent may be
-   shown the reading that a sensor holds, and a filter weighs the number by its availability. */
+/* A missing number is NaN. It is replaced by the sensor's last reading, before that by zero: an agent may observe the
+   last reading, and a filter weighs the number by its availability. */
 static void hold_missing(double *row, double *last) {{
     static const int available[] = {{{available}-1}};
     int i, missing = 0;
@@ -56,7 +56,7 @@ static void hold_missing(double *row, double *last) {{
             row[i] = last[i];
 }}
 
-/* Answers every measurement of some tracks until there are no more. */
+/* Writes the estimate of every measurement of some tracks until the end of input. */
 static int answer_all(long tracks, int steers, {own}_state *states, double *rows, double *last) {{
     const int width = ANSWER + (steers ? FEEDBACK : 0);
     long t;
@@ -91,7 +91,7 @@ static int answer_all(long tracks, int steers, {own}_state *states, double *rows
     return 0;
 }}
 
-/* Reads the hello, and answers. */
+/* Reads the hello, and writes estimates. */
 static int serve(void) {{
     const long tracks = number_of("\\"tracks\\": ");
     const int steers = FEEDBACK > 0 && number_of("\\"feedback\\": ") == FEEDBACK;
@@ -124,7 +124,7 @@ static void print_number(double value) {{
         printf(",nan");
 }}
 
-/* Writes the estimates of a table; what is refused or rejected has none, and status 1 says so. */
+/* Writes the estimates of a table; refused or rejected rows have none, and the status is then 1. */
 static int estimate_rows(FILE *file) {{
     static {own}_state state;
     static double row[COLUMNS];
@@ -163,7 +163,7 @@ static int estimate_rows(FILE *file) {{
         set_measurement(&measurement_now, measurement_of(row));
         there = {own}_update(&state, &measurement_now, &estimate) < {upper}_REJECTED;
         if (!there && failed == 0) failed = number;
-        printf("%ld,%ld", track, ++measurement);{told}
+        printf("%ld,%ld", track, ++measurement);{likelihoods}
         for (i = 0; i < {C}; ++i) print_number(there ? (double)estimate.mean{mean} : (double)NAN);
         for (i = 0; i < {C}; ++i) print_number(there ? sqrt((double)estimate.covariance{covariance}) : (double)NAN);
         putchar('\\n');
@@ -187,13 +187,14 @@ int main(int argc, char **argv) {{
 }}
 """
 """Reads a table of measurements and writes one of estimates."""
-INITIAL_IN_ROW = """/* Whether a row begins a track, the initial estimate that it has, and its measurement. */
+INITIAL_IN_ROW = """/* Whether a row begins a track, its initial estimate, and its measurement. */
 static int begins(const double *row) {{ return row[0] == row[0]; }}
 static const double *initial_of(const double *row) {{ return row; }}
 static const double *measurement_of(const double *row) {{ return row + INITIAL; }}
 """
-"""Layout of the rows of a table with the initial estimate in the row that begins a track, and every number of a
-measurement."""
+"""Layout of the rows of a table with the initial estimate in the first row of a track, and every number of a
+measurement.
+"""
 INITIAL_OF_MODEL = """static const double initial_estimate[INITIAL] = {{{estimate}}};
 
 /* Whether a row begins a track, the initial estimate of all tracks, and the measurement of a row. */
@@ -217,8 +218,8 @@ static const double *measurement_of(const double *row) {{
     return given;
 }}
 """
-"""Layout of the rows of a table with the columns of a log, where the model has the initial estimate."""
-TEST = """/* Compares the filter with what the competitor itself estimated, and says how long an update takes. */
+"""Layout of the rows of a table with the columns of a log, where the model contains the initial estimate."""
+TEST = """/* Compares the filter with the estimates of the competitor itself, and prints the time of an update. */
 #include <math.h>
 #include <stdio.h>
 #include <time.h>

@@ -1,7 +1,6 @@
 """A whole filter as C99: header and source, a program that reads a table, and a test with its vectors.
 
-The filter itself is written by :mod:`.c_filter`; what differs in the programs around it goes into the templates of
-:mod:`.c_programs`.
+:mod:`.c_filter` writes the filter itself; the programs around it are templates of :mod:`.c_programs`.
 """
 
 import shutil
@@ -33,31 +32,32 @@ from .request import ExportRequest
 from .traced_filter import FEEDBACK, LIKELIHOODS, TracedFilter
 
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic")
-"""Under which the text compiles without a warning."""
+"""Compiler flags under which the text compiles without a warning."""
 MOST_OPTIMISED = 10_000
-"""Operations of an update, at most, of which the text is tried with ``-O2``; for more the compiler takes half as long
-with ``-O1``, whose code takes a tenth longer."""
+"""Largest number of operations of an update whose text is compiled with ``-O2``; beyond it ``-O1`` halves the compile
+time and makes the code a tenth slower.
+"""
 WORST = {"double": 1e-3, "float": 0.1}
-"""Largest difference to the competitor itself, in its standard deviations, with which a filter leaves."""
+"""Largest accepted difference to the competitor itself, in its standard deviations."""
 EPISODES, MEASUREMENTS = 8, 200
-"""That are compared before anything is written, at most."""
+"""Largest number of episodes and measurements that are compared before the export is written."""
 STEER = """
             for (i = 0; steers && i < FEEDBACK; ++i) *answer++ = (double)estimate.feedback[i];"""
-"""In the program around a filter that reports what steers the world."""
+"""Output of the program around a filter whose report steers the world."""
 VECTORS = 2, 50
-"""Episodes and measurements among the test's vectors, at most."""
+"""Largest number of episodes and measurements among the test's vectors."""
 
 
 class Writer(LogText):
     """The files of a filter: itself, and the programs around it.
 
     Args:
-        name: as of :class:`.FilterText`, also the next three.
+        name: name of the competitor.
         traced: its programs.
-        scalar: kind of numbers.
-        components: what is estimated.
-        log_format: as of :class:`.LogText`, also the next one.
-        columns: of the log.
+        scalar: type of the numbers.
+        components: name and unit of the estimated components.
+        log_format: log format of the environment; None where it reads no logs.
+        columns: names in the log of renamed columns.
 
     Attributes:
         limit: largest difference with which the test passes, standard deviations.
@@ -76,7 +76,7 @@ class Writer(LogText):
         self.limit: float = WORST[scalar.name]
 
     def rows(self) -> str:
-        """Text of a header that fills structs from rows of numbers, for main.c and the test."""
+        """Return the text of a header that fills structs from rows of numbers, for main.c and the test."""
         own, real = self.name, self.scalar.name
         text = [
             comment("Structs from rows of a table."),
@@ -92,16 +92,16 @@ class Writer(LogText):
         return "\n".join(text)
 
     def main(self) -> str:
-        """Text of a program that reads a table of measurements and writes one of estimates."""
+        """Return the text of a program that reads a table of measurements and writes one of estimates."""
         C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
         initial, measurement = self.columns("initial"), self.columns("measurement")
         given = self.table_columns()
         names = [identifier(name) for name, _ in self.components]
-        told = [member.name for member in self.traced.estimate if member.name in LIKELIHOODS]
+        likelihoods = [member.name for member in self.traced.estimate if member.name in LIKELIHOODS]
         header = [
             "track",
             "measurement",
-            *told,
+            *likelihoods,
             *(f"estimate_{n}" for n in names),
             *(f"sigma_{n}" for n in names),
         ]
@@ -129,13 +129,14 @@ class Writer(LogText):
             entry="" if C == 1 else "[i][j]",
             feedback=sum(member.name == FEEDBACK for member in self.traced.estimate),
             steer=STEER if any(member.name == FEEDBACK for member in self.traced.estimate) else "",
-            told="".join(
-                f"\n        print_number(there ? (double)estimate.{name} : (double)NAN);" for name in told
+            likelihoods="".join(
+                f"\n        print_number(there ? (double)estimate.{name} : (double)NAN);"
+                for name in likelihoods
             ),
         )
 
     def table_columns(self) -> list[str]:
-        """Names of the columns of the table that main.c reads."""
+        """Return the names of the columns of the table that main.c reads."""
         rows = self.plain_rows
         if rows is None:
             return [*self.columns("initial"), *self.columns("measurement")]
@@ -144,7 +145,7 @@ class Writer(LogText):
         return [*map(identifier, ["recording", *timed, *rows.received, *rows.held]), *own]
 
     def _layout(self) -> str:
-        """Functions of main.c that say where in a row everything is."""
+        """Return the functions of main.c that locate the values in a row."""
         rows = self.plain_rows
         if rows is None:
             return INITIAL_IN_ROW.format()
@@ -161,7 +162,7 @@ class Writer(LogText):
         return INITIAL_OF_MODEL.format(estimate=", ".join(map(literal, self.initial_estimate)), fill=fill)
 
     def test(self) -> str:
-        """Text of a program that compares the filter with the vectors."""
+        """Return the text of a program that compares the filter with the vectors."""
         return TEST.format(
             own=self.name,
             upper=self.name.upper(),
@@ -171,7 +172,7 @@ class Writer(LogText):
         )
 
     def vectors(self, replayed: Replay) -> str:
-        """Text of the vectors of the test."""
+        """Return the text of the vectors of the test."""
         E, T = min(VECTORS[0], replayed.initial.shape[1]), min(VECTORS[1], len(replayed.measurements))
         arrays = {
             "initials": replayed.initial[:, :E].T,
@@ -189,7 +190,7 @@ class Writer(LogText):
         return "\n".join(text)
 
     def table(self, replayed: Replay) -> str:
-        """Text of a table of measurements, as main.c reads it."""
+        """Return the text of a table of measurements, as main.c reads it."""
         lines = [",".join(self.table_columns())]
         if self.plain_rows is not None:
             for episode in range(replayed.initial.shape[1]):
@@ -204,7 +205,7 @@ class Writer(LogText):
         return "\n".join([*lines, ""])
 
     def _plain_row(self, row: Sequence[float]) -> list[str]:
-        """Cells of a measurement in a table with the columns of a log, without its first one."""
+        """Return the cells of a measurement in a table with the columns of a log, without its first one."""
         found: dict[str, list[str]] = {"interval": [], "received": [], "held": [], "other": []}
         there = [
             value > 0.0
@@ -219,16 +220,16 @@ class Writer(LogText):
 
 
 def export_c(request: ExportRequest, folder: Path, precision: str = "double", command: str = "") -> Figures:
-    """Write a competitor as C99 into a folder, after its programs were compared with the competitor itself.
+    """Write a competitor as C99 into a folder, after a comparison of its programs with the competitor itself.
 
     Args:
         request: the competitor.
-        folder: for the files.
+        folder: folder of the files.
         precision: "double" or "float".
-        command: that made it, for the comment of the header.
+        command: command of the export, for the comment of the header.
 
     Raises:
-        ValueError: for what cannot be exported, or answers something else in this precision.
+        ValueError: for a competitor that cannot be exported, or differs in this precision.
     """
     scalar = {"double": DOUBLE, "float": FLOAT}[precision]
     traced, replayed = replay(request, EPISODES, MEASUREMENTS)
@@ -266,7 +267,9 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
 
 
 def price_of(request: ExportRequest) -> dict[str, int] | None:
-    """Return what an update costs in C: operations, and bytes of state and stack; None for what cannot be exported."""
+    """Return the cost of an update in C: operations, and bytes of state and stack; None for a competitor that cannot be
+    exported.
+    """
     try:
         traced, replayed = replay(request, EPISODES, 2)
     except ValueError:
@@ -289,7 +292,6 @@ def files_of(writer: Writer, replayed: Replay, notes: Sequence[str] = ()) -> dic
 
 
 def _about(request: ExportRequest, writer: Writer, precision: str, command: str) -> list[str]:
-    """Paragraphs that say what the filter is."""
     own, maker = writer.name, request.maker
     described = maker if isinstance(maker, type) else getattr(maker, "func", None) and maker
     first = (getattr(described, "__doc__", None) or "").strip().split("\n\n")[0].replace("`", "")
@@ -300,7 +302,7 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
         *([meaning] if (meaning := array_meanings(request.problem.task).measurement) else []),
         f"Made by: {command}" if command else "Made by filtergym.",
         "",
-        "No allocation, nothing but math.h. Compare it with the filter that was judged:",
+        "No allocation, nothing but math.h. Compare it with the evaluated filter:",
         f"    cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test",
         "Estimates from a table of measurements:",
         f"    cc -std=c99 -O2 main.c {own}.c -lm -o run && ./run measurements.csv",
@@ -326,10 +328,10 @@ def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
         f"{figures.difference:.1e} of the standard deviations that it reports.",
     ]
     if figures.test:
-        notes.append(f"Compiled where it was made: {figures.test}.")
+        notes.append(f"Compiled on export: {figures.test}.")
     if figures.replaced:
         listed = ", ".join(f"{value:g}" for value in figures.replaced)
-        notes.append(f"Constants that float does not have, replaced by the nearest that it has: {listed}.")
+        notes.append(f"Constants that float cannot represent, replaced by the nearest ones: {listed}.")
     return notes
 
 
@@ -339,13 +341,13 @@ def compile_and_test(
     """Compile the test and run it.
 
     Args:
-        writer: of the filter.
+        writer: writer of the filter.
         replayed: the vectors.
-        compiler: default: cc, where there is one.
-        flags: of the compiler.
+        compiler: path of the compiler; default: cc, where there is one.
+        flags: compiler flags.
 
     Returns:
-        What the test says; nothing without a compiler.
+        The output of the test; empty without a compiler.
 
     Raises:
         ValueError: if it does not compile, or the test fails.
@@ -366,8 +368,8 @@ def compile_and_test(
         for words in (program, [str(Path(place) / "test")]):
             done = subprocess.run(words, cwd=place, capture_output=True, text=True, check=False)
             if done.returncode != 0:
-                said = (done.stderr or done.stdout).strip()[-500:]
+                output = (done.stderr or done.stdout).strip()[-500:]
                 raise ValueError(
-                    f"{words[0]} failed on the exported {writer.name!r}, please report it: {said}"
+                    f"{words[0]} failed on the exported {writer.name!r}, please report it: {output}"
                 )
     return done.stdout.strip()

@@ -1,4 +1,4 @@
-"""Structures of C for the numbers that a filter is given, keeps and answers."""
+"""Structs of C for the input, state and output of a filter."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,22 +14,22 @@ class Structure(NamedTuple):
 
     name: str
     arrays: list[tuple[str, tuple[int, ...], str, list[int]]]
-    """Of every array its name, its shape, what it is, and the rows of the argument in its order."""
+    """Name, shape and meaning of every array, and the rows of the argument in its order."""
     places: dict[int, str]
-    """Row of the argument to the expression that follows the variable."""
+    """Row of the argument -> expression that follows the variable."""
     columns: dict[int, str]
-    """Row of the argument to a name in a table."""
+    """Row of the argument -> name in a table."""
 
     @property
     def numbers(self) -> dict[int, int]:
-        """Row of the argument to its place among the numbers of the struct, which has no others before them."""
+        """Row of the argument -> its place among the numbers of the struct, which come first."""
         rows = [row for _, _, _, own in self.arrays for row in own]
         return {row: place for place, row in enumerate(rows)}
 
 
 def structure(name: str, members: Sequence[Member]) -> Structure:
-    """Give numbers their places in a struct: an array of which every entry is there stays one, of others the entries
-    that are there get names of their own.
+    """Assign numbers to places in a struct: a complete array stays one, the entries of an incomplete one get names of
+    their own.
     """
     groups: dict[tuple[str, tuple[int, ...]], list[int]] = {}
     for row, member in enumerate(members):

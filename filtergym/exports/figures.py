@@ -1,33 +1,33 @@
-"""What is known of an exported filter: what it costs, and how far it is from the filter that was judged."""
+"""Figures of an exported filter: its cost, and its difference to the evaluated filter."""
 
 from typing import NamedTuple
 
 
 class Figures(NamedTuple):
-    """What is known of an exported filter."""
+    """Cost and accuracy of an exported filter."""
 
     operations: int
-    """Of an update, without those of a network."""
+    """Operations of an update, without those of a network."""
     state_bytes: int
     constant_bytes: int
-    """Of a network's weights."""
+    """Bytes of a network's weights."""
     scratch_bytes: int
-    """On the stack, beside the state."""
+    """Bytes on the stack, beside the state."""
     difference: float
-    """Largest one to the competitor itself, in its standard deviations, see :func:`~.replay.run_filter`."""
+    """Largest difference to the competitor itself, in its standard deviations, see :func:`~.replay.run_filter`."""
     replaced: tuple[float, ...]
-    """Constants that float does not have."""
+    """Constants that float cannot represent."""
     network_operations: int = 0
-    """Of a network, where it is asked."""
+    """Operations of a network, where it is evaluated."""
     test: str = ""
-    """What the compiled test has said; empty without a compiler."""
+    """Output of the compiled test; empty without a compiler."""
     reads_log: bool = False
-    """Whether a program reads logs of the user."""
+    """Whether a program reads the user's logs."""
 
 
 def operation_words(figures: Figures) -> str:
-    """Return how many operations an update takes, those of a network beside those of the filter."""
+    """Return the operations of an update in words, with those of a network apart."""
     network = figures.network_operations
     return f"{figures.operations:,} operations an update" + (
-        f" and {network:,} of the network where it is asked" if network else ""
+        f" and {network:,} of the network where it is evaluated" if network else ""
     )

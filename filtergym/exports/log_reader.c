@@ -3,12 +3,12 @@ typedef struct Row {
     const char *words, *recording; /* of the time and of the recording */
     long number, line, track;      /* rows count from 0 without the names, lines from 1 */
     struct Row *again;             /* the next row of the same time */
-    int copy;                      /* what became of a row of the time of another one */
+    int copy;                      /* status of a row with the time of another one */
     double cell[COLUMNS];
 #ifdef FARTHEST /* Rows may hold plots. */
     double p[2], v[2], m[2]; /* position, m east and north, its variances, and as it was measured */
     double moved[2];         /* since the row before, m east and north, by a second sensor */
-    int plot, odometry;      /* whether these are there */
+    int plot, odometry;      /* whether these exist */
 #endif
 } Row;
 
@@ -378,7 +378,7 @@ static void print_words(const char *words) {
     if (quoted) putchar('"');
 }
 
-/* Writes what became of a row, and of those that have its time. */
+/* Writes the status of a row, and of those with its time. */
 static void print_row(const Row *row, int status, const Estimate *estimate) {
     int i;
     for (; row != NULL; row = row->again) {
@@ -406,7 +406,7 @@ static void print_row(const Row *row, int status, const Estimate *estimate) {
     }
 }
 
-/* Notes what an update returned. */
+/* Counts the result of an update. */
 static int note(const Row *row, int status) {
     if (status == REJECTED || status == REFUSED) {
         if (failures++ == 0) failed = row;

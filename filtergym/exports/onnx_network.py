@@ -1,8 +1,9 @@
 """The network of an agent as an ONNX graph: observation and memory in, action and memory out.
 
 The graph is that of :class:`~filtergym.agents.learned_policy.LearnedPolicy`, in the primitive operators that every
-runtime has: normalisation, the gates of the recurrent unit as matrix products, the layers, and what makes an action of
-the last one. Everything is float32. Estimation is not in it: the observation is that of the environment's filter.
+runtime has: normalisation, the gates of the recurrent unit as matrix products, the layers, and the conversion of the
+last one to an action. Everything is float32. Estimation is not in it: the observation is that of the environment's
+filter.
 """
 
 import json
@@ -20,7 +21,7 @@ from ..evaluation.storage.files import whole_file
 from .request import ExportRequest
 
 OPSET, IR_VERSION = 17, 8
-"""Of 2022: runtimes from then on read it."""
+"""Versions of 2022, which runtimes since then read."""
 BATCH = "N"
 """Name of the axis of observations side by side."""
 
@@ -44,7 +45,7 @@ class _Graph:
         return name
 
     def node(self, operator: str, inputs: list[str], *outputs: str, **attributes: Any) -> str:
-        """Add an operation; returns the name of its first output."""
+        """Add an operation; return the name of its first output."""
         names = list(outputs) or [f"{operator.lower()}_{len(self.nodes)}"]
         self.nodes.append(self.onnx.helper.make_node(operator, inputs, names, names[0], **attributes))
         return names[0]
@@ -57,12 +58,12 @@ class _Graph:
         return parts
 
     def linear(self, rows: str, weight: str, bias: str) -> str:
-        """``rows @ weight.T + bias``."""
+        """Return ``rows @ weight.T + bias``."""
         return self.node("Gemm", [rows, weight, bias], transB=1)
 
 
 def _normalise(graph: _Graph, arrays: dict[str, numpy.ndarray]) -> str:
-    """Observation less its mean over its scale, cut at the limit."""
+    """Return the observation less its mean over its scale, clipped at the limit."""
     limit = [graph.constant(n, v) for n, v in (("low", -OBSERVATION_LIMIT), ("high", OBSERVATION_LIMIT))]
     mean, scale = (graph.constant(n, arrays[n]) for n in ("observation_mean", "observation_scale"))
     centred = graph.node("Sub", ["observation", mean])
@@ -70,7 +71,7 @@ def _normalise(graph: _Graph, arrays: dict[str, numpy.ndarray]) -> str:
 
 
 def _gated_recurrent(graph: _Graph, x: str, width: int) -> str:
-    """One step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
+    """Add one step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
     from_input = graph.split(graph.linear(x, "gru_input_weight", "gru_input_bias"), 3, width, "from_input")
     from_memory = graph.linear("memory", "gru_memory_weight", "gru_memory_bias")
     from_memory_parts = graph.split(from_memory, 3, width, "from_memory")
@@ -85,7 +86,7 @@ def _gated_recurrent(graph: _Graph, x: str, width: int) -> str:
 
 
 def _long_short_term(graph: _Graph, x: str, width: int) -> str:
-    """One step of the long short-term memory (Gers et al., 2000); memory holds what it shows, then its cells."""
+    """Add one step of the long short-term memory (Gers et al., 2000); memory contains its output, then its cells."""
     shown, cells = graph.split("memory", 2, width, "memory_part")
     from_input = graph.linear(x, "lstm_input_weight", "lstm_input_bias")
     from_memory = graph.linear(shown, "lstm_memory_weight", "lstm_memory_bias")
@@ -99,7 +100,7 @@ def _long_short_term(graph: _Graph, x: str, width: int) -> str:
 
 
 def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
-    """What the last layer means: cut to the box, squashed into it, or the largest entry's index."""
+    """Return the action of the last layer: clipped to the box, squashed into it, or the largest entry's index."""
     if output == "argmax":
         graph.node("ArgMax", [x], "action", axis=1, keepdims=0)
         return
@@ -114,10 +115,10 @@ def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
 
 
 def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
-    """Return the arrays of an agent, and the model that it acts in.
+    """Return the arrays of an agent, and the model of its environment.
 
     Raises:
-        ValueError: for what has no plain arrays, or does not fit the environment.
+        ValueError: for an agent that has no plain arrays, or does not fit the environment.
     """
     maker = request.maker
     stored = maker.policy if isinstance(maker, EstimatorMaker) else maker
@@ -132,11 +133,11 @@ def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
 
 
 def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
-    """Return what the file says of the network: names, units and meaning of what goes in and comes out.
+    """Return the file's description of the network: names, units and meaning of inputs and outputs.
 
     Args:
-        stored: the agent.
-        model: that it acts in.
+        stored: arrays of the agent.
+        model: model of its environment.
     """
     header, space = stored.header, model.action_space
     known = {field.name: field for field in model.fields}
@@ -168,8 +169,8 @@ def network_graph(stored: StoredPolicy, model: Model) -> Any:
     """Return the ONNX model of a network.
 
     Args:
-        stored: the agent.
-        model: that it acts in.
+        stored: arrays of the agent.
+        model: model of its environment.
 
     Raises:
         ValueError: if the package is not installed.
@@ -223,11 +224,12 @@ def export_onnx(request: ExportRequest, path: Path) -> None:
     """Write the network of an agent as ONNX.
 
     Args:
-        request: of an agent, shipped or in a file.
-        path: of the file.
+        request: request of an agent, shipped or in a file.
+        path: path of the file.
 
     Raises:
-        ValueError: for what has no network of plain arrays, a file that cannot be written, or without the package.
+        ValueError: for an agent without a network of plain arrays, a file that cannot be written, or without the
+            package.
     """
     made = network_graph(*_network(request))
     with whole_file(path) as partial:

@@ -1,7 +1,7 @@
-"""Parameters of an exported filter that its user sets: inputs in place of the numbers of a task and of a tuning.
+"""Parameters of an exported filter that its user sets: inputs in place of the parameters of a task and of a tuning.
 
-A filter is made and traced with expressions in place of its parameters, so that whatever it derives of them, also where
-it is made, becomes part of the program that starts a track. A branch that depends on parameters is a condition under
+A filter is made and traced with expressions in place of its parameters, so that all numbers that it derives of them
+become part of the program that starts a track. A branch that depends on parameters is a condition under
 which the program holds; a parameter that becomes a plain number, or that decides a branch and nothing else, stays a
 constant.
 """
@@ -31,30 +31,30 @@ PARAMETER = 6
 NUMBERS = {name: compute for name, compute in FUNCTIONS.items() if hasattr(math, name)}
 """Functions that :mod:`math` has, too."""
 EXACT = frozenset(OPERATIONS) - {"remainder"} | {"constant", "input", "take"}
-"""Operations that have the same bits everywhere."""
+"""Operations whose results have the same bits everywhere."""
 SUMMED = 1e-9
-"""How far the sum of probabilities may be from one, as in ``envs/contract/parameters.py``."""
+"""Tolerance of a sum of probabilities around one, as in ``envs/contract/parameters.py``."""
 
 
 class Declared(NamedTuple):
-    """A parameter that is declared: a number, or an array of them."""
+    """A declared parameter: a number, or an array of numbers."""
 
     name: str
     shape: tuple[int, ...]
     values: tuple[float, ...]
-    """In force without a choice, row by row."""
+    """Default values, row by row."""
     low: float
     high: float
     """Limits of every number, both included."""
     words: str
-    """What it is, with its unit."""
+    """Meaning, with its unit."""
     limits: ParameterLimits = ParameterLimits()
     size: float | None = None
-    """Whose decimal logarithm it is, where the filter itself has that."""
+    """Parameter of which this is the decimal logarithm, where the filter itself has that parameter."""
 
 
 class Declaration(NamedTuple):
-    """What can be set in a competitor."""
+    """The parameters of a competitor that can be set."""
 
     tuned: list[Declared]
     """Values of its tuning."""
@@ -64,18 +64,18 @@ class Declaration(NamedTuple):
 
     @property
     def all(self) -> list[Declared]:
-        """Values of the tuning first."""
+        """All parameters, values of the tuning first."""
         return [*self.tuned, *self.own]
 
 
 def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str) -> Declaration:
-    """Return what can be set in a competitor.
+    """Return the parameters of a competitor that can be set.
 
     Args:
-        task: with the parameters that are in force.
-        maker: of the competitor.
-        known: what can be tuned, by the names of competitors.
-        name: of the competitor.
+        task: task with the current parameters.
+        maker: maker of the competitor.
+        known: tunable parameters by the names of competitors.
+        name: name of the competitor.
     """
     if isinstance(maker, TunedPolicy):
         tunable, values = maker.tunable, maker.values
@@ -100,7 +100,7 @@ def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str)
 
 
 def _arguments(maker: Any) -> dict[str, Any]:
-    """Arguments that a competitor is made with, and the fields of its prior."""
+    """Return the arguments of a competitor's maker, and the fields of its prior."""
     given: dict[str, Any] = {}
     while isinstance(maker, functools.partial):
         maker, given = maker.func, {**maker.keywords, **given}
@@ -111,8 +111,8 @@ def _arguments(maker: Any) -> dict[str, Any]:
 
 
 def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
-    """Value of a tuning that an untuned filter has, and of a logarithm whose it is: what a search starts from may have
-    fewer digits.
+    """Return the tuning value of an untuned filter, and the parameter of which it is the logarithm; the start of a
+    search may have fewer digits.
     """
     is_log = name.startswith("log10_")
     size = arguments.get(name.removeprefix("log10_"))
@@ -122,7 +122,7 @@ def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[fl
 
 
 def _of_task(parameters: Any) -> Iterator[Declared]:
-    """Numbers among the parameters of a task."""
+    """Return the numbers among the parameters of a task."""
     words = {
         name: text for base in reversed(type(parameters).__mro__) for name, text in field_words(base).items()
     }
@@ -148,7 +148,7 @@ def _of_task(parameters: Any) -> Iterator[Declared]:
 
 
 def _kinds(hint: Any) -> set[Any]:
-    """Types of the numbers and words that a value is made of."""
+    """Return the types of the numbers and words of a value."""
     inside = typing.get_args(hint)
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) in (tuple, typing.Union):
         return {kind for part in inside for kind in _kinds(part)}
@@ -162,7 +162,7 @@ class ParameterGraph(Graph):
         free: parameters whose numbers are the rows of ``PARAMETER``.
 
     Attributes:
-        conditions: on which branches were decided, and how.
+        conditions: conditions of the branches, and their values.
         settled: rows of parameters that became plain numbers.
     """
 
@@ -178,12 +178,12 @@ class ParameterGraph(Graph):
         self.ends: dict[int, tuple[float, float] | None] = {}
 
     def rows(self, nodes: Sequence[int]) -> set[int]:
-        """Rows of the parameters that expressions depend on."""
+        """Return the rows of the parameters that expressions depend on."""
         inputs = [self.arguments[node] for node in self.live(nodes) if self.operations[node] == "input"]
         return {row for argument, row in inputs if argument == PARAMETER}
 
     def value(self, node: int) -> Any:
-        """Return the value of an expression with the usual parameters; None where it depends on anything else."""
+        """Return the value of an expression with the usual parameters; None where it depends on other inputs."""
         if node in self.usual:
             return self.usual[node]
         for part in self.live([node]):
@@ -213,8 +213,8 @@ class ParameterGraph(Graph):
             return ({**OPERATIONS, **FUNCTIONS}[operation])(*parts)
 
     def settle(self, node: int, use: str) -> Any:
-        """Value of an expression that must be plain: of a branch it becomes a condition, else its parameters stay what
-        they are; None where it depends on more than parameters.
+        """Return the value of an expression that must be plain: of a branch it becomes a condition, else its parameters
+        become constant; None where it depends on other inputs than parameters.
         """
         found = self.value(node)
         if found is None:
@@ -227,11 +227,11 @@ class ParameterGraph(Graph):
         return found
 
     def is_exact(self, node: int) -> bool:
-        """Whether an expression has the same bits whatever computes it."""
+        """Return whether an expression has the same bits on every machine."""
         return all(self.operations[part] in EXACT for part in self.live([node]))
 
     def _is_limited(self, node: int, holds: bool) -> bool:
-        """Whether the limits of parameters alone decide a comparison."""
+        """Return whether the limits of parameters alone decide a comparison."""
         name = self.operations[node]
         ends = [self._ends(part) for part in self.parts(node)]
         if name not in COMPARISONS or None in ends:
@@ -242,7 +242,7 @@ class ParameterGraph(Graph):
         return all(bool(OPERATIONS[name](x, y)) == holds for x in one for y in other)
 
     def _ends(self, node: int) -> tuple[float, float] | None:
-        """Between what an expression is for all parameters within their limits; None: that is not known."""
+        """Return the limits of an expression over all parameters within their limits; None: unknown."""
         if node not in self.ends:
             self.ends[node] = self._ends_of_parts(node)
         return self.ends[node]
@@ -272,9 +272,9 @@ def _power(base: float, exponent: float) -> float:
 
 @contextmanager
 def traced_functions(graph: ParameterGraph) -> Iterator[None]:
-    """Let the functions of :mod:`math` make expressions of traced numbers, as those of NumPy do.
+    """Make the functions of :mod:`math` return expressions of traced numbers, as those of NumPy do.
 
-    Anything else they compute as ever, also for other threads.
+    Other arguments, and other threads, get numbers as before.
     """
     original = {name: getattr(math, name) for name in NUMBERS} | {
         "sqrt": math.sqrt,
@@ -310,7 +310,7 @@ def traced_functions(graph: ParameterGraph) -> Iterator[None]:
 
 
 def expressions(declared: Declared, first: int, graph: Graph) -> Any:
-    """Nested tuples of traced numbers in place of a parameter, whose first number has a row."""
+    """Return nested tuples of traced numbers in place of a parameter, given the row of the first number."""
     nodes = [graph.input(PARAMETER, first + i) for i in range(len(declared.values))]
 
     def nested(part: numpy.ndarray) -> Any:
@@ -322,7 +322,9 @@ def expressions(declared: Declared, first: int, graph: Graph) -> Any:
 
 
 def with_parameters(parameters: Any, values: Mapping[str, Any]) -> Any:
-    """Parameters of a task with others, which are not checked, and without what was computed of the former ones."""
+    """Return the parameters of a task with others, which are not checked, and without cached results of the former
+    ones.
+    """
     changed = object.__new__(type(parameters))
     for field in dataclasses.fields(parameters):
         object.__setattr__(changed, field.name, values.get(field.name, getattr(parameters, field.name)))

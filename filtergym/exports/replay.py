@@ -1,4 +1,4 @@
-"""What an exported filter must answer: measurements of episodes, and what the competitor itself estimated of them."""
+"""Test vectors of an exported filter: measurements of episodes, and the estimates of the competitor itself."""
 
 import collections
 import copy
@@ -40,15 +40,15 @@ class Replay(NamedTuple):
     """E episodes of T measurements, every array of a structure row by row."""
 
     initial: numpy.ndarray
-    """``(rows, E)``."""
+    """Initial estimate, ``(rows, E)``."""
     measurements: numpy.ndarray
-    """``(T, rows, E)``."""
+    """Measurements, ``(T, rows, E)``."""
     mean: numpy.ndarray
-    """Of the competitor, ``(T, C, E)``."""
+    """Mean of the competitor, ``(T, C, E)``."""
     covariance: numpy.ndarray
-    """``(T, C, C, E)``."""
+    """Covariance of the competitor, ``(T, C, C, E)``."""
     components: list[tuple[str, str]]
-    """Name and unit of what is estimated."""
+    """Name and unit of the estimated components."""
 
     @property
     def sigma(self) -> numpy.ndarray:
@@ -57,7 +57,9 @@ class Replay(NamedTuple):
         return numpy.sqrt(numpy.maximum(variance, 0.0))
 
     def largest_difference(self, mean: numpy.ndarray) -> float:
-        """Largest difference of other means ``(T, C, E)`` to the competitor's, in its standard deviations."""
+        """Return the largest difference of other means ``(T, C, E)`` to the competitor's, in its standard
+        deviations.
+        """
         with numpy.errstate(all="ignore"):
             difference = numpy.abs(mean - self.mean) / self.sigma
         same = (mean == self.mean) | (numpy.isnan(mean) & numpy.isnan(self.mean))
@@ -66,13 +68,14 @@ class Replay(NamedTuple):
 
 
 def _report(model: Model, episode: Episode) -> dict[str, Any]:
-    """What a filter was given, and what it estimated."""
     mean, covariance = model.mean(episode), model.covariance(episode)
     return {"measurement": episode.measurement, "mean": mean, "covariance": covariance}
 
 
 def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
-    """Of an estimator also why an episode is lost: the last valid answer is held then."""
+    """Return the input and the estimate of an estimator, and why an episode is lost: its last valid estimate is then
+    repeated.
+    """
     return {
         **_report(model, episode),
         "lost": model.filter.records(episode.filter, episode.measurement)["lost"],
@@ -80,7 +83,7 @@ def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _rows(part: Any, count: int) -> numpy.ndarray:
-    """Numbers of nested tuples of arrays ``(..., N)`` row by row, of the first lanes, ``(rows, count)``."""
+    """Return the numbers of nested tuples of arrays ``(..., N)`` row by row, of the first lanes, ``(rows, count)``."""
     arrays = [numpy.asarray(array, dtype=float) for array in leaves(part)]
     return numpy.concatenate([array.reshape(-1, array.shape[-1])[:, :count] for array in arrays])
 
@@ -88,15 +91,15 @@ def _rows(part: Any, count: int) -> numpy.ndarray:
 def replay(
     request: ExportRequest, episodes: int = 8, measurements: int | None = None
 ) -> tuple[TracedFilter, Replay]:
-    """Trace a competitor, and let it run over episodes as an evaluation does.
+    """Trace a competitor, and run it over episodes as an evaluation does.
 
     Args:
-        request: what is traced.
-        episodes: how many run.
-        measurements: of each, at most.
+        request: competitor to trace.
+        episodes: number of episodes.
+        measurements: largest number of measurements in each.
 
     Raises:
-        ValueError: for what cannot be exported, or loses every episode.
+        ValueError: for a competitor that cannot be exported, or loses every episode.
     """
     problem, name, maker, scenario, keywords = request[:5]
     kind = kind_of(maker)
@@ -108,7 +111,7 @@ def replay(
     started: list[Any] = []
     start_lanes(plain, seeds, lambda episode: started.append(episode.measurement))
     kept: dict[str, list[numpy.ndarray]] = {"measurement": [], "mean": [], "covariance": []}
-    # What cannot be exported is refused before it runs. Measurements have the same form whatever steers.
+    # Competitors that cannot be exported fail before they run. Measurements have the same form for every control.
     first = start_lanes(plain, seeds[:1]).state.measurement
     known = problem.baselines.tunable
     traced = trace_filter(problem.task, control, maker, name, plain, (started[0], first), known)
@@ -130,11 +133,11 @@ def replay(
 
 
 class _Network:
-    """The network of a filter, asked as it is in an evaluation.
+    """The network of a filter, evaluated as in an evaluation.
 
     Args:
-        network: of the filter.
-        dtype: in which it computes.
+        network: network of the filter.
+        dtype: type in which it computes.
     """
 
     def __init__(self, network: "LearnedPolicy", dtype: Any) -> None:
@@ -146,7 +149,7 @@ class _Network:
         self.answer: Any = None
 
     def __call__(self, shown: Any) -> None:
-        """Answer, if this measurement is decided on."""
+        """Compute the output, if there is a decision at this measurement."""
         flag, *rest = shown
         if not numpy.all(flag):
             return
@@ -162,9 +165,9 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     the C library, where code can be compiled, else in NumPy.
 
     Args:
-        traced: to run.
-        replayed: what it is given.
-        dtype: in which everything is computed.
+        traced: filter to run.
+        replayed: its input.
+        dtype: type of the computation.
 
     Returns:
         Rows of the estimate, ``(T, rows, E)``.
@@ -190,8 +193,8 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     return numpy.stack(answers)
 
 
-def _answered(network: _Network | None) -> Any:
-    """Rows of what a network has answered; where nothing is decided the answer that was held is not looked at."""
+def _network_rows(network: _Network | None) -> Any:
+    """Return the rows of a network's output; without a decision the previous output is not read."""
     if network is None or network.answer is None:
         return collections.defaultdict(float)
     return network.answer
@@ -200,10 +203,9 @@ def _answered(network: _Network | None) -> Any:
 def _interpret_update(
     traced: TracedFilter, dtype: Any, given: dict[int, Any], network: _Network | None
 ) -> list[numpy.ndarray]:
-    """Results of an update in NumPy."""
 
     def read(argument: int, row: int) -> Any:
-        return (_answered(network) if argument == ANSWER else given[argument])[row]
+        return (_network_rows(network) if argument == ANSWER else given[argument])[row]
 
     return interpret(traced.update, read, dtype, network, traced.shown)
 
@@ -213,13 +215,13 @@ class _CompiledUpdate:
 
     Args:
         traced: the filter.
-        E: how many.
+        E: number of filters.
     """
 
     def __init__(self, traced: TracedFilter, E: int) -> None:
         code, shown = traced.update, traced.shown
         self._whole, self._before = _Code(code, E), None
-        if shown:  # what a network is shown is computed before it is asked, and once more with its answer
+        if shown:  # the network's input is computed before its output, and once more with it
             first = first_steps(code, shown)
             steps, origins = code.steps[:first], code.origins[:first]
             self._before = _Code(StraightLineProgram(steps, code.constants, code.results[:shown], origins), E)
@@ -227,7 +229,7 @@ class _CompiledUpdate:
     def __call__(self, given: dict[int, Any], network: _Network | None) -> list[numpy.ndarray]:
         if network is not None and self._before is not None:
             network(self._before(given))
-        return self._whole({**given, ANSWER: _answered(network)})
+        return self._whole({**given, ANSWER: _network_rows(network)})
 
 
 class _Code:
@@ -258,5 +260,5 @@ class _Code:
 
 
 def mean_rows(traced: TracedFilter) -> slice:
-    """Rows of the estimate that are its mean."""
+    """Return the rows of the estimate that are its mean."""
     return slice(0, sum(member.name == "mean" for member in traced.estimate))

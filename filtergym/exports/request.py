@@ -1,4 +1,4 @@
-"""What is to be exported: a competitor, and the parameters that it gets."""
+"""The request of an export: a competitor with its parameters."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,19 +11,19 @@ from ..names import file_endings, find_competitor
 
 
 class ExportRequest(NamedTuple):
-    """What is to be written: a competitor, and the parameters that it gets."""
+    """A competitor to export, with its parameters."""
 
     problem: Problem
-    """Whose competitor it is."""
+    """Problem of the competitor."""
     name: str
     maker: Any
-    """Of the competitor."""
+    """Maker of the competitor."""
     scenario: Any = None
-    """Whose parameters it gets, and whose episodes it is compared on, of the test split; a recording, too."""
+    """Scenario or recording that gives the parameters, and the episodes of the comparison, of the test split."""
     keywords: Mapping[str, Any] = MappingProxyType({})
     """Parameters of the task."""
     log: LogSetup | None = None
-    """How the log was read that it was advised for."""
+    """Reading of the log that the filter was advised for."""
 
 
 def request_export(
@@ -32,11 +32,11 @@ def request_export(
     """Find a competitor by its name.
 
     Args:
-        problem: whose competitor it is.
-        name: as of :func:`~filtergym.names.competitor`.
-        scenario: of the request.
-        trust: import what can execute code.
-        **keywords: of the request.
+        problem: problem of the competitor.
+        name: name or path, see :func:`~filtergym.names.competitor`.
+        scenario: scenario of the request.
+        trust: whether to load files that can execute code.
+        **keywords: further fields of the request.
 
     Raises:
         ValueError: for an unknown name.
@@ -57,7 +57,7 @@ def request_export(
 
 
 def _own_name(problem: Problem, name: str | Path) -> str:
-    """Name of a competitor; of a file its own, without folder and ending, and without that of the environment."""
+    """Return the name of a competitor; of a file its stem, without the name of the environment."""
     text = str(name)
     for ending in file_endings():
         if text.endswith(ending):

@@ -1,7 +1,7 @@
-"""A whole filter as one straight line for one measurement: state and measurement in, state and estimate out.
+"""A whole filter as one straight-line program for one measurement: state and measurement in, state and estimate out.
 
-Traced is the filter's own text, the same that an evaluation runs. What the estimate does not depend on is left out of
-the state, and members that are always equal, as P[0, 1] and P[1, 0], are kept once.
+The traced code is the filter's own, the same that an evaluation runs. Numbers that do not affect the estimate are left
+out of the state, and members that are always equal, as P[0, 1] and P[1, 0], are stored once.
 """
 
 import copy
@@ -47,46 +47,49 @@ STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs, beside :data:`~.parameters.PARAMETER`."""
 DERIVED, CONDITION = 7, 8
 LIKELIHOODS = ("log_likelihood", "nis", "nis_degrees")
-"""What is told beside an estimate, where the filter tells it."""
+"""Likelihoods that are reported beside an estimate, if the filter has them."""
 FEEDBACK = "feedback"
-"""What of an estimate steers the world, where it does not follow from the mean."""
+"""Part of an estimate that steers the world, where it does not follow from the mean."""
 
 
 class Member(NamedTuple):
     """A number in a structure of arrays."""
 
     name: str
-    """Of its array: the names that lead to it."""
+    """Name of its array: the attributes that lead to it."""
     shape: tuple[int, ...]
-    """Of its array, without axes of one."""
+    """Shape of its array, without axes of one."""
     place: int
-    """In that array, row by row."""
+    """Place in that array, row by row."""
     words: str
-    """What its array is, where its class says so."""
+    """Meaning of its array, where its class documents it."""
 
 
 class FreeParameters(NamedTuple):
-    """Parameters of a filter that its user sets, and what it derives of them when a track starts."""
+    """Parameters of a filter that its user sets, and the numbers that it derives of them when a track starts."""
 
     declared: Sequence[Declared] = ()
     """Arrays in the order of the rows of the argument ``PARAMETER``."""
     derive: StraightLineProgram | None = None
-    """From the parameters to the rows of the argument ``DERIVED``; None where none is free."""
+    """Program from the parameters to the rows of the argument ``DERIVED``; None where none is free."""
     usual: Sequence[float] = ()
-    """Values of these rows with the parameters in force, as they are in the filter itself."""
+    """Values of these rows with the current parameters, as they are in the filter itself."""
     kept: int = 0
-    """First of these rows that are the last rows of the state, too: ``update`` reads them and leaves them alone."""
+    """Number of these rows that are also the last rows of the state: ``update`` reads them and leaves them
+    unchanged.
+    """
     stated: range = range(0)
-    """Rows that computing may not give as they are in the filter, in double: a library's functions decide their
-    bits."""
+    """Rows whose bits may differ from those of the filter itself in double, since a library's functions decide them."""
     condition: StraightLineProgram | None = None
-    """From the parameters to one result, whether the programs hold for them; None: for any within the limits."""
+    """Program from the parameters to one result, whether the programs hold for them; None: for any within
+    the limits.
+    """
     constant: Sequence[str] = ()
-    """Names of declared parameters that stay what they were when the filter was traced."""
+    """Names of declared parameters that keep the values of the trace."""
 
     @property
     def values(self) -> list[float]:
-        """Parameters in force, row by row."""
+        """Current parameters, row by row."""
         return [value for one in self.declared for value in one.values]
 
 
@@ -94,31 +97,35 @@ class TracedFilter(NamedTuple):
     """A filter as two programs."""
 
     start: StraightLineProgram
-    """From the initial estimate and the parameters to the state."""
+    """Program from the initial estimate and the parameters to the state."""
     update: StraightLineProgram
-    """From state and measurement to state and estimate; what a network is shown comes first among the results."""
+    """Program from state and measurement to state and estimate; the input of a network comes first among
+    the results.
+    """
     initial: list[Member]
     measurement: list[Member]
     state: list[Member]
-    """Rows of the argument ``STATE``: what is kept from one measurement to the next."""
+    """Rows of the argument ``STATE``: the state between two measurements."""
     estimate: list[Member]
     """Rows of the argument ``ESTIMATE``."""
     shown: int
-    """Results of ``update`` that a network is shown, the first one whether it is asked; zero without network."""
+    """Number of results of ``update`` that are the input of a network, the first one whether it is evaluated; zero
+    without network.
+    """
     network: "LearnedPolicy | None"
-    """That answers between the two parts of ``update``; None where none is asked."""
+    """Network that is evaluated between the two parts of ``update``; None where there is none."""
     free: FreeParameters = FreeParameters()
-    """What its user sets."""
+    """Parameters that its user sets."""
 
 
 class FilterSteps:
-    """A filter alone: an answer that an evaluation would not accept is returned all the same.
+    """A filter alone; an estimate that an evaluation would reject is returned all the same.
 
     Args:
         filter: on traced arrays.
-        masked: puts something in place of what was not received, of what never sees it.
-        decider: asks a network inside; None without one.
-        reports_feedback: whether it is asked what steers the world, as a bank is.
+        masked: replaces missing measurements, for a filter that never reads them.
+        decider: evaluates a network inside; None without one.
+        reports_feedback: whether it reports the quantity that steers the world, as a bank does.
     """
 
     def __init__(
@@ -136,18 +143,18 @@ class FilterSteps:
         )
 
     def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
-        """Its state after a measurement, and its answer."""
+        """Return the state after a measurement, and the estimate."""
         own, received = self.filter, measurement if self.masked is None else self.masked(measurement)
         after = own.step(state, FilterInput(received))
-        told = own.records(after, received)
-        known = {name: told[name] for name in LIKELIHOODS if told.get(name) is not None}
+        records = own.records(after, received)
+        known = {name: records[name] for name in LIKELIHOODS if records.get(name) is not None}
         feedback = own.feedback(after, received) if self.reports_feedback else None
         if feedback is not None:
             known[FEEDBACK] = feedback
         return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
 
     def due_nodes(self, state: Any, graph: Graph) -> list[int]:
-        """Expression of whether the network is asked at a measurement."""
+        """Return the expression of whether the network is evaluated at a measurement."""
         assert self.decider is not None
         if self.decider.interval == 1:
             return [graph.constant(True)]
@@ -155,7 +162,7 @@ class FilterSteps:
 
 
 def clear_missing(task: Task, measurement: Any) -> Any:
-    """Return a measurement with zero in place of what was not received, whatever stands there."""
+    """Return a measurement with zero in place of missing values, whatever they contain."""
 
     def clear(own: Any, masked: Any) -> Any:
         if own is masked or (own.nodes == masked.nodes).all():
@@ -166,17 +173,17 @@ def clear_missing(task: Task, measurement: Any) -> Any:
     return map_arrays(lambda own: clear(own, next(masked)), measurement)
 
 
-def count_answers(network: "LearnedPolicy") -> int:
-    """Numbers of an action."""
+def action_size(network: "LearnedPolicy") -> int:
+    """Return the number of values of an action."""
     return 1 if network.output == "argmax" else len(network.layers[-1][1])
 
 
-class AskedNetwork(Policy):
-    """In place of a network while a filter is traced: keeps what it is shown, and answers with inputs.
+class NetworkPlaceholder(Policy):
+    """Placeholder of a network during the trace: stores the network's input, and returns new inputs as its output.
 
     Args:
-        network: in whose place it stands.
-        graph: of the inputs.
+        network: the replaced network.
+        graph: graph of the inputs.
     """
 
     def __init__(self, network: "LearnedPolicy", graph: Graph) -> None:
@@ -187,20 +194,20 @@ class AskedNetwork(Policy):
         self.shown: list[int] = []
 
     def act(self, observation: Any, state: Any, start: Any) -> tuple[Any, Any]:
-        """Keep what is shown; numbers are answered with zeros, whose form alone matters."""
+        """Store the input; for plain numbers return zeros, of which only the shape matters."""
         if not isinstance(observation, Traced):
             return numpy.zeros(
-                (1,) if self.network.output == "argmax" else (1, count_answers(self.network))
+                (1,) if self.network.output == "argmax" else (1, action_size(self.network))
             ), ()
         self.shown = observation[:, self.network.columns].nodes.ravel().tolist()
-        nodes = [self.graph.input(ANSWER, i) for i in range(count_answers(self.network))]
+        nodes = [self.graph.input(ANSWER, i) for i in range(action_size(self.network))]
         if self.network.output == "argmax":
             return Traced(nodes, numpy.int64), ()
         return Traced(numpy.array(nodes)[None], numpy.float64), ()
 
 
 def check_kind(name: str, maker: Any) -> None:
-    """Raise ValueError for what is neither estimator nor policy."""
+    """Raise ValueError for an object that is neither estimator nor policy."""
     kind = kind_of(maker)
     if kind not in RANKED:
         raise ValueError(
@@ -211,25 +218,25 @@ def check_kind(name: str, maker: Any) -> None:
 
 def steps_of(
     traced: Task, control: str, maker: Any, plain: Model, graph: Graph
-) -> tuple[FilterSteps, "AskedNetwork | None"]:
-    """Make the steps of a competitor on traced arrays, and what stands in its network's place; while a graph is open.
+) -> tuple[FilterSteps, "NetworkPlaceholder | None"]:
+    """Return the steps of a competitor on traced arrays, and the placeholder of its network; a graph must be open.
 
     Args:
         traced: task on traced arrays.
-        control: of the competitor.
-        maker: of it.
+        control: control of the competitor.
+        maker: maker of the competitor.
         plain: model of the same parameters on NumPy.
-        graph: that is open.
+        graph: the open graph.
     """
     if _traced_as(maker) == "learned estimator":
-        policy, network = with_asked_network(maker(plain.task).network, graph)
+        policy, network = replace_network(maker(plain.task).network, graph)
         steered = steer(Model(traced, maker.bank), policy, 1)
         return FilterSteps(steered, functools.partial(clear_missing, traced), steered.decider), network
     if _traced_as(maker) == "gated":
-        inside: list[AskedNetwork | None] = []
+        inside: list[NetworkPlaceholder | None] = []
 
         def replace(policy: Any) -> Any:
-            replaced, network = with_asked_network(policy, graph)
+            replaced, network = replace_network(policy, graph)
             inside.append(network)
             return replaced
 
@@ -241,7 +248,7 @@ def steps_of(
             raise NotTraceable("it does not say that it is traceable")
         return FilterSteps(own, traced.world.mask_missing), None
     acting = plain if traced.parameters is plain.task.parameters else Model(traced, control)
-    policy, network = with_asked_network(make_competitor(maker, acting), graph)
+    policy, network = replace_network(make_competitor(maker, acting), graph)
     if isinstance(policy, RandomPolicy):
         raise NotTraceable("its actions are drawn")
     if not isinstance(policy, Policy):
@@ -250,27 +257,29 @@ def steps_of(
             "run as arrays"
         )
     steered = steer(Model(traced, control), policy)
-    # Where a field says by its name what is received, the program around the filter puts a number there.
+    # Where a field's name marks received values, the program around the filter fills in a number.
     masked = None if traced.world.received_field else functools.partial(clear_missing, traced)
     return FilterSteps(steered, masked, steered.decider, reports_feedback=True), network
 
 
-def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:
-    """Put :class:`AskedNetwork` in the place of the network of a policy, wherever it is inside."""
+def replace_network(policy: Any, graph: Graph) -> tuple[Any, NetworkPlaceholder | None]:
+    """Replace the network of a policy by :class:`NetworkPlaceholder`, wherever it is inside."""
     if _traced_as(policy) == "network":
-        asked = AskedNetwork(policy, graph)
+        asked = NetworkPlaceholder(policy, graph)
         return asked, asked
     place = getattr(policy, "inner", None)
     if place is None:
         return policy, None
-    inner, asked_inside = with_asked_network(getattr(policy, place), graph)
+    inner, asked_inside = replace_network(getattr(policy, place), graph)
     policy = copy.copy(policy)
     setattr(policy, place, inner)
     return policy, asked_inside
 
 
 def _traced_as(found: Any) -> str:
-    """What learned objects are in an export; learning is not imported for that, which may be absent."""
+    """Return the placeholders of learned objects in an export, without importing the learning room, which may be
+    absent.
+    """
     return getattr(found, "traced_as", "")
 
 
@@ -278,7 +287,7 @@ def _traced_as(found: Any) -> str:
 
 
 def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
-    """Every number of nested tuples of arrays of one lane, in the order of ``leaves``."""
+    """Return every number of nested tuples of arrays of one lane, in the order of ``leaves``."""
     if part is None:
         return []
     if isinstance(part, dict | tuple):
@@ -300,7 +309,7 @@ def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
 
 
 def nodes_of(part: Any) -> list[int]:
-    """Expressions of all numbers."""
+    """Return the expressions of all numbers."""
     return [node for array in leaves(part) for node in namespace.asarray(array).nodes.ravel().tolist()]
 
 
@@ -321,7 +330,7 @@ def fill(part: Any, nodes: Sequence[int], graph: Graph) -> Any:
 
 
 def one_lane(part: Any) -> Any:
-    """Nested tuples of arrays ``(..., N)`` with the first lane alone, ``(..., 1)``."""
+    """Return the nested tuples of arrays ``(..., N)`` with the first lane alone, ``(..., 1)``."""
     return map_arrays(lambda array: array[..., :1], part)
 
 
@@ -329,11 +338,11 @@ def one_lane(part: Any) -> Any:
 
 
 class _Classes:
-    """Which members of a state are the same number, and which never change.
+    """Classes of equal members of a state, and of constant ones.
 
-    What starts as one number is taken for one number, and for a constant where it starts as one, until the update
-    disagrees: then they are told apart, and the update is traced again. Numbers that are still told apart after some
-    rounds, as in a window that moves by one each time, are not compared any more.
+    Members that start equal form a class, which is constant if they start constant. Where the update makes them differ,
+    the class is split, and the update is traced again. Classes that still split after some rounds, as in a window that
+    moves by one each time, are given up.
     """
 
     ROUNDS = 4
@@ -347,14 +356,14 @@ class _Classes:
         self.fixed = {c: value for c, value in values.items() if value is not None}
 
     def nodes(self) -> list[int]:
-        """Expressions of the members before an update."""
+        """Return the expressions of the members before an update."""
         return [
             self.graph.constant(self.fixed[c]) if c in self.fixed else self.graph.input(STATE, c)
             for c in self.members
         ]
 
     def split(self, after: Sequence[int]) -> bool:
-        """Tell apart what an update makes different; whether there was anything."""
+        """Split the classes that an update makes different; return whether there were any."""
         pairs = list(zip(self.members, after, strict=True))
         groups: dict[tuple[int, int], int] = {}
         members = [groups.setdefault(pair, i) for i, pair in enumerate(pairs)]
@@ -393,15 +402,15 @@ def trace_filter(
 
     Args:
         task: class of the environment.
-        control: of the competitor.
-        maker: of it.
-        name: of it, in errors.
+        control: control of the competitor.
+        maker: maker of the competitor.
+        name: name of the competitor, in errors.
         plain: model of the control on NumPy, with the parameters of the export.
         template: initial estimate and measurement, any numbers of any width.
-        known: what can be tuned, by the names of competitors: those parameters are free, and the task's.
+        known: tunable parameters by the names of competitors; these and the task's are free.
 
     Raises:
-        ValueError: for what is neither estimator nor policy, or no straight line of arithmetic.
+        ValueError: for a competitor that is neither estimator nor policy, or no straight line of arithmetic.
     """
     check_kind(name, maker)
     found = declaration(plain.task, maker, known, name)
@@ -440,17 +449,17 @@ def _trace_free(
     free: Sequence[Declared],
     fixed: "_Nodes | None" = None,
 ) -> "tuple[TracedFilter, _Nodes] | set[str]":
-    """Trace a competitor with some of its parameters free; or the names of those that cannot be.
+    """Trace a competitor with some of its parameters free, or return the names of those that cannot be.
 
     Args:
         task: class of the environment.
-        control: of the competitor.
-        maker: of it.
+        control: control of the competitor.
+        maker: maker of the competitor.
         plain: model of the control on NumPy.
-        template: as of :func:`trace_filter`.
+        template: initial estimate and measurement, any numbers of any width.
         found: all parameters.
-        free: those that are tried.
-        fixed: expressions of the filter traced without.
+        free: parameters that may become inputs.
+        fixed: expressions of the filter traced without free parameters.
     """
     graph = ParameterGraph(free)
     firsts = [0, *itertools.accumulate(len(one.values) for one in free)]
@@ -475,7 +484,7 @@ def _trace_free(
 
 def _trace(
     steps: FilterSteps,
-    asked: "AskedNetwork | None",
+    asked: "NetworkPlaceholder | None",
     template: tuple[Any, Any],
     graph: ParameterGraph,
     free: Sequence[Declared],
@@ -544,25 +553,25 @@ def _trace(
 
 
 KEPT = 10**9
-"""First row of what the state keeps of it, while a filter is traced."""
+"""First row of the parameters that the state contains, while a filter is traced."""
 DERIVED_WORDS = "Derived from the parameters at the start, constant from then on."
 CLOSE = 1e-9
-"""Difference of a derived number and that of the filter itself, which computes it in another order, at most."""
+"""Largest difference of a derived number to that of the filter itself, which computes it in another order."""
 
 SMALL = 1e-15
-"""The same of numbers that may be zero."""
+"""The same for numbers that may be zero."""
 
 
 class _Nodes(NamedTuple):
-    """Expressions that a filter is made of."""
+    """Expressions of a filter."""
 
     graph: ParameterGraph
     wanted: list[int]
-    """In an order that does not depend on its parameters."""
+    """Expressions in an order that does not depend on the parameters."""
 
 
 def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
-    """Constants of a filter that stand where expressions of the same filter with free parameters stand."""
+    """Return the constants of a filter in the places of the expressions of the same filter with free parameters."""
     one, other, found = plain.graph, free.graph, dict[int, float]()
     waiting = list(zip(plain.wanted, free.wanted, strict=True))
     seen = set(waiting)
@@ -585,18 +594,18 @@ def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
 
 
 class _Derived:
-    """Largest expressions of parameters alone that a filter is made of, in the order of the rows of ``DERIVED``.
+    """Largest expressions of parameters alone in a filter, in the order of the rows of ``DERIVED``.
 
     Args:
-        nodes: of the filter.
+        nodes: expressions of the filter.
         update: results of an update, whose expressions come first.
         start: results of the start of a track.
         plain: expressions of the same filter traced without parameters.
 
     Attributes:
         nodes: the expressions.
-        values: of them in the filter itself, with the parameters in force.
-        kept: how many are of the update.
+        values: their values in the filter itself, with the current parameters.
+        kept: number of those that the update reads.
         stated: rows whose bits a library decides, or that are computed in another order.
     """
 
@@ -638,13 +647,13 @@ class _Derived:
         return list(found | dict.fromkeys(node for node in wanted if kinds[node] == 1))
 
     def program(self) -> StraightLineProgram:
-        """Program from the parameters to these expressions."""
+        """Return the program from the parameters to these expressions."""
         graph = self.graph
         numbers = [graph.node("number", node) if graph.logical[node] else node for node in self.nodes]
         return program(graph, [ProgramResult(DERIVED, row, node) for row, node in enumerate(numbers)])
 
     def read(self) -> None:
-        """Let these expressions be read from then on: by the update from the state, where they are kept."""
+        """Replace these expressions by inputs: of the update from the state, where it contains them."""
         graph = self.graph
         for row, node in enumerate(self.nodes):
             given = (STATE, KEPT + row) if row < self.kept else (DERIVED, row)
@@ -656,7 +665,7 @@ class _Derived:
 
 
 def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Declared], dict[int, int]]:
-    """Parameters of which a row is used, and the rows that theirs become."""
+    """Return the parameters of which a row is used, and their new rows."""
     declared, first = list[Declared](), 0
     moved: dict[int, int] = {}
     for one in free:
@@ -671,7 +680,6 @@ def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Dec
 def _live_members(
     graph: Graph, classes: Sequence[int], after: Sequence[int], wanted: Sequence[int]
 ) -> list[int]:
-    """Members that some result depends on, now or later."""
 
     def read(nodes: Sequence[int]) -> set[int]:
         inputs = (node for node in graph.live(nodes) if graph.operations[node] == "input")
@@ -686,7 +694,7 @@ def _live_members(
 
 
 def _renumbered(code: StraightLineProgram, argument: int, place: Mapping[int, int]) -> StraightLineProgram:
-    """The program with other numbers of the rows of an argument."""
+    """Return the program with other numbers of the rows of an argument."""
     steps, arguments = code.steps, code.steps.arguments.copy()
     inputs = steps.begins[:-1][steps.which("input")]
     rows = 1 + inputs[arguments[inputs] == argument]

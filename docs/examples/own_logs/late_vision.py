@@ -23,7 +23,7 @@ Rail = filtergym.state_space(
 
 
 def follow(policy, imu, fixes):
-    """Estimates after each sample of the IMU; fixes are `(time, arrival, position)`, in the order of their arrival."""
+    """Return the estimates after each sample of the IMU; fixes are `(time, arrival, position)`, in order of arrival."""
     filter, waiting, estimates = filtergym.online("mine/LateVision-v0", policy, lag=40), list(fixes), []
     filter.start(mean=[0, 0, 0], covariance=Rail.definition.covariance)
     for time, acceleration in imu:

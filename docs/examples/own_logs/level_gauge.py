@@ -1,4 +1,4 @@
-"""A reservoir: a gauge that drifts and speaks irregularly, and a dip stick twice a day."""
+"""A reservoir: a gauge that drifts and reports irregularly, and a dip stick twice a day."""
 
 import numpy as np
 

@@ -34,7 +34,7 @@ def gps_odometry(rng, seconds=120, dt=0.1):
 
 
 def level_gauge(rng, days=10):
-    """A reservoir: inflow wanders, the gauge drifts. It speaks about each 10 minutes, a dip stick twice a day."""
+    """A reservoir: inflow wanders, the gauge drifts. It reports about each 10 minutes, a dip stick twice a day."""
     dt, n = 60.0, days * 1440
     rate = correlated(rng, n, dt, 0.05 / 3600, 6 * 3600)
     level = rng.normal(10.0, 0.1) + np.cumsum(rate) * dt
@@ -50,7 +50,7 @@ def level_gauge(rng, days=10):
 
 
 def pitch_roll(rng, seconds=30, dt=0.02, fine=10):
-    """A drone that rolls over: gyroscope with drifting bias, accelerometer that also feels its accelerations."""
+    """A drone that rolls over: gyroscope with drifting bias, accelerometer that also measures its accelerations."""
     n = int(seconds / dt)
     h = dt / fine
     p = 1.0 + correlated(rng, n * fine, h, 0.8, 1.0)
@@ -96,7 +96,7 @@ def battery(rng, seconds=3600, dt=2.0):
 
 
 def late_vision(rng, seconds=20, dt=0.01):
-    """A rail: an accelerometer each 10 ms with a bias, and a camera each 200 ms that takes 150 ms to answer."""
+    """A rail: an accelerometer each 10 ms with a bias, and a camera each 200 ms with a delay of 150 ms."""
     n = int(seconds / dt)
     a = correlated(rng, n, dt, 1.5, 0.7)
     v = np.cumsum(a) * dt
@@ -117,7 +117,7 @@ JUDGED = 10
 
 
 def write_logs(folder, machines=MACHINES):
-    """Write the logs; those that are judged have other seeds than the one that is fitted to."""
+    """Write the logs; the judged logs have other seeds than the fitted one."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in machines:
         for file, seeds in ((name, range(1)), (f"{name}_judged", range(1, 1 + JUDGED))):

@@ -1,4 +1,4 @@
-"""Lets a filter of yours compete as a program: copy this file beside it. It needs nothing but Python.
+"""Makes your filter a program that competes: copy this file beside it. It needs only Python.
 
 filtergym evaluate filtergym/ManeuveringTarget-v0 --policy "exec:python my_filter.py" --policy imm
 """
@@ -8,13 +8,13 @@ import sys
 
 
 def serve(begin):
-    """Answer the measurements of some tracks until there are no more.
+    """Write the estimates of some tracks until their measurements end.
 
     Args:
         begin: called for each track with the hello and with its initial estimate; returns what is called with each of
             its measurements and returns mean and covariance. Fields come by their names, None where nothing was received.
     """
-    answers, sys.stdout = sys.stdout, sys.stderr  # what a filter prints is no answer
+    answers, sys.stdout = sys.stdout, sys.stderr  # the filter's own prints are no estimates
     hello = json.loads(sys.stdin.readline())
     print(json.dumps({"filtergym": 1, "format": "json"}), file=answers, flush=True)
     tracks = [begin(hello, initial) for initial in split(sys.stdin.readline(), "initial")]

@@ -1,4 +1,4 @@
-"""Results as pages that stand alone: the report of a benchmark and of advice, as HTML, with the outcome in sentences.
+"""Results as self-contained HTML pages: the report of a benchmark and of advice, with the outcome in sentences.
 
-Knows ``tables``. Begin with :mod:`.html_report`; :mod:`.html_page` is what every page is written into.
+It imports ``tables``. Begin with :mod:`.html_report`; :mod:`.html_page` writes every page.
 """

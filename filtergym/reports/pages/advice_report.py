@@ -1,4 +1,4 @@
-"""An advice as one self-contained page: sentences, tables, the checks of the log, and pictures of what was found.
+"""An advice as one self-contained page: sentences, tables, the checks of the log, and pictures of the results.
 
 Time in pictures is in seconds since the first row of the log.
 """
@@ -34,11 +34,11 @@ from ..tables.results import Settings
 from .html_page import pack, render_page
 
 MOST_EPISODES = 12
-"""That are drawn."""
+"""Largest number of drawn episodes."""
 MOST_POINTS = 4000
-"""Of a line; of longer recordings every second, third ... is drawn."""
+"""Largest number of points of a line; of longer recordings every second, third ... is drawn."""
 WINDOWS_OF_NIS = 40
-"""Into which a recording is cut for its mean NIS, at most, and measurements of one, at least."""
+"""Largest number of windows of a recording for its mean NIS, and least number of measurements in one."""
 SHORTEST_WINDOW = 10
 DIGITS = 6
 ROLES = {"fitted": "fitted to", "chosen": "chosen by", "judged": "judged by"}
@@ -50,11 +50,11 @@ def advice_html(
     """Return the page.
 
     Args:
-        advice: of :func:`~..baselines.advice.advise`.
-        task: of the recording, with its parameters.
-        sentences: what is said of it after the first one.
+        advice: advice from :func:`~..baselines.advice.advise`.
+        task: task of the recording, with its parameters.
+        sentences: sentences after the first one.
         learned: names of shipped agents.
-        settings: how it was made.
+        settings: command and versions.
     """
     replay = advice.replay()
     return render_page(
@@ -95,12 +95,12 @@ def advice_html(
 
 
 def _shown(advice: Advice) -> list[str]:
-    """Who is drawn: the advised one first."""
+    """Return the names of the drawn filters, the advised one first."""
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
 
 
 def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]]:
-    """Parameters of a fitted filter in words; intervals where they were computed."""
+    """Return the parameters of a fitted filter in words; intervals where they were computed."""
     tunable, found, profiles = advice.tunables[name], advice.fits[name], advice.profiles.get(name, {})
     for key, value in found.values.items():
         interval = profiles[key].interval if key in profiles else None
@@ -108,7 +108,6 @@ def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]
 
 
 def _log_lines(advice: Advice) -> Iterator[str]:
-    """What was read, and which part of it served for what."""
     yield from reading_lines(advice.recording)
     share = advice.share
     counts = [
@@ -125,7 +124,7 @@ def _log_lines(advice: Advice) -> Iterator[str]:
 
 
 def _episodes(advice: Advice, replay: xarray.Dataset, task: Task) -> Iterator[dict[str, Any]]:
-    """What is drawn of each track of the recording."""
+    """Return the drawn data of each track of the recording."""
     recording = advice.recording
     for episode in range(min(replay.sizes["episode"], MOST_EPISODES)):
         rows = min(int(recording.rows[episode]), replay.sizes["time"])
@@ -147,12 +146,12 @@ def _episodes(advice: Advice, replay: xarray.Dataset, task: Task) -> Iterator[di
 
 
 def _numbers(values: numpy.ndarray) -> list[float | None]:
-    """Numbers as JSON has them, in few digits."""
+    """Return numbers in JSON's types, in few digits."""
     return [float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None for value in values]
 
 
 def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tuple[str, float, float]]:
-    """What each stretch of the track served for, from which second to which."""
+    """Return the use of each stretch of the track, with its first and last second."""
     share = advice.share
     if not share.apart:
         return
@@ -167,8 +166,8 @@ def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tup
 def _track(
     run: xarray.Dataset, task: Task, names: Sequence[str], step: int, is_outlier: numpy.ndarray
 ) -> dict[str, Any]:
-    """Where the target was measured, estimated and truly was, and which measurements are taken for outliers: of a plane
-    its two axes, else the main component.
+    """Return measurements, estimates, truth and outliers of a track: of a plane its two axes, else the main
+    component.
     """
     measured = received(run.isel(policy=0), task)
     log_format = find_companion(task, LogFormat)
@@ -202,7 +201,7 @@ def _track(
 
 
 def _onboard(advice: Advice, episode: int, rows: int, step: int) -> dict[str, Any]:
-    """Where the vehicle's own filter was at the fixes."""
+    """Return the positions of the vehicle's own filter at the fixes."""
     if advice.onboard is None:
         return {}
     places = advice.onboard.positions[episode, :rows:step]
@@ -210,7 +209,7 @@ def _onboard(advice: Advice, episode: int, rows: int, step: int) -> dict[str, An
 
 
 def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
-    """Innovations of a competitor, scaled so that their squares sum to the NIS: of deviation one each."""
+    """Return the innovations of a competitor, scaled so that their squares sum to the NIS: of deviation one each."""
     if "prediction_error" not in run or "nis" not in run:
         return {}
     groups = run["measured_group"].values
@@ -226,7 +225,9 @@ def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
 
 
 def _mean_nis(run: xarray.Dataset, name: str, seconds: numpy.ndarray) -> dict[str, Any]:
-    """Mean NIS over its dimension in windows of the recording, and the chi-square band of each, over seconds."""
+    """Return the mean NIS over its dimension in windows of the recording, and the chi-square band of each, over
+    seconds.
+    """
     nis, degrees = (run[key].sel(policy=name).values[0] for key in ("nis", "nis_degrees"))
     there = numpy.flatnonzero(numpy.isfinite(nis) & (degrees > 0.0))
     size = max(SHORTEST_WINDOW, -(-len(there) // WINDOWS_OF_NIS))
@@ -243,7 +244,7 @@ def _mean_nis(run: xarray.Dataset, name: str, seconds: numpy.ndarray) -> dict[st
 
 
 def _profiles(advice: Advice) -> Iterator[dict[str, Any]]:
-    """Likelihood of every parameter of the fitted filter, the others adapted."""
+    """Return the likelihood of every parameter of the fitted filter, the others adapted."""
     name = advice.fitted.name
     for key, profile in advice.profiles[name].items():
         plain = key.removeprefix("log10_")

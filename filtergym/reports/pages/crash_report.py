@@ -24,7 +24,7 @@ PAGE_WIDTH = 150
 
 
 def count_verdicts(findings: Sequence[Finding]) -> str:
-    """Say how often each verdict was given: ``14 passed, 6 degraded, 2 failed``."""
+    """Return the counts of the verdicts: ``14 passed, 6 degraded, 2 failed``."""
     counts = Counter(finding.verdict for finding in findings)
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in (PASSED, DEGRADED, FAILED))
 
@@ -33,8 +33,8 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
     """Return the table of one competitor, a line for each alteration that applies.
 
     Args:
-        findings: of the competitor, in the order of the catalogue.
-        described: whether each line says what happens.
+        findings: findings of the competitor, in the order of the catalogue.
+        described: whether each line describes the alteration.
     """
     left_out = [finding.alteration for finding in findings if finding.reason == NOT_CONTAINED]
     notes = f"Does not apply, as {NOT_CONTAINED}: {', '.join(left_out)}." if left_out else ""
@@ -55,11 +55,11 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
 
 
 def crash_page(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
-    """Return a page of HTML that needs nothing else.
+    """Return a self-contained page of HTML.
 
     Args:
-        title: above the tables.
-        tables: of :func:`crash_table`.
+        title: title above the tables.
+        tables: tables from :func:`crash_table`.
         notes: sentences below them.
     """
     console = Console(width=PAGE_WIDTH, record=True, file=io.StringIO(), force_terminal=True)

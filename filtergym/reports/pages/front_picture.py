@@ -18,16 +18,16 @@ class FrontImage(NamedTuple):
 
     title: str
     words: str
-    """Who is on the front, the quickest first; where the user's own stand; and who costs more than is drawn."""
+    """Sentences on the front, the quickest first, on the user's own competitors, and on those outside the picture."""
     address: str
-    """The image itself, as a ``data:`` address."""
+    """The image as a ``data:`` address."""
 
 
 def front_images(results: Sequence[Result]) -> list[FrontImage]:
     """Draw each environment of the table of the best whose competitors were timed.
 
     Args:
-        results: as of :func:`.headline.headline`.
+        results: results as in :func:`.headline.headline`.
     """
     found = []
     for result, _ in headline(results):
@@ -59,7 +59,7 @@ def _place(point: Point) -> str:
 
 @in_print
 def _draw(panel: FrontPanel, *, columns: int) -> bytes:
-    """Return the panel as SVG whose letters are lines, the same bytes every time."""
+    """Return the panel as SVG with letters as lines, the same bytes every time."""
     from matplotlib import rc_context
 
     # Names are of anybody: between two dollars they are no formulas.

@@ -1,6 +1,6 @@
-"""What self-contained pages share: packed data, Plotly, and scripts that run by their hashes and nothing else.
+"""Common parts of self-contained pages: packed data, Plotly, and scripts that run by their hashes only.
 
-Whatever stands in the data is text: the template escapes it, the figures' data are packed, and the page's content
+All data are text: the template escapes them, the figures' data are packed, and the page's content
 security policy runs two scripts only, the page's own and Plotly's.
 """
 
@@ -23,9 +23,9 @@ def render_page(template: str, script: str, **values: Any) -> str:
     """Return a page of a template.
 
     Args:
-        template: name of its file.
-        script: likewise, of the page's own script.
-        **values: what the template shows.
+        template: file name of the template.
+        script: file name of the page's own script.
+        **values: values of the template.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HTML), autoescape=True, trim_blocks=True, lstrip_blocks=True
@@ -47,17 +47,17 @@ def _hash(script: str) -> str:
 
 
 def pack(values: Any) -> str:
-    """JSON, compressed, in characters that mean nothing in HTML; the same bytes every time."""
+    """Return JSON, compressed, in characters without meaning in HTML; the same bytes every time."""
     return pack_text(json.dumps(values, allow_nan=False, separators=(",", ":")))
 
 
 def pack_text(text: str) -> str:
-    """Text, compressed likewise."""
+    """Return text, compressed, in characters without meaning in HTML."""
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
 def mark_code(text: str) -> markupsafe.Markup:
-    """Words between backticks as code, everything escaped."""
+    """Return text with the words between backticks as code, everything escaped."""
     parts = re.split(r"`([^`]*)`", text)
     pieces = [
         markupsafe.Markup("<code>{}</code>").format(part) if i % 2 else markupsafe.escape(part)

@@ -1,4 +1,4 @@
-"""One self-contained page from a file of results: it opens offline, and executes nothing of what the file says."""
+"""One self-contained page from a file of results: it opens offline, and executes nothing of the file."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ from .outcome import outcome_sentences, own_sentences, protocol_sentences
 from .why_section import why_section, worst_data
 
 WORDS = ("competitor", "covariance", "origin", "control")
-"""Columns that hold no numbers."""
+"""Columns without numbers."""
 
 
 class Entry(NamedTuple):
@@ -38,15 +38,15 @@ class Entry(NamedTuple):
 
     text: str
     sorted_by: float | str | None = None
-    """None: stands last, whatever the order."""
+    """Key for sorting; None: last in any order."""
 
 
 def report_html(results: Sequence[Result], settings: Settings) -> str:
     """Return the page.
 
     Args:
-        results: of any environments and scenarios.
-        settings: how they were made.
+        results: results of any environments and scenarios.
+        settings: command and versions.
 
     Raises:
         ValueError: if there are none.
@@ -84,7 +84,6 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
 
 
 def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any]:
-    """What the template shows of an environment in a scenario."""
     first = result.records[0]
     header, rows = _table(result)
     return {
@@ -114,7 +113,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
 
 
 def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
-    """Header and rows of every competitor, lowest cost first; smoothers, references and bounds last."""
+    """Return the header and rows of every competitor, lowest cost first; smoothers, references and bounds last."""
     records = result.records
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     shown = main_components(records)
@@ -187,7 +186,9 @@ def _number(text: str) -> float | None:
 
 
 def _differences(result: Result) -> list[list[Any]]:
-    """Name, and cost against the paper's algorithm with its interval in percent, of the ranked and the reference."""
+    """Return name, and cost against the paper's algorithm with its interval in percent, of the ranked competitors and
+    the reference.
+    """
     found: dict[str, Record] = {
         r.policy: r for r in result.records if (r.metric, r.window) == (HEADLINE, "all")
     }
@@ -202,8 +203,8 @@ def _differences(result: Result) -> list[list[Any]]:
 
 
 def _front(result: Result) -> list[list[Any]]:
-    """Name, origin, nanoseconds, cost against the paper's algorithm in percent, whether compiled, and whether on the
-    front, of the ranked and the reference.
+    """Return name, origin, nanoseconds, cost against the paper's algorithm in percent, whether compiled, and whether on
+    the front, of the ranked competitors and the reference.
     """
     points = points_of_records(result.records)
     on_front = front(points)
@@ -222,8 +223,8 @@ def _front(result: Result) -> list[list[Any]]:
 
 
 def _dots(group: Sequence[Result]) -> dict[str, Any]:
-    """What the picture over all scenarios of an environment shows: the competitors of the curves of the training
-    distribution, of which the verdict speaks; where it was not run, of the first scenario.
+    """Return the content of the picture over all scenarios of an environment: the competitors of the curves of the
+    training distribution, to which the verdict refers; where it was not run, of the first scenario.
     """
     shown = next((result for result in group if result.default), group[0])
     return {
@@ -237,7 +238,9 @@ def _dots(group: Sequence[Result]) -> dict[str, Any]:
 
 
 def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
-    """Name, origin and colour of what is drawn; a name has the same colour in all scenarios of its environment."""
+    """Return name, origin and colour of the drawn competitors; a name has the same colour in all scenarios of its
+    environment.
+    """
     names: dict[str, str] = {}
     for one in [*(other for other in group if other.default), *group]:
         kinds = {record.policy: record.kind for record in one.records}
@@ -268,16 +271,16 @@ class Figure(NamedTuple):
     """A figure of a scenario."""
 
     kind: str
-    """By which the page's script draws it."""
+    """Kind, by which the page's script draws it."""
     title: str
     text: str
-    """What it shows."""
+    """Description."""
     alternative: str
-    """What reads it instead of looking."""
+    """Alternative for readers who do not see it."""
 
 
 def _figures(result: Result) -> Iterator[Figure]:
-    """Yield the figures of a scenario, of whatever there is data for."""
+    """Yield the figures of a scenario for which there are data."""
     found = {(r.policy, r.metric, r.component): r for r in result.records if r.window == "all"}
     order = [name for name, kind, _ in rank_competitors(result.records) if kind in RANKED]
 
@@ -295,7 +298,7 @@ def _figures(result: Result) -> Iterator[Figure]:
             f"Cost against {result.paper or 'the paper'}",
             "Geometric mean of the ratios of the episodes' costs, less one, with its paired 95 % interval; "
             "left of zero is better.",
-            "The table above holds these numbers.",
+            "The table above contains these numbers.",
         )
     if points := points_of_records(result.records):
         yield Figure(
@@ -342,7 +345,7 @@ def _figures(result: Result) -> Iterator[Figure]:
             "Gains, weights and actions over time",
             "Mean over episodes; bands hold 95 % of the mean of a probability, and eight of ten episodes of an action "
             "or a gain.",
-            "What each competitor steers, and how, says the page of the environment.",
+            "The page of the environment describes the action of each competitor.",
         )
     if result.track is not None:
         yield Figure(
@@ -356,11 +359,11 @@ def _figures(result: Result) -> Iterator[Figure]:
         yield Figure(
             "worst",
             "The worst episodes",
-            "Those that cost a competitor most, beside whom it is compared with: truth, what was measured, estimates, "
+            "Those that cost a competitor most, beside its opponent: truth, measurements, estimates, "
             "and their covariances at two standard deviations. The slider begins where the error is largest.",
-            "An animation of single episodes; the tables of the causes tell their seeds and costs.",
+            "An animation of single episodes; the tables of the causes contain their seeds and costs.",
         )
 
 
 BEHAVIOUR_CURVES = {"mode_probability", "true_class_probability", "action", "gain"}
-"""Curves of what competitors do."""
+"""Curves of the competitors' actions."""

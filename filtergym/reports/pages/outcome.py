@@ -1,4 +1,4 @@
-"""What a benchmark comes to: one sentence for each environment, for readers who know nothing of this package."""
+"""The outcome of a benchmark: one sentence for each environment, for readers new to this package."""
 
 import itertools
 import math
@@ -13,28 +13,29 @@ from ..tables.results import Result
 from ..tables.terminal_tables import HEADLINE, consistency_word
 
 HALF = (0.45, 0.55)
-"""Share of the paper's cost that is called half of it."""
+"""Range of the cost ratio that is called half."""
 
 
 def outcome_sentences(results: Sequence[Result]) -> list[str]:
-    """Say of each environment how the best competitor stands to the paper's algorithm, and learned to classical ones.
+    """Return a sentence for each environment on the best competitor against the paper's algorithm, and on learned
+    against classical ones.
 
-    Two competitors are called level where the interval of their paired difference holds zero.
+    Two competitors are called level where the interval of their paired difference contains zero.
 
     Args:
-        results: of which those of training distributions are taken; where there is none, all.
+        results: results, of which those of training distributions are used; where there is none, all.
     """
     usual = [result for result in results if result.default] or list(results)
     return [sentence_of(result) for result in usual if ranking(result.records)]
 
 
 def own_sentences(records: Sequence[Record], own: Sequence[str], paper: str) -> list[str]:
-    """Say of each of the user's own competitors what it costs against the paper's algorithm and the best of the others,
-    and whether its covariance is as large as its errors.
+    """Return a sentence for each of the user's competitors on its cost against the paper's algorithm and the best of
+    the others, and on its consistency.
 
     Args:
-        records: of one environment and scenario whose truth is known.
-        own: names of the user's.
+        records: records of one environment and scenario with a truth.
+        own: names of the user's competitors.
         paper: name of the paper's algorithm; it may be missing in the records.
     """
     return [
@@ -64,8 +65,8 @@ def _own_sentence(records: Sequence[Record], name: str, paper: str) -> str:
 
 
 def _comparison(difference: Record, other: str, first: bool) -> str:
-    """Say by how much a cost is above or below another's, where the interval of their paired ratio leaves one out; the
-    first comparison of a sentence names what is compared.
+    """Return how far a cost is above or below another's, where the interval of their paired ratio excludes one; the
+    first comparison of a sentence names the quantity.
     """
     value = difference.value or 0.0
     if _low(difference) <= 0.0 <= _high(difference):
@@ -77,10 +78,10 @@ def _comparison(difference: Record, other: str, first: bool) -> str:
 
 
 def protocol_sentences(results: Sequence[Result]) -> list[str]:
-    """Say what the sentences and the table below them rest on.
+    """Return sentences on the basis of the outcome sentences and of the table below them.
 
     Args:
-        results: as of :func:`outcome_sentences`.
+        results: results as in :func:`outcome_sentences`.
     """
     records = [result.records[0] for result in results if result.default or not _any_default(results)]
     if not records:
@@ -90,9 +91,9 @@ def protocol_sentences(results: Sequence[Result]) -> list[str]:
     each = " to ".join(f"{number:,}" for number in dict.fromkeys((episodes[0], episodes[-1])))
     return [
         f"Every competitor met the same {each} episodes of an environment ({first.split} split, seed {first.seed}). "
-        "Ranges hold 95 %; competitors are level where that of their ratio holds one. Error cost is the mean squared "
-        "error of the estimate, in a control loop the loop's quadratic cost; its ratios are geometric means over the "
-        "episodes, which no single one owns; times are of one processor core."
+        "Ranges hold 95 %; competitors are level where that of their ratio contains one. Error cost is the mean "
+        "squared error of the estimate, in a control loop the loop's quadratic cost; its ratios are geometric means "
+        "over the episodes, which no single one dominates; times are of one processor core."
     ]
 
 
@@ -101,7 +102,7 @@ def _any_default(results: Sequence[Result]) -> bool:
 
 
 def sentence_of(result: Result) -> str:
-    """Return the sentence on one environment and scenario, in which somebody is ranked."""
+    """Return the sentence on one environment and scenario with at least one ranked competitor."""
     places = ranking(result.records)
     first = _best_clause(result, places[0])
     rival = rival_of(places, result.learned)
@@ -135,7 +136,7 @@ def _subject(result: Result) -> str:
 
 
 def _best_clause(result: Result, best: Record) -> str:
-    """Say who has the lowest error cost, and how much less than the paper's algorithm."""
+    """Return a clause on the competitor of the lowest error cost, and on its difference to the paper's algorithm."""
     if best.policy == result.paper:
         return f"the paper's `{best.policy}` has the lowest error cost"
     what = "learned" if best.policy in result.learned else "classical"
@@ -157,27 +158,27 @@ class Lead(NamedTuple):
     """Times of a measurement for which the cheapest of one origin costs less than the cheapest of the other."""
 
     name: str
-    """Who leads where the most time is allowed."""
+    """Name of the leader where the most time is allowed."""
     first: float
-    """From so many nanoseconds on."""
+    """Lower end, ns."""
     last: float
-    """Up to the time of the competitor that ends the lead."""
+    """Upper end, ns: the time of the competitor that ends the lead."""
 
 
 def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) -> Lead | None:
-    """Return where competitors of an origin lead in computing time, though another one has a lower cost.
+    """Return the times in which competitors of an origin lead, though another one has a lower cost.
 
-    Someone leads where the interval of its cost against the paper's algorithm lies below that of the cheapest of the
-    other origin that takes no more time: a stricter test than that of their paired difference, which records hold only
-    against the best.
+    A competitor leads where the interval of its cost against the paper's algorithm lies below that of the cheapest of
+    the other origin that takes no more time: a stricter test than that of their paired difference, which records
+    contain only against the best.
 
     Args:
-        records: of one environment and scenario.
-        learned: names of those that were learned.
+        records: records of one environment and scenario.
+        learned: names of learned competitors.
         origin: "learned" or "classical", that of the best excluded.
 
     Returns:
-        The longest times for which they lead; None where they lead nowhere, or times are not known.
+        The longest times for which they lead; None where they lead nowhere, or times are unknown.
     """
     times = {name: time.nanoseconds for name, time in times_of_records(records).items()}
     costs = {
@@ -218,7 +219,7 @@ def _high(record: Record) -> float:
 
 
 def _percent(share: float) -> str:
-    """Per cent in two digits, or in three where that is nearly all."""
+    """Return the percentage in two digits, or in three near 100."""
     percent = 100.0 * share
     digits = 1 if abs(percent) < 9.95 or 99.0 <= percent < 100.0 else 0
     return f"{percent:,.{digits}f}"

@@ -1,4 +1,4 @@
-"""The part of a report that says why: cost and consistency by cause, and the worst episodes."""
+"""The part of a report on causes: cost and consistency by cause, and the worst episodes."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,10 +10,10 @@ from ..tables.terminal_tables import with_interval
 
 
 def why_section(result: Result) -> list[dict[str, Any]]:
-    """Return what the template shows of every competitor whose cost is split: those to be explained first, and open.
+    """Return the template's values of every competitor whose cost is split: explained ones first, and open.
 
     Args:
-        result: of one environment and scenario.
+        result: result of one environment and scenario.
     """
     names = dict.fromkeys([*result.explained, *(record.policy for record in result.records)])
     found = []
@@ -45,7 +45,6 @@ def why_section(result: Result) -> list[dict[str, Any]]:
 
 
 def _row(result: Result, reason: Reason, against: bool) -> tuple[str, str, list[str]]:
-    """Name of a cause, when it holds, and its numbers."""
     numbers = [
         with_interval(reason.measurements, 100.0, negligible=0.005),
         with_interval(reason.share, 100.0, negligible=0.005),
@@ -64,7 +63,7 @@ def _worst_row(result: Result, one: WorstTrack) -> list[str]:
 
 
 def main_causes_in_words(one: WorstTrack, phrases: Mapping[str, str]) -> str:
-    """Say where the cost of an episode falls mostly.
+    """Return the main causes of an episode's cost in words.
 
     Args:
         one: the episode.
@@ -74,7 +73,7 @@ def main_causes_in_words(one: WorstTrack, phrases: Mapping[str, str]) -> str:
 
 
 def worst_data(result: Result) -> list[dict[str, Any]]:
-    """Return the worst episodes as the page's figure takes them."""
+    """Return the worst episodes in the form of the page's figure."""
     return [
         {
             "policy": one.policy,

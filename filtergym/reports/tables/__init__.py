@@ -1,4 +1,4 @@
-"""Results as tables and sentences: who ranks where, by how much and at what time, for terminals and documents.
+"""Results as tables and sentences for terminals and documents: ranking, differences and times.
 
-Knows what is evaluated and no page. Begin with :mod:`.results`, the one table of results that all others read.
+It imports evaluations and no pages. Begin with :mod:`.results`, the one table of results that all others read.
 """

@@ -1,4 +1,4 @@
-"""An advice in words and as a table: which filter, which numbers, and why."""
+"""An advice in words and as a table: the filter, its parameters, and the reasons."""
 
 import math
 import textwrap
@@ -18,40 +18,42 @@ from ...envs.data.recording import Recording
 from ...evaluation.statistics.bootstrap import IntervalEstimate
 
 MOST_OUTLIERS = 12
-"""Named in a sentence."""
+"""Largest number of outliers in a sentence."""
 MOST_ROWS = 12
 LEAST_CORRELATION = 0.1
-"""Of successive prediction errors, from which on it is spoken of."""
+"""Correlation of successive prediction errors from which the advice mentions it."""
 SMALL_SCALE = 0.3
-"""Of the noise, below which most of the error must last longer than a measurement, or is not as stated."""
+"""Scale of the noise below which most of the error lasts longer than a measurement, or the stated
+deviations are wrong.
+"""
 LARGE_SCALE = 5.0
-"""Above which what was measured may be no motion."""
+"""Scale of the noise above which the measured motion may fit no model."""
 NAME_WIDTH = 16
-"""Columns of a name; longer ones go on below."""
+"""Columns of a name; longer ones are broken."""
 COLUMNS = {"nats": 6, "less": 8, "RMSE": 6, "against, %": 8, "NIS": 4, "correl-\nation": 8}
-"""Of the table, and how wide they are at least, so that no number is cut."""
+"""Columns of the table, and their least widths, so that no number is cut."""
 WITHHELD = {"with-\nheld": 6}
-"""The column of the errors at withheld fixes, where a log holds the estimate of the vehicle's own filter."""
+"""Column of the errors at withheld fixes, where a log contains the estimate of the vehicle's own filter."""
 PRICES = {
     "operations": "operations",
     "state, bytes": "state_bytes",
     "weights, bytes": "weight_bytes",
     "stack, bytes": "stack_bytes",
 }
-"""Columns of what an update costs, and the parts of a price."""
+"""Columns of the cost of an update, and the parts of a price."""
 NEGLIGIBLE = 5e-4
-"""Difference of errors that is none in the digits of a sentence."""
+"""Difference of errors that is zero in the digits of a sentence."""
 FEW = 80
-"""Measurements below which an advice warns."""
+"""Number of measurements below which an advice warns."""
 FEWEST_MEASUREMENTS = 30
-"""From which on a log is more than a guess; a choice: six for each of some five parameters."""
+"""Least number of measurements of an informative log; a choice: six for each of some five parameters."""
 
 
 def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
-    """Compare the advised filter with the other fitted ones, its rival, the best in hindsight and whoever follows.
+    """Compare the advised filter with the other fitted ones, its rival, the best in hindsight and the next ones.
 
     Args:
-        advice: of :func:`~..baselines.advice.advise`.
+        advice: advice from :func:`~..baselines.advice.advise`.
         learned: names of shipped agents.
     """
     recording = advice.recording
@@ -84,16 +86,16 @@ class Row(NamedTuple):
     name: str
     label: str
     cells: tuple[str, ...]
-    """In the order of :func:`advice_columns`."""
+    """Cells in the order of :func:`advice_columns`."""
 
 
 def advice_columns(advice: Advice) -> dict[str, int]:
-    """Return the columns of the table of an advice, and how wide they are at least."""
+    """Return the columns of the table of an advice, and their least widths."""
     return {**COLUMNS, **({} if advice.onboard is None else WITHHELD)}
 
 
 def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
-    """Return what stands in the table: the advised filter first, the vehicle's own last; arguments as of
+    """Return the rows of the table: the advised filter first, the vehicle's own last; arguments as of
     :func:`advice_table`.
     """
     errors = None if advice.onboard is None else advice.onboard.errors
@@ -103,7 +105,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
     room = MOST_ROWS - len(keep)
     rest: list[JudgedFilter] = []
     for each in advice.competitors:  # a filter that answers as another does in this log needs no row
-        if each not in keep and not any(_answers_alike(each, other) for other in [*keep, *rest]):
+        if each not in keep and not any(_has_same_results(each, other) for other in [*keep, *rest]):
             rest.append(each)
     agents = [c for c in rest if c.name in learned]
     keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
@@ -123,8 +125,8 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
 
 
 def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
-    """What an update of each filter of :func:`advice_table` costs, in the order of ``PRICES``; empty where it is known
-    of none.
+    """Return the cost of an update of each filter of :func:`advice_table`, in the order of ``PRICES``; empty where none
+    is known.
     """
     names = [row.name for row in advice_rows(advice, learned) if row.name != ONBOARD]
     prices = {name: advice.prices[name] for name in names}
@@ -136,11 +138,11 @@ def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[
 
 
 def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
-    """Put :func:`price_rows` into a table; None where there are none."""
+    """Return a table of :func:`price_rows`; None where there are none."""
     rows = price_rows(advice, learned)
     if not rows:
         return None
-    table = Table(title="What an update costs in C, in double precision", title_justify="left")
+    table = Table(title="Cost of an update in C, in double precision", title_justify="left")
     table.add_column("filter", no_wrap=True)
     for title in PRICES:
         table.add_column(title, justify="right")
@@ -149,14 +151,14 @@ def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
     return table
 
 
-def _answers_alike(one: JudgedFilter, other: JudgedFilter) -> bool:
-    """Whether two filters say the same of every number of a log: likelihoods that are not known are not the same."""
+def _has_same_results(one: JudgedFilter, other: JudgedFilter) -> bool:
+    """Return whether two filters give the same numbers on a log; unknown likelihoods count as different."""
     compared = "log_likelihood", "gain", "difference", "prediction"
     return all(getattr(one, name) == getattr(other, name) for name in compared)
 
 
 def reading_lines(recording: Recording) -> Iterator[str]:
-    """Say what was read, before anything is fitted: how much, of which errors, and what is noteworthy."""
+    """Return sentences on the log before a fit: its size, the errors of its measurements, and notes."""
     seconds = recording.seconds
     steps = numpy.diff(seconds, axis=1)
     missed = ""
@@ -172,7 +174,7 @@ def reading_lines(recording: Recording) -> Iterator[str]:
     yield from _extent(recording)
     if int(recording.rows.sum()) < FEWEST_MEASUREMENTS:
         yield (
-            f"Fewer than {FEWEST_MEASUREMENTS} measurements tell filters apart by chance alone: what follows is a "
+            f"Fewer than {FEWEST_MEASUREMENTS} measurements separate filters by chance alone: the advice below is a "
             "guess, and a longer log is better."
         )
     if recording.deviations:
@@ -185,7 +187,7 @@ def reading_lines(recording: Recording) -> Iterator[str]:
 
 
 def _extent(recording: Recording) -> Iterator[str]:
-    """Say how far and how fast the positions move, which shows a wrong unit to who knows the target."""
+    """Return the span and the speed of the positions, which show a wrong unit to a reader who knows the target."""
     position = recording.measurements.get("position")
     if position is None:
         return
@@ -204,7 +206,7 @@ def _extent(recording: Recording) -> Iterator[str]:
 
 
 def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
-    """Return what the judged measurements say of the advised filter; None where it is not known."""
+    """Return the results of the advised filter on the judged measurements; None where unknown."""
     one = advice.advised
     numbers = {
         "measurements": float(sum(span.last - span.first for span in advice.share.judged)),
@@ -220,7 +222,6 @@ def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
 
 
 def _label(advice: Advice, one: JudgedFilter) -> str:
-    """Name of a filter, and what it is here."""
     role = "fitted" if one.fitted else "rival" if one.name == advice.rival else ""
     role = "advised" if one is advice.advised else role
     return f"{one.name} ({role})" if role else one.name
@@ -243,23 +244,25 @@ def _interval(estimate: IntervalEstimate, form: str) -> str:
 
 
 def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Say what is advised, with which numbers, how sure that is, and what cannot be known.
+    """Return lines on the advised filter, its parameters, their certainty, and unknown quantities.
 
     Args:
-        advice: of :func:`~..baselines.advice.advise`.
+        advice: advice from :func:`~..baselines.advice.advise`.
         learned: names of shipped agents.
     """
     one = advice.fitted
     yield verdict(advice)
     if one is not advice.advised:
-        yield f"Of what was fitted {one.name} comes closest, with"
+        yield f"Of the fitted filters {one.name} comes closest, with"
     for line in parameter_lines(advice.tunables[one.name], advice.fits[one.name], advice.intervals):
         yield f"  {line}"
     yield from further_sentences(advice, learned)
 
 
 def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Say how sure the advice is and what cannot be known; arguments as of :func:`advice_lines`."""
+    """Return sentences on the certainty of the advice and on unknown quantities; arguments as of
+    :func:`advice_lines`.
+    """
     yield from _onboard(advice)
     yield from _hindsight(advice)
     yield from _fits(advice)
@@ -273,21 +276,21 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
 
 
 def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
-    """Say what was fitted, parameter by parameter, with units and intervals.
+    """Return the fitted parameters in lines, with units and intervals.
 
     Args:
-        tunable: what was fitted.
-        found: the values.
-        intervals: of the parameters.
+        tunable: the fitted filter.
+        found: its fit.
+        intervals: intervals of the parameters.
     """
     for name, value in found.values.items():
         text = parameter_text(name, value, intervals.get(name), tunable, name in found.at_limit)
-        said = " ".join(part for part in (parameter_name(name), *text[:3]) if part)
-        yield said + (f": {text.remark}" if text.remark else "")
+        line = " ".join(part for part in (parameter_name(name), *text[:3]) if part)
+        yield line + (f": {text.remark}" if text.remark else "")
 
 
 def verdict(advice: Advice) -> str:
-    """First sentence."""
+    """Return the first sentence."""
     one, rival = advice.fitted, advice.rival
     judged = sum(span.last - span.first for span in advice.share.judged)
     where = (
@@ -303,8 +306,8 @@ def verdict(advice: Advice) -> str:
     if one is not advice.advised:
         what = _interval(one.gain, "+.3f")
         text = (
-            f"Take {rival}, as it is shipped: nothing that was fitted predicts better beyond chance "
-            f"({one.name}: {what} nats per measurement, its parameters paid for)."
+            f"Take {rival}, as it is shipped: no fitted filter predicts better beyond chance "
+            f"({one.name}: {what} nats per measurement, less the cost of its parameters)."
         )
         if not math.isnan(one.relative_error.value):
             text += f" {one.name} has {_amount(advice, one.relative_error)} than it, {where}."
@@ -315,7 +318,7 @@ def verdict(advice: Advice) -> str:
     if one.gain.low <= 0.0 and not advice.tunables[one.name].anchored:
         name += f", as good as {rival} and cheaper"
     if math.isnan(one.relative_error.value) and advice.anchor is not None and one.name == advice.anchor.name:
-        return f"{name}, by the second sensor: there is no truth to say how much it gains."
+        return f"{name}, by the second sensor: without a truth its gain is unknown."
     if math.isnan(one.relative_error.value):
         return f"{name}: {one.difference.value:+.3f} nats per measurement against {rival}, {where}."
     text = (
@@ -331,13 +334,13 @@ def verdict(advice: Advice) -> str:
 
 
 def _operations(advice: Advice, name: str, other: str) -> str:
-    """What an update of a filter takes beside another's; nothing where one of them is not known."""
+    """Return the operations of an update of a filter beside another's; empty where one of them is unknown."""
     one, two = (advice.prices.operations(each) for each in (name, other))
     return f"takes {one:,.0f} operations an update for {two:,.0f}" if max(one, two) < math.inf else ""
 
 
 def _amount(advice: Advice, relative: IntervalEstimate) -> str:
-    """How much less or more error, with its interval."""
+    """Return how much less or more error, with its interval."""
     value, low, high = _percent(relative)
     kind = "error" if advice.recording.truth is not None else "error of prediction"
     less = value <= 0.0
@@ -349,19 +352,21 @@ def _amount(advice: Advice, relative: IntervalEstimate) -> str:
 
 
 def _hindsight(advice: Advice) -> Iterator[str]:
-    """Who of the shipped filters was best on the judged measurements, which nobody could know."""
+    """Return a sentence on the shipped filter that was best on the judged measurements, which is known in hindsight
+    only.
+    """
     best, relative = advice.best_shipped, advice.hindsight
     if best in (advice.advised.name, advice.rival) or not abs(relative.value) >= NEGLIGIBLE:
         return
     count = sum(not c.fitted for c in advice.competitors)
     yield (
         f"In hindsight {best} is the best of the {count} shipped ones there: {advice.advised.name} has "
-        f"{_amount(advice, relative)}. The best of many is so partly by luck."
+        f"{_amount(advice, relative)}. The best of many is best partly by luck."
     )
 
 
 def _onboard(advice: Advice) -> Iterator[str]:
-    """How the vehicle's own filter compares, and what flatters it."""
+    """Return sentences on the vehicle's own filter, and on the bias in its favour."""
     found = advice.onboard
     if found is None:
         return
@@ -376,12 +381,12 @@ def _onboard(advice: Advice) -> Iterator[str]:
 
 
 def parameter_name(key: str) -> str:
-    """Name of a parameter in words, of the name under which it is searched."""
+    """Return a parameter's name in words, from its name in the search."""
     return key.removeprefix("log10_").replace("_", " ")
 
 
 def parameter_size(key: str, value: float) -> float:
-    """Value of a parameter, of that which is searched."""
+    """Return a parameter's value, from its value in the search."""
     return float(10.0**value) if key.startswith("log10_") else float(value)
 
 
@@ -392,19 +397,19 @@ class ParameterText(NamedTuple):
     interval: str
     unit: str
     remark: str
-    """What its interval means where it is none."""
+    """Meaning of an interval without two ends."""
 
 
 def parameter_text(
     key: str, value: float, interval: Interval | None, tunable: Tunable, is_at_limit: bool
 ) -> ParameterText:
-    """Say a fitted parameter with its interval, and whether it can be known.
+    """Return a fitted parameter in words with its interval, and whether it is identifiable.
 
     Args:
-        key: as it is searched.
-        value: likewise.
-        interval: of it, if it was computed.
-        tunable: whose it is.
+        key: name in the search.
+        value: value in the search.
+        interval: its interval, if computed.
+        tunable: filter of the parameter.
         is_at_limit: whether it ended at a limit of the search.
     """
     unit = tunable.units.get(key.removeprefix("log10_"), "")
@@ -412,7 +417,7 @@ def parameter_text(
     if interval is None:
         return text
     low, high = parameter_size(key, interval.low), parameter_size(key, interval.high)
-    after = f" {unit}" if unit and " " not in unit else ""  # what a number means is said once
+    after = f" {unit}" if unit and " " not in unit else ""  # a unit with words stands once
     flat = (interval.open_low and interval.open_high) or (
         key.startswith("log10_") and high > IDENTIFIABLE * low
     )
@@ -424,17 +429,16 @@ def parameter_text(
         first, last = tunable.limits[key]
         if value - first < last - value:
             return text._replace(
-                remark=f"at the lower limit of the search, the log says at most {high:.3g}{after}"
+                remark=f"at the lower limit of the search, the log supports at most {high:.3g}{after}"
             )
         return text._replace(
-            remark=f"at the upper limit of the search, the log says at least {low:.3g}{after}"
+            remark=f"at the upper limit of the search, the log supports at least {low:.3g}{after}"
         )
     ends = [f"{'<' * interval.open_low}{low:.3g}", f"{'>' * interval.open_high}{high:.3g}"]
     return text._replace(interval=f"[{', '.join(ends)}]")
 
 
 def _fits(advice: Advice) -> Iterator[str]:
-    """What is to be told of the fits themselves."""
     one = advice.fitted
     spread = advice.fits[one.name].spread
     if spread > DROP:
@@ -450,7 +454,7 @@ def _fits(advice: Advice) -> Iterator[str]:
 
 
 def _dearer(advice: Advice) -> Iterator[str]:
-    """What the likeliest would bring, where something cheaper is as good."""
+    """Return the gain of the likeliest filter, where a cheaper one is as good."""
     if advice.likeliest is None or math.isnan(advice.likeliest[1].value):
         return
     name, gain = advice.likeliest
@@ -462,7 +466,7 @@ def _dearer(advice: Advice) -> Iterator[str]:
 
 
 def _outliers(advice: Advice) -> Iterator[str]:
-    """Name the measurements that are taken for outliers, by row and time."""
+    """Return a sentence on the measurements classified as outliers, by row and time."""
     found, recording = advice.outliers, advice.recording
     count = int(found.sum())
     if OUTLIER_SHARE not in advice.fits[advice.fitted.name].values:
@@ -473,7 +477,7 @@ def _outliers(advice: Advice) -> Iterator[str]:
         "times as large"
     )
     if not count:
-        yield f"{text}; in this log it names none for sure."
+        yield f"{text}; in this log none is certain."
         return
     places = []
     for episode, k in numpy.argwhere(found)[:MOST_OUTLIERS]:
@@ -486,7 +490,7 @@ def _outliers(advice: Advice) -> Iterator[str]:
 
 
 def _noise(advice: Advice) -> Iterator[str]:
-    """What the scale of the noise says, and what it does not."""
+    """Return the meaning of the fitted scale of the noise, and its limits."""
     one = advice.fitted
     if NOISE_SCALE in advice.fits[one.name].values:
         scale = 10.0 ** advice.fits[one.name].values[NOISE_SCALE]
@@ -496,8 +500,8 @@ def _noise(advice: Advice) -> Iterator[str]:
         )
         if scale > LARGE_SCALE:
             yield (
-                "That is far more than stated: the stated deviations are wrong, or what was measured moves like "
-                "nothing that was fitted."
+                "That is far more than stated: the stated deviations are wrong, or the motion fits "
+                "no fitted model."
             )
         if scale < SMALL_SCALE:
             yield (
@@ -506,13 +510,13 @@ def _noise(advice: Advice) -> Iterator[str]:
             )
     else:
         yield (
-            "NIS and likelihood say nothing of errors that last longer than the motion: those are invisible without a "
+            "NIS and likelihood do not show errors that last longer than the motion: those are invisible without a "
             "second sensor."
         )
 
 
 def _anchor(advice: Advice) -> Iterator[str]:
-    """Why a filter with a second sensor is advised or not, and what its likelihood says."""
+    """Return the reason for or against a filter with a second sensor, and the meaning of its likelihood."""
     anchor = advice.anchor
     if anchor is None:
         return
@@ -523,7 +527,7 @@ def _anchor(advice: Advice) -> Iterator[str]:
         )
         return
     yield (
-        f"The second sensor tells errors that last from motion: measurements {APART:g} s apart are likelier by "
+        f"The second sensor separates lasting errors from motion: measurements {APART:g} s apart are likelier by "
         f"{anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such. From one measurement to the next "
         "filters without it may predict better, because they follow these errors: there likelihoods of both kinds do "
         "not compare, nor does NIS, and deviations are taken as they are stated."
@@ -532,10 +536,9 @@ def _anchor(advice: Advice) -> Iterator[str]:
 
 
 def _warnings(advice: Advice) -> Iterator[str]:
-    """What makes the advice less than it looks."""
     one, count = advice.advised, int(advice.recording.rows.sum())
     if count < FEW:
-        yield f"{count} measurements are few: below {FEW} the parameters are known badly, and so is who is best."
+        yield f"{count} measurements are few: below {FEW} the parameters and the choice of a filter are uncertain."
     correlation = one.correlation
     sure = not math.isnan(correlation.low) and not correlation.low <= 0.0 <= correlation.high
     if sure and abs(correlation.value) > LEAST_CORRELATION:
@@ -554,13 +557,12 @@ def _warnings(advice: Advice) -> Iterator[str]:
     ]
     if wide:
         yield (
-            f"Nothing in this recording tells the size of: {', '.join(wide)}. It lacks the motion that would, or is "
-            "too short."
+            f"This recording does not determine: {', '.join(wide)}. It lacks the necessary motion, or is too short."
         )
 
 
 def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """What the learned agents did, which were trained on other data."""
+    """Return a sentence on the learned agents, which were trained on other data."""
     found: list[JudgedFilter] = [
         c for c in advice.competitors if c.name in learned and not math.isnan(c.relative_error.value)
     ]

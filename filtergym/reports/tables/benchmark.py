@@ -1,7 +1,6 @@
-"""The main job: every environment with its competitors.
+"""The benchmark: every environment with its competitors.
 
-Quick: the telling ones in the training distribution. Full: everything there is to
-compare, in all scenarios.
+Quick: the most informative competitors in the training distribution. Full: all competitors, in all scenarios.
 """
 
 import math
@@ -40,14 +39,17 @@ from .terminal_tables import HEADLINE
 MEASUREMENTS = 60_000
 """Measurements per policy and cell of the quick benchmark: 500 episodes of 100 scans, and some more."""
 FULL_SECONDS = 5.0
-"""Time per policy and cell that the full benchmark, of ten times as many measurements, does not go beyond."""
+"""Longest time per policy and cell of the full benchmark, of ten times as many measurements."""
 FEWEST_EPISODES, FEWEST_EPISODES_FULL = 10, 20
-"""Of fewer the intervals are too narrow; where episodes are long, the quick benchmark takes no more."""
+"""Least number of episodes, since fewer make intervals too wide; with long episodes the quick benchmark
+runs no more.
+"""
 MOST_EPISODES = 20_000
-"""That are run for the sake of an interval's width."""
+"""Largest number of episodes that are run to narrow an interval."""
 LONG = 2000
-"""Measurements of an episode, beyond which the quick benchmark leaves out who was tuned: few episodes side by side cost
-as much as many."""
+"""Measurements of an episode beyond which the quick benchmark leaves out tuned competitors: few episodes side by side
+cost as much as many.
+"""
 
 
 class Cell(NamedTuple):
@@ -65,7 +67,7 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Start of the names of the cell's files."""
+        """Beginning of the names of the cell's files."""
         return f"{self.problem.short_name}.{self.scenario}"
 
     @property
@@ -79,14 +81,14 @@ def _horizon(cls: Any, scenario: str) -> int:
 
 
 def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[str, ...]:
-    """Names that a cell compares, the paper's algorithm first.
+    """Return the names of a cell's competitors, the paper's algorithm first.
 
-    Quick: the telling ones, tuned where that has won and episodes are not long; others that are tuned; shipped agents.
-    Full: every policy and estimator as it is, those that were tuned, shipped agents, smoothers, references, bounds.
+    Quick: the most informative ones, tuned where that has won and episodes are not long; other tuned ones; shipped
+    agents. Full: every policy and estimator as it is, tuned ones, shipped agents, smoothers, references, bounds.
 
     Args:
-        problem: whose they are.
-        full: everything.
+        problem: problem of the competitors.
+        full: whether all competitors run.
         horizon: measurements of an episode.
     """
     known = problem.baselines
@@ -102,12 +104,13 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
 
 
 def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
-    """Return how many episodes a competitor runs in some seconds: 2000, or 400 where a measurement is dear.
+    """Return the number of episodes that a competitor runs in some seconds: 2000, or 400 where a measurement takes
+    long.
 
     Args:
-        problem: whose competitor it is.
-        scenario: of the episodes.
-        most: no more than these.
+        problem: problem of the competitor.
+        scenario: scenario of the episodes.
+        most: largest number.
     """
     seconds = problem.baselines.measurement_seconds * _horizon(problem.task, scenario)
     return min(most, max(FEWEST_EPISODES_FULL, int(2.0 * FULL_SECONDS / seconds)))
@@ -116,7 +119,7 @@ def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
 def without_smoothers_of_closed_loops(
     problem: Problem, names: Sequence[str], scenario: Any
 ) -> tuple[str, ...]:
-    """Names of those that can run in a scenario: in a closed loop nothing can be smoothed."""
+    """Return the names of competitors that can run in a scenario: in a closed loop there is no smoothing."""
     smoothers = {*names} & {*problem.baselines.smoothers}
     if not smoothers or not make_task(problem.task, scenario).closes_loop:
         return tuple(names)
@@ -124,7 +127,7 @@ def without_smoothers_of_closed_loops(
 
 
 def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> list[Cell]:
-    """List the work: quick, the default scenario, of which the verdict is; full, all of them and more episodes.
+    """Return the cells: quick, the default scenario, on which the verdict rests; full, all of them and more episodes.
 
     Held-out scenarios are for final tables: on another split than "test" only training scenarios run.
     """
@@ -157,16 +160,16 @@ def result_of(
     worst: Mapping[str, Sequence[WorstTrack]] | None = None,
     own: Sequence[str] = (),
 ) -> Result:
-    """Turn an evaluation into what a file of results holds of it.
+    """Convert an evaluation into the content of a file of results.
 
     Args:
-        problem: that was evaluated.
-        evaluation: with curves, of which those of what is shown are kept. Of the variables of its dataset only those of
-            the track are needed, which ``drawn_episodes`` keeps.
-        learned: names that stand for something learned, those of competitors among them.
-        worst: by the names of those whose cost is to be explained their worst episodes; default: the paper's algorithm,
-            and none.
-        own: names of the user's own.
+        problem: the evaluated problem.
+        evaluation: an evaluation with curves, of which those of the shown competitors are stored. Its dataset needs the
+            variables of the track only, which ``drawn_episodes`` stores.
+        learned: names of learned competitors.
+        worst: worst episodes of the competitors whose cost is explained, by name; default: the paper's algorithm,
+            without episodes.
+        own: names of the user's own competitors.
     """
     dataset, records, curves = evaluation.dataset, evaluation.records, evaluation.curves
     assert curves is not None
@@ -199,30 +202,31 @@ def result_of(
 
 
 class BenchmarkOptions(NamedTuple):
-    """What a benchmark runs, and how."""
+    """Content and execution of a benchmark."""
 
     full: bool = False
     """All scenarios and policies, and more episodes."""
     seed: int = 0
     """Number of the experiment."""
     environments: Sequence[str] = ()
-    """Ids; none: all."""
+    """Ids; empty: all."""
     split: str = "test"
-    """Or another one, for development."""
+    """Split of the episodes; another one than test is for development."""
     backend: str = "auto"
-    """What computes the steps, see :func:`~.envs.backend.task_on`."""
+    """Implementation of the steps, see :func:`~.envs.backend.task_on`."""
     threads: int = 1
-    """How many share the episodes, of the compiled backend."""
+    """Threads of the compiled backend that share the episodes."""
     command: str = "filtergym benchmark"
-    """That runs this, kept in the results."""
+    """Command of the benchmark, stored in the results."""
     half_width: float = 0.0
-    """Percentage points to either side, to which the intervals of the headline are brought by more episodes of the
-    training distribution; zero: as many episodes as there are in other scenarios."""
+    """Largest distance of the headline's interval ends, percentage points, which more episodes of the training
+    distribution attain; zero: as many episodes as in other scenarios.
+    """
     timed: bool = True
-    """Measure the processor time of every competitor, which differs from run to run."""
+    """Whether to measure the processor time of every competitor, which differs from run to run."""
 
     def requests(self, cell: Cell) -> list[EvaluationRequest]:
-        """Return what is asked for in a cell."""
+        """Return the requests of a cell."""
         experiment = cell.problem.experiment(
             cell.scenario,
             cell.episodes,
@@ -237,41 +241,41 @@ class BenchmarkOptions(NamedTuple):
 
 
 class Callbacks(NamedTuple):
-    """What is called while a benchmark runs."""
+    """Functions that are called while a benchmark runs."""
 
     started: Callable[[int], Progress] = lambda total: lambda done: None
-    """With the number of measurements; returns what is told of progress."""
+    """Called with the number of measurements; returns the function that receives the progress."""
     finished: Callable[[Result], None] = lambda result: None
-    """With the result of each cell, in their order."""
+    """Called with the result of each cell, in their order."""
     drawn: Callable[[Cell, Evaluation], None] = lambda cell, evaluation: None
-    """With each cell and its evaluation."""
+    """Called with each cell and its evaluation."""
 
 
 class _Results:
-    """Results of cells, made when the last competitor of each is there.
+    """Results of cells, made when the last competitor of each has finished.
 
     Args:
         wanted: the cells.
-        callbacks: told of evaluations and results.
+        callbacks: functions that receive evaluations and results.
     """
 
     def __init__(self, wanted: Sequence[Cell], callbacks: Callbacks) -> None:
         self.wanted, self.callbacks = wanted, callbacks
         self._summaries: list[dict[str, Summary]] = [{} for _ in wanted]
         self._results: list[Result | None] = [None] * len(wanted)
-        self._told = 0
+        self._reported = 0
 
     def add(self, i: int, name: str, summary: Summary) -> None:
-        """Take in the summary of a competitor of a cell, and tell of all results that are due."""
+        """Add the summary of a competitor of a cell, and report all results that are due."""
         cell, found = self.wanted[i], self._summaries[i]
         found[name] = summary
         if len(found) == len(cell.policies):
             evaluation = combine_summaries([found.pop(name) for name in cell.policies])
             self.callbacks.drawn(cell, evaluation)
             self._results[i] = result_of(cell.problem, evaluation, learned_names(cell.environment))
-        while self._told < len(self._results) and (due := self._results[self._told]) is not None:
+        while self._reported < len(self._results) and (due := self._results[self._reported]) is not None:
             self.callbacks.finished(due)
-            self._told += 1
+            self._reported += 1
 
     def all(self) -> list[Result]:
         """Return the results, in the order of the cells."""
@@ -284,13 +288,13 @@ def run_benchmark(
     callbacks: Callbacks | None = None,
     workers: Workers | None = None,
 ) -> list[Result]:
-    """Run every cell, going on after an interruption with the competitors that are missing.
+    """Run every cell; after an interruption continue with the missing competitors.
 
     Args:
-        folder: where ``results.json`` goes; competitors wait in ``unfinished/`` until all are done.
-        options: what is run.
-        callbacks: called meanwhile; default: nothing is.
-        workers: who does the work; default: this process.
+        folder: folder of ``results.json``; finished competitors are in ``unfinished/`` until all are done.
+        options: content of the benchmark.
+        callbacks: functions that are called meanwhile; default: none.
+        workers: processes that do the work; default: this process.
 
     Returns:
         All results.
@@ -319,11 +323,10 @@ def run_benchmark(
 def _run_cells(
     wanted: Sequence[Cell], options: BenchmarkOptions, callbacks: Callbacks, workers: Workers, store: Store
 ) -> list[Result]:
-    """Run all competitors of some cells, those of which the store has nothing."""
     tick = callbacks.started(sum(cell.measurements for cell in wanted))
-    # What is asked for, and the cell that it belongs to.
+    # The requests, and the cell of each.
     asked = [(one, i) for i, cell in enumerate(wanted) for one in options.requests(cell)]
-    if not workers.alone:  # the dear ones first, that nobody waits for them at the end
+    if not workers.alone:  # the slow ones first, so that no process waits for them at the end
         asked.sort(
             key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
         )
@@ -339,7 +342,7 @@ def _enlarge(
 ) -> Cell:
     """Return a cell with as many episodes as the headline's intervals need, ``MOST_EPISODES`` at most.
 
-    What is run on the way stays in the store, and the last run is not repeated. An interval's width falls with the root
+    Intermediate runs stay in the store, and the last run is not repeated. An interval's width falls with the root
     of the number of episodes; stopping at a width keeps its coverage (Y. S. Chow and H. Robbins, On the asymptotic
     theory of fixed-width sequential confidence intervals, Annals of Mathematical Statistics 36, 1965).
     """
@@ -355,7 +358,7 @@ def _enlarge(
 
 
 def headline_half_width(result: Result) -> float:
-    """Half the widest interval of the headline, of the best of every origin, as a share of the paper's cost."""
+    """Return half the widest interval of the headline, of the best of every origin, as a share of the paper's cost."""
     shown = {name for _, name in best_of_origins(result)}
     return max(
         (

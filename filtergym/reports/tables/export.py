@@ -16,7 +16,7 @@ from ...evaluation.storage.files import whole_file, write_text
 
 PREAMBLE = "% In the preamble: \\usepackage{booktabs,graphicx}"
 FITTING = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
-"""Makes what is wider than the line as wide as the line."""
+"""Command that shrinks a wider table to the width of the line."""
 SPECIAL = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -58,7 +58,7 @@ MINUS = re.compile(r"(?<![\w.)\]])-(?=\.?\d)")
 
 
 LATEX_WIDTH = 160
-"""Columns of a terminal whose tables are written for LaTeX: all of them beside each other, with all intervals."""
+"""Columns of a terminal whose tables are written for LaTeX: all columns side by side, with all intervals."""
 
 
 def write_records(path: Path, records: Sequence[Any]) -> None:
@@ -71,7 +71,7 @@ def records_as_csv(path: Path, records: Sequence[Any]) -> None:
     """Write records as a table of comma-separated values, a line each, all fields; empty where one is None.
 
     Args:
-        path: of the file.
+        path: path of the file.
         records: named tuples of one kind.
 
     Raises:
@@ -85,7 +85,7 @@ def records_as_csv(path: Path, records: Sequence[Any]) -> None:
 
 
 def latex_text(text: str) -> str:
-    """Return text as LaTeX shows it as it is; a hyphen before a number becomes a minus sign."""
+    """Return text escaped for LaTeX; a hyphen before a number becomes a minus sign."""
     marked = MINUS.sub("\N{MINUS SIGN}", text)
     return "".join(map(_latex_character, marked))
 
@@ -99,18 +99,18 @@ def _latex_character(character: str) -> str:
         return "o" if character == "ο" else f"$\\{GREEK[character]}$"
     if "LATIN" in unicodedata.name(character, ""):
         return character
-    # What LaTeX has no letter for would stop it.
+    # A character without a letter in LaTeX would stop it.
     return f"[U+{ord(character):04X}]"
 
 
 def latex_table(table: Table) -> str:
     """Return a table of the terminal for LaTeX with booktabs: the same cells, its title as caption, its notes below.
 
-    Columns that are right-justified in the terminal are so here; rules separate the same sections. It stands across
-    both columns of a paper if it has more than four columns, and shrinks to the width that there is.
+    Columns that are right-justified in the terminal are so here; rules separate the same sections. It spans
+    both columns of a paper if it has more than four columns, and shrinks to the available width.
 
     Args:
-        table: of text, or of rich's ``Text``.
+        table: table of text, or of rich's ``Text``.
     """
     environment = "table*" if len(table.columns) > 4 else "table"
     letters = "".join("r" if column.justify == "right" else "l" for column in table.columns)
@@ -155,5 +155,5 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _after_break(line: str) -> str:
-    """Guard what follows a line break: LaTeX takes a bracket for a length and an asterisk for a mark."""
+    """Guard the text after a line break: LaTeX takes a bracket for a length and an asterisk for a mark."""
     return ("{}" if line.startswith(("[", "*")) else "") + line

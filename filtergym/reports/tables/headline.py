@@ -10,14 +10,14 @@ from .results import Result
 from .terminal_tables import HEADLINE, consistency_word, with_interval
 
 SHORT = {"slightly overconfident": "slightly over", "slightly cautious": "slightly under"}
-"""Words on a covariance in a narrow column."""
+"""Short words on a covariance for a narrow column."""
 
 
 def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, str, str, str]]]]:
     """Return for each environment the best of every origin, lowest cost first.
 
     Args:
-        results: of which those of training distributions are taken; of an environment without one all.
+        results: results, of which those of training distributions are used; of an environment without one all.
 
     Returns:
         Result and rows: origin, name, cost against the paper's in percent (geometric), and a word on consistency.
@@ -39,7 +39,7 @@ def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, st
 
 
 def headline_table(results: Sequence[Result]) -> Table:
-    """Show the best of every origin in each environment: at most 80 columns wide."""
+    """Return a table of the best of every origin in each environment, at most 80 columns wide."""
     table = Table(box=None, pad_edge=False, padding=(0, 1), title_justify="left", caption_justify="left")
     table.title = "Best of every origin, cost against the paper's algorithm (95 % intervals)"
     table.add_column("")

@@ -1,4 +1,4 @@
-"""What there is: an environment with its paper, controls, scenarios and competitors, in lines for the terminal."""
+"""An environment with its paper, controls, scenarios and competitors, in lines for the terminal."""
 
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -14,11 +14,11 @@ from ...envs.engine.compiled import AVAILABLE
 from ...names import learned_names
 
 FEWEST_COLUMNS = 20
-"""Of a text beside its head, however narrow the terminal."""
+"""Least number of columns of a text beside its head."""
 
 
 def _backend(cls: type[Task]) -> str:
-    """What computes an environment's steps, and where the exponentials of compiled ones come from."""
+    """Return the implementation of an environment's steps, and of the exponentials in compiled ones."""
     compiled = AVAILABLE
     if cls.id in USER_TASKS:  # those of this package can all be traced
         compiled = make_model(cls, backend="auto").backend == "compiled"
@@ -31,11 +31,11 @@ def summary_of(cls: type[Task]) -> str:
 
 
 def list_lines(tasks: Mapping[str, type[Task]], width: int | None) -> Iterator[str]:
-    """Say what each environment is, in one line.
+    """Yield a line for each environment.
 
     Args:
-        tasks: by id.
-        width: columns beyond which a line goes on below, None: nowhere.
+        tasks: tasks by id.
+        width: columns beyond which a line is continued below; None: no limit.
     """
     longest = max(map(len, tasks), default=0)
     for id, cls in tasks.items():
@@ -48,8 +48,8 @@ def environment_lines(problem: Problem, width: int, everything: bool = False) ->
     Args:
         problem: the environment and its competitors.
         width: columns.
-        everything: names of the parameters, and whole descriptions of scenarios; else their number, and a line for each
-            scenario.
+        everything: whether to name the parameters and describe scenarios in full; else their number, and a line for
+            each scenario.
     """
     cls, known, parameters = problem.task, problem.baselines, parameter_names(problem.task)
     yield problem.name
@@ -91,7 +91,7 @@ def _shorten(head: str, text: str, width: int) -> str:
 
 
 def _hang(head: str, text: str, width: int | None) -> str:
-    """Return a head and a text beside it, which goes on below itself."""
+    """Return a head and a text beside it, with a hanging indent."""
     if width is None:
         return f"{head} {text}"
     lines = textwrap.wrap(

@@ -1,4 +1,4 @@
-"""Who is best in a scenario, of any control and kind, in words that follow from the records."""
+"""Ranking of competitors of any control and kind in a scenario, with sentences that follow from the records."""
 
 from collections.abc import Sequence
 
@@ -18,10 +18,10 @@ def find_record(
     """Return a competitor's record of a metric over all times; of any component unless one is named.
 
     Args:
-        records: of one environment and scenario.
-        name: of the competitor.
-        metric: that is wanted.
-        component: "state", or that of a state.
+        records: records of one environment and scenario.
+        name: name of the competitor.
+        metric: name of the metric.
+        component: "state", or one of its components.
     """
     wanted = name, metric, "all"
     found = (r for r in records if (r.policy, r.metric, r.window) == wanted)
@@ -29,10 +29,10 @@ def find_record(
 
 
 def ranking(records: Sequence[Record]) -> list[Record]:
-    """Geometric mean of the cost of every ranked competitor of one environment and scenario, lowest first.
+    """Return the geometric mean of the cost of every ranked competitor of one environment and scenario, lowest first.
 
-    Those that are as good as equal to the lowest stand in the order of the records, which is the catalogue's: a filter
-    comes before what is made of it.
+    Competitors that are practically equal to the lowest stand in the order of the records, which is the catalogue's: a
+    filter comes before its variants.
     """
     costs = [
         (record.value, record)
@@ -48,22 +48,22 @@ def rival_of(places: Sequence[Record], learned: Sequence[str]) -> Record | None:
     """Return the strongest competitor of another origin than the first, learned or classical; None where there is none.
 
     Args:
-        places: of :func:`ranking`, one at least.
-        learned: names of those that were learned.
+        places: ranking of at least one competitor, from :func:`ranking`.
+        learned: names of learned competitors.
     """
     was_learned = places[0].policy in learned
     return next((place for place in places if (place.policy in learned) != was_learned), None)
 
 
-def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
-    """Who is best of learned and classical competitors in a scenario, in two or three words.
+def best_competitor(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
+    """Return the best of learned and classical competitors in a scenario, in two or three words.
 
-    It rests on the paired ratio between the best one and the best of the other origin: where its interval holds one,
-    nobody is called best.
+    It rests on the paired ratio between the best one and the best of the other origin: where its interval contains one,
+    no competitor is called best.
 
     Args:
-        records: of the scenario.
-        learned: names of those that were learned; default: the environment's shipped agents.
+        records: records of the scenario.
+        learned: names of learned competitors; default: the environment's shipped agents.
     """
     places = ranking(records)
     if not places:
@@ -80,12 +80,12 @@ def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None)
 
 
 def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[str] | None = None) -> str:
-    """Say who is best, by how much, and how the strongest of another origin stands to it.
+    """Return a sentence on the best competitor, by how much it leads, and on the strongest of another origin.
 
     Args:
-        records: of the scenario.
+        records: records of the scenario.
         paper: name of the paper's algorithm.
-        learned: as of :func:`who_is_best`.
+        learned: names of learned competitors; default: the environment's shipped agents.
     """
     places = ranking(records)
     if not places:
@@ -125,12 +125,12 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
 
 
 def _share(share: float) -> str:
-    """Per cent of the resamples, of which there are a thousand."""
+    """Return the percentage of the thousand resamples."""
     return f"{100.0 * share:.1f} % of cases" if share >= 0.001 else "less than 0.1 % of cases"
 
 
 def origin(result: Result, name: str, kind: str) -> str:
-    """Return where a competitor comes from.
+    """Return the origin of a competitor.
 
     "yours"; "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator",
     filters of its own; "learned", policy or estimator; "smoother", which uses later measurements; "reference", which
@@ -146,7 +146,7 @@ def origin(result: Result, name: str, kind: str) -> str:
 
 
 def best_of_origins(result: Result) -> list[tuple[str, str]]:
-    """Return origin and name of the best of every origin: the ranked by their cost, then the reference."""
+    """Return origin and name of the best of every origin: the ranked ones by their cost, then the reference."""
     best: dict[str, str] = {}
     for place in ranking(result.records):
         best.setdefault(origin(result, place.policy, place.kind), place.policy)
@@ -156,10 +156,10 @@ def best_of_origins(result: Result) -> list[tuple[str, str]]:
 
 
 def remarks(results: Sequence[Result]) -> list[str]:
-    """Say which learned agents do harm, and whether the winners' covariances are honest.
+    """Return remarks on learned agents that do harm, and on the consistency of the best ones.
 
     Args:
-        results: of one or several environments.
+        results: results of one or several environments.
     """
     sentences = []
     usual = [result for result in results if result.default] or list(results)
@@ -195,7 +195,7 @@ def remarks(results: Sequence[Result]) -> list[str]:
 
 
 def _harms(result: Result) -> list[tuple[float, str]]:
-    """Learned agents that cost significantly more than the paper's algorithm: how much, and in words."""
+    """Return the learned agents that cost significantly more than the paper's algorithm: how much, and in words."""
     return [
         (r.value or 0.0, f"`{r.policy}` in {result.short} `{r.scenario}`, {with_interval(r, 100.0)} %")
         for r in result.records

@@ -1,4 +1,4 @@
-"""Why a competitor costs what it costs: its records by cause in sentences and as a table."""
+"""Causes of a competitor's cost, as sentences and as a table."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -11,24 +11,24 @@ from ...evaluation.statistics.cause_split import CAUSE_METRICS, EVERYTHING, reas
 from .terminal_tables import rank_competitors, with_interval
 
 MOST_REASONS = 3
-"""Sentences about one competitor."""
+"""Largest number of sentences about one competitor."""
 LEAST_EXCESS = 0.05
 """Share of the cost beyond the share of the measurements from which a cause is a reason."""
 
 
 class Reason(NamedTuple):
-    """What one cause costs a competitor."""
+    """The cost of a competitor under one cause."""
 
     cause: str
     measurements: Record
-    """Share of the measurements under it; likewise what follows."""
+    """Share of the measurements under the cause."""
     share: Record
-    """Of the cost."""
+    """Share of the cost under the cause."""
     cost: Record
-    """Mean cost of a measurement."""
+    """Mean cost of a measurement under the cause."""
     anees: Record | None
     ratio: Record | None
-    """Of the cost to that of the opponent, whom the component names."""
+    """Ratio of this cost to that of the opponent, whom the component names."""
 
     @property
     def excess(self) -> float:
@@ -37,20 +37,20 @@ class Reason(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """See :func:`.evaluation.statistics.cause_split.reason_weight`."""
+        """Weight, see :func:`.evaluation.statistics.cause_split.reason_weight`."""
         shares = (numpy.array(record.value or 0.0) for record in (self.share, self.measurements))
         return float(reason_weight(*shares))
 
 
 def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
-    """Return what each cause costs a competitor, in the order of their declaration; first the whole.
+    """Return the cost of a competitor under each cause, in the order of their declaration; first the whole.
 
     Args:
-        records: of one environment and scenario.
-        name: of the competitor.
+        records: records of one environment and scenario.
+        name: name of the competitor.
 
     Returns:
-        Nothing where nothing is split: bounds, and what has no truth.
+        The reasons; empty where costs are not split: for bounds, and without a truth.
     """
     found: dict[str, dict[str, Record]] = {}
     for r in records:
@@ -72,22 +72,22 @@ def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
 
 
 def largest_reasons(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return the causes of the largest weight that hold clearly more of the cost than of the measurements.
+    """Return the causes of the largest weight whose share of the cost clearly exceeds that of the measurements.
 
     Args:
-        reasons: of :func:`reasons_of`.
+        reasons: reasons from :func:`reasons_of`.
     """
     causes = [reason for reason in reasons if reason.cause != EVERYTHING and reason.excess >= LEAST_EXCESS]
     return sorted(causes, key=lambda reason: -reason.weight)[:MOST_REASONS]
 
 
 def reason_sentences(records: Sequence[Record], phrases: Mapping[str, str], name: str) -> list[str]:
-    """Say in short sentences where most of a competitor's cost falls.
+    """Return short sentences on where most of a competitor's cost falls.
 
     Args:
-        records: of one environment and scenario.
+        records: records of one environment and scenario.
         phrases: when each cause holds, by name.
-        name: of the competitor.
+        name: name of the competitor.
     """
     reasons = reasons_of(records, name)
     if not reasons:
@@ -109,17 +109,17 @@ def _percent(record: Record) -> str:
 
 
 def _times(record: Record) -> str:
-    """Say how many times as much as the opponent's: ``2.3 times imm [1.9, 2.8]``."""
+    """Return the multiple of the opponent's cost in words: ``2.3 times imm [1.9, 2.8]``."""
     value, _, interval = with_interval(record, digits=2).partition(" ")
     return f"{value} times {record.component}" + (f" {interval}" if interval else "")
 
 
-def explained_by_default(records: Sequence[Record], named: Sequence[str], paper: str) -> list[str]:
-    """Return whom sentences are about unless somebody is named: the first of those whom the user wants evaluated, else
-    the paper's algorithm, else the cheapest.
+def default_explained(records: Sequence[Record], named: Sequence[str], paper: str) -> list[str]:
+    """Return the competitor that sentences are about by default: the first of the user's, else the paper's algorithm,
+    else the cheapest.
 
     Args:
-        records: of one environment and scenario.
+        records: records of one environment and scenario.
         named: names that the user gives.
         paper: name of the paper's algorithm.
     """

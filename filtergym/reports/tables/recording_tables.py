@@ -1,4 +1,4 @@
-"""How competitors predicted the measurements of a recording, for the terminal."""
+"""Tables of the competitors' predictions of a recording's measurements, for the terminal."""
 
 import functools
 import math
@@ -27,14 +27,14 @@ def recording_tables(
     width: int,
     own: Collection[str] = (),
 ) -> list[Table]:
-    """Compare competitors by what they expected of each measurement.
+    """Compare competitors by their predictions of each measurement.
 
     Args:
         records: tidy records of one recording.
-        differences: of the log-likelihood per measurement to that of the best, by name, with intervals over stretches
-            of measurements.
-        has_truth: whether other tables tell errors and costs.
-        width: columns of the terminal; what does not fit beside each other stands below.
+        differences: differences of the log-likelihood per measurement to that of the best, by name, with intervals over
+            stretches of measurements.
+        has_truth: whether other tables contain errors and costs.
+        width: columns of the terminal; columns that do not fit stand below.
         own: names of the user's own competitors, whose rows are marked.
     """
     found = {(r.policy, r.metric, r.component): r for r in records if r.window == "all"}
@@ -71,7 +71,7 @@ Column = Callable[[str], str]
 
 
 def _beside(draw: Callable[..., Table], parts: Sequence[Mapping[str, Column]], width: int) -> list[Table]:
-    """Return tables of groups of columns, as many groups beside each other as fit, the rest below."""
+    """Return tables of groups of columns, with as many groups side by side as fit, the rest below."""
     for count in range(len(parts), 0, -1):
         columns = {title: column for part in parts[:count] for title, column in part.items()}
         looks = [draw(columns, control) for control in (True, False)]
@@ -87,7 +87,6 @@ Found = Mapping[tuple[str, str, str], Any]
 
 
 def _rounded(estimate: Any, digits: int) -> str:
-    """Value and interval with so many decimals."""
     if estimate is None or estimate.value is None or math.isnan(estimate.value):
         return "-"
     low, high = estimate.low, estimate.high
@@ -121,7 +120,6 @@ def _consistency_columns(found: Found, has_one_band: bool) -> dict[str, Column]:
 
 
 def _prediction_columns(records: Sequence[Any], found: Found) -> dict[str, Column]:
-    """Error and correlation of every group of what is predicted."""
     groups = {r.component: r.unit for r in records if r.metric == "prediction_error"}
 
     def error(group: str, name: str) -> str:

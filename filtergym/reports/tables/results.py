@@ -1,6 +1,6 @@
 """Results of a benchmark or an evaluation in one file, from which a report can be made anywhere.
 
-The file holds numbers and names: who reads it executes nothing of it, and needs none of its environments.
+The file contains numbers and names: reading it executes nothing, and needs none of its environments.
 """
 
 import json
@@ -26,48 +26,50 @@ RESULTS = "results.json"
 """Name of the file in a folder."""
 FORMAT = 1
 LIBRARIES = ("filtergym", "numpy", "scipy", "gymnasium", "xarray", "llvmlite")
-"""Whose versions a file tells."""
+"""Libraries whose versions a file contains."""
 MOST_SHOWN = 10
-"""Competitors of which a file holds curves and a track; all have their records."""
+"""Largest number of competitors whose curves and track a file contains; it contains the records of all."""
 MOST_TIMES = 120
-"""Times of a curve; of more, these are spread over the episode."""
+"""Largest number of times of a curve; of more, these are spread over the episode."""
 TRACK_TIMES = 160
 TRACK_DIGITS = {"truth": 7, "estimate": 7, "seen": 7}
 DIGITS = 4
-"""Significant digits: a curve is looked at; of a track one also looks at a few metres in a hundred kilometres."""
+"""Significant digits: a curve is only looked at; a track also shows a few metres in a hundred kilometres."""
 REQUIRED_DIMENSIONS: dict[str, tuple[str, ...]] = {
     "curves": ("policy", "time"),
     "track": ("policy", "time", "component", "unit", "estimate", "sigma"),
 }
-"""What a report cannot be made without."""
+"""Dimensions that a report needs."""
 
 
 class Settings(NamedTuple):
     """How results were made."""
 
     command: str
-    """That makes them again."""
+    """Command that makes them again."""
     versions: dict[str, str]
-    """Of Python and the libraries."""
+    """Versions of Python and the libraries."""
 
 
 class WorstTrack(NamedTuple):
-    """An episode that costs a competitor much, to be looked at."""
+    """An episode of high cost to a competitor, for the report."""
 
     policy: str
-    """The competitor."""
+    """Name of the competitor."""
     opponent: str
-    """With whom it is compared; empty: nobody."""
+    """Name of the opponent in the comparison; empty: none."""
     seed: str
-    """Of the episode, in words: it has more digits than a number of JavaScript. Of a recording its name there."""
+    """Seed of the episode, as text, since it has more digits than a number of JavaScript; of a recording the episode's
+    name.
+    """
     cost: float
-    """Mean over the episode."""
+    """Mean cost over the episode."""
     ratio: float | None
-    """Of the cost to the opponent's."""
+    """Ratio of the cost to the opponent's."""
     causes: list[str]
-    """The main ones; empty: none."""
+    """Main causes; empty: none."""
     track: xarray.Dataset | None
-    """See :func:`track_of`."""
+    """Track, see :func:`track_of`."""
 
 
 class Result(NamedTuple):
@@ -76,7 +78,7 @@ class Result(NamedTuple):
     environment: str
     scenario: str
     description: str
-    """Of the scenario, in words."""
+    """Description of the scenario."""
     default: bool
     """Whether it is the environment's training distribution."""
     training: bool
@@ -88,38 +90,38 @@ class Result(NamedTuple):
     learned: list[str]
     """Names of the competitors that were learned."""
     knows: dict[str, str]
-    """What references and bounds know, by their names."""
+    """Knowledge of references and bounds, by their names."""
     notes: list[str]
-    """What was left out, in sentences."""
+    """Notes on omissions, in sentences."""
     records: list[Record]
     curves: xarray.Dataset | None
-    """See :func:`.evaluation.running.curves.curves_of`, of the competitors that are shown."""
+    """Curves of the shown competitors, see :func:`.evaluation.running.curves.curves_of`."""
     track: xarray.Dataset | None
-    """Of one episode, see :func:`track_of`."""
-    causes: dict[str, str] = {}  # noqa: RUF012  (nobody writes to it)
+    """Track of one episode, see :func:`track_of`."""
+    causes: dict[str, str] = {}  # noqa: RUF012  (never written to)
     """When each cause of the records holds, by name."""
     explained: list[str] = []  # noqa: RUF012
-    """Names of those whose cost was to be explained."""
+    """Names of the competitors whose cost is explained."""
     worst: list[WorstTrack] = []  # noqa: RUF012
-    """Their worst episodes."""
+    """Worst episodes of these."""
     own: list[str] = []  # noqa: RUF012
     """Names of the user's own competitors, with which a report begins."""
 
     @property
     def short(self) -> str:
-        """Environment without its namespace and version."""
+        """Name of the environment without its namespace and version."""
         return bare_name(self.environment)
 
 
 def settings_of(command: str) -> Settings:
-    """Return a command with the versions of what runs it."""
+    """Return a command with the versions of the running libraries."""
     return Settings(command, {"Python": python_version(), **library_versions(LIBRARIES)})
 
 
 def select_competitors(
     records: Sequence[Record], paper: str, reference: str, learned: Sequence[str], own: Sequence[str] = ()
 ) -> list[str]:
-    """Return at most ``MOST_SHOWN`` names whose curves tell most.
+    """Return at most ``MOST_SHOWN`` names of the most informative curves.
 
     The paper's algorithm, the reference, the user's own, the learned, the cheapest of each kind, a bound; then by cost.
     """
@@ -147,18 +149,18 @@ def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
 def track_of(
     dataset: xarray.Dataset, components: Sequence[str], plane: bool, number: int = 0
 ) -> xarray.Dataset | None:
-    """Return one episode of an evaluation: what was true, measured and estimated.
+    """Return the truth, measurements and estimates of one episode of an evaluation.
 
     Args:
-        dataset: from an evaluation with ``drawn_episodes``; without there is no track.
-        components: that are drawn.
+        dataset: dataset of an evaluation with ``drawn_episodes``; without these there is no track.
+        components: components to draw.
         plane: whether the first two of them are the axes of a plane.
-        number: of the episode.
+        number: number of the episode.
 
     Returns:
-        ``truth`` and ``seen`` (policy, component, time), where they are known: in a closed loop every competitor flies
-        a truth of its own; ``estimate`` likewise, with ``sigma``, its standard deviation as reported; of a plane also
-        the ``correlation`` (policy, time) of both.
+        ``truth``, ``seen`` (measurements), ``estimate`` and its reported standard deviation ``sigma``, each (policy,
+        component, time) where known, since in a closed loop every competitor has a truth of its own; of a plane also
+        the ``correlation`` (policy, time) of both components.
     """
     if "drawn_estimate" not in dataset:
         return None
@@ -204,7 +206,7 @@ def track_of(
 def components_to_draw(
     groups: Mapping[str, Sequence[str]], components: Sequence[str]
 ) -> tuple[list[str], bool]:
-    """Return what a track is drawn of: two components of a group that has several, as a plane; else the first three."""
+    """Return the components of a drawn track: two of a group that has several, as a plane; else the first three."""
     for parts in groups.values():
         if len(parts) > 1:
             return list(parts[:2]), True
@@ -212,7 +214,7 @@ def components_to_draw(
 
 
 def write_results(path: Path, results: Iterable[Result], settings: Settings) -> None:
-    """Write results, whole or not at all.
+    """Write results completely or not at all.
 
     Raises:
         ValueError: if the file cannot be written.
@@ -232,12 +234,12 @@ def _as_json(result: Result) -> dict[str, Any]:
 
 
 def serialise_track(track: xarray.Dataset | None) -> dict[str, Any] | None:
-    """A track as JSON can say it."""
+    """Return a track in JSON's types."""
     return None if track is None else dataset_as_json(track, TRACK_DIGITS, DIGITS)
 
 
 def serialise_datasets(result: Result) -> dict[str, Any]:
-    """Curves and track as JSON can say them."""
+    """Return the curves and track in JSON's types."""
     return {
         "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
         "track": serialise_track(result.track),
@@ -245,13 +247,13 @@ def serialise_datasets(result: Result) -> dict[str, Any]:
 
 
 def read_results(path: Path) -> tuple[list[Result], Settings]:
-    """Read what :func:`write_results` has written, or say why not.
+    """Read a file of :func:`write_results`, or raise an error with the reason.
 
     Args:
-        path: of the file, or of the folder where it is called ``results.json``.
+        path: path of the file, or of the folder that contains it as ``results.json``.
 
     Raises:
-        ValueError: if it holds anything else.
+        ValueError: if the file has other content.
     """
     path = path / RESULTS if path.is_dir() else path
     try:
@@ -270,7 +272,7 @@ def read_all_results(paths: Sequence[Path]) -> tuple[list[Result], Settings]:
     """Read several files of results as one.
 
     Raises:
-        ValueError: if one cannot be read, or they hold a scenario twice.
+        ValueError: if one cannot be read, or they contain a scenario twice.
     """
     read = [read_results(path) for path in paths]
     results = [result for found, _ in read for result in found]
@@ -316,7 +318,7 @@ def _restore_worst(fields: Any) -> WorstTrack:
 
 
 def _check_dataset(part: str, found: xarray.Dataset | None) -> None:
-    """Raise ValueError if curves or a track lack what a report cannot be made without."""
+    """Raise ValueError if curves or a track lack dimensions that a report needs."""
     wanted = REQUIRED_DIMENSIONS[part] if found is not None else ()
     missing = [name for name in wanted if found is None or name not in found.variables]
     if missing:

@@ -1,7 +1,7 @@
-"""How trained agents stand beside the paper's algorithm, the strongest classical competitor and the reference.
+"""Standing of trained agents beside the paper's algorithm, the strongest classical competitor and the reference.
 
-On the validation split, by which agents are chosen; tables of the test split are made by ``filtergym evaluate``
-and ``filtergym benchmark``.
+It is measured on the validation split, by which agents are chosen; ``filtergym evaluate`` and ``filtergym benchmark``
+make tables of the test split.
 """
 
 from collections.abc import Mapping
@@ -22,10 +22,10 @@ from ...filters.gaussian import log_density
 from .terminal_tables import INCONSISTENT, consistency, cost_title, plain_table, with_interval
 
 SCREENING_SECONDS = 1.5
-"""Time for asking every classical competitor, on a few episodes, whether it may be the strongest."""
+"""Time for running every classical competitor on a few episodes, to find candidates for the strongest."""
 FEWEST_SCREENED = 16
 FINALISTS = 3
-"""Of those, how many meet all episodes."""
+"""Number of candidates that run on all episodes."""
 
 
 def _cost_and_nees(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
@@ -37,16 +37,16 @@ def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool =
     """Measure agents, and the competitors they are compared with, on the episodes of a run's validations.
 
     Args:
-        run: whose environment, scenario and parameters they meet.
-        agents: file of each, by name.
-        trust: load a model, which can execute code.
+        run: run that gives environment, scenario and parameters.
+        agents: file of each agent, by name.
+        trust: whether to load a model, which can execute code.
 
     Returns:
-        ``cost`` and ``anees``, normalised estimation error, of every episode, ``(policy, episode)``; ``role`` says what
-        each one is: "agent", "paper", "strongest classical" or "reference".
+        ``cost`` and ``anees``, normalised estimation error, of every episode, ``(policy, episode)``; ``role`` is
+        "agent", "paper", "strongest classical" or "reference".
 
     Raises:
-        ValueError: if an agent cannot be read, or takes ``trust``.
+        ValueError: if an agent cannot be read, or needs ``trust``.
     """
     problem, known = run.problem, run.problem.baselines
     episodes = TrainingEpisodes(run, validation.VALIDATION_EPISODES, validation_backend(run))
@@ -75,7 +75,7 @@ def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool =
 
 
 def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
-    """Name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
+    """Return the name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
     problem, known = run.problem, run.problem.baselines
     makers = {
         name: problem.competitor(name)
@@ -95,11 +95,11 @@ def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
 
 
 def standing_table(standing: xarray.Dataset, passed: Mapping[str, FirstWin | None]) -> Table:
-    """Compare agents with their opponents: cost, its difference to the paper's algorithm, consistency.
+    """Return a table of agents and their opponents: cost, its difference to the paper's algorithm, consistency.
 
     Args:
-        standing: of :func:`measure_standing`.
-        passed: when each agent was first better than the paper's algorithm, by name.
+        standing: dataset from :func:`measure_standing`.
+        passed: step at which each agent was first better than the paper's algorithm, by name.
     """
     bootstrap = Bootstrap(standing.sizes["episode"])
     table = plain_table(
@@ -135,7 +135,7 @@ def standing_table(standing: xarray.Dataset, passed: Mapping[str, FirstWin | Non
         table.add_row(*row)
     table.caption = (
         "cost vs is the geometric mean of the ratios of the episodes' costs, means the ratio of the mean costs. "
-        f"ANEES is 1 if errors are as large as the covariance says; {INCONSISTENT} marks one that is off by more than "
+        f"ANEES is 1 if errors are as large as the covariance states; {INCONSISTENT} marks one off by more than "
         "a factor of two. Agents were chosen on these episodes."
     )
     return table

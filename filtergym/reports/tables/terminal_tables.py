@@ -17,23 +17,23 @@ from ...evaluation.competitors.kinds import NOT_CAUSAL, RANKED
 from ...evaluation.running.times import OWN_MARK, OWN_NOTE, TIME_NOTE, TIME_TITLE, column_of_times
 
 NARROW, WIDE = 24, 44
-"""Columns of a name, where there are few and otherwise: longer ones go on below, from a hyphen on if they have one."""
+"""Widths of the column of names, columns; longer names are broken, after a hyphen if they have one."""
 INCONSISTENT_WORDS = ("overconfident", "cautious")
-"""With which the words on a covariance end that is not consistent."""
+"""Endings of the words on an inconsistent covariance."""
 INCONSISTENT = "!"
-"""Marks a covariance that is off by more than a factor of two."""
+"""Mark of a covariance that is off by more than a factor of two."""
 OWN_ROW = ">"
-"""Marks the row of a user's own competitor."""
+"""Mark of the row of a user's own competitor."""
 
 
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
-    """Value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``.
+    """Return the value and interval in significant digits: ``67.0 [66.6, 67.4]``.
 
     Args:
-        record: with ``value``, ``low`` and ``high``; or None.
-        scale: that all three are multiplied with.
-        digits: significant ones.
-        negligible: what is smaller, scaled, is shown as 0.
+        record: record with ``value``, ``low`` and ``high``; or None.
+        scale: factor of all three.
+        digits: number of significant digits.
+        negligible: scaled values below this are shown as 0.
     """
     if record is None or record.value is None:
         return "-"
@@ -54,7 +54,9 @@ HEADLINE = "geometric_cost_difference"
 
 
 def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
-    """Share of lost tracks with its interval, %, and the difference of the mean cost to the paper's algorithm, %."""
+    """Return the share of lost tracks with its interval, %, and the difference of the mean cost to the paper's
+    algorithm, %.
+    """
     lost, means = (
         found.get((*scenario, name, metric, "", "all"))
         for metric in ("lost_tracks", "relative_cost_difference")
@@ -68,16 +70,16 @@ def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
 
 
 def consistency_word(record: Any) -> str:
-    """Say what a mean NEES over its dimension means: an estimator is consistent where its interval holds one.
+    """Return the meaning of a mean NEES over its dimension: an estimator is consistent where its interval contains one.
 
     Args:
-        record: with ``value``, ``low`` and ``high``; or None.
+        record: record with ``value``, ``low`` and ``high``; or None.
 
     Returns:
         One or two words; by less than a factor of two an inconsistent one is "slightly" overconfident or cautious.
     """
     if record is None or record.value is None:
-        return "says nothing"
+        return "unknown"
     if record.low is None or record.low == record.high:
         return "no interval"
     if record.low <= 1.0 <= record.high:
@@ -87,24 +89,26 @@ def consistency_word(record: Any) -> str:
 
 
 def is_far_off(value: float) -> bool:
-    """Say whether a mean NEES over its dimension is off by more than a factor of two."""
+    """Return whether a mean NEES over its dimension is off by more than a factor of two."""
     return not 0.5 <= value <= 2.0
 
 
 def consistency(record: Any) -> str:
-    """Mean NEES over the dimension, marked where it is off by more than a factor of two."""
+    """Return the mean NEES over the dimension, marked where it is off by more than a factor of two."""
     if record is None or record.value is None:
         return "-"
     return f"{record.value:.3g}" + (f" {INCONSISTENT}" if is_far_off(record.value) else "")
 
 
 def score_text(record: Any) -> str:
-    """Score with its interval; none where the reference is not significantly better than the paper's algorithm."""
+    """Return the score with its interval; empty where the reference is not significantly better than the paper's
+    algorithm.
+    """
     return with_interval(record, negligible=1e-9)
 
 
 def main_components(records: Sequence[Any]) -> list[str]:
-    """Components that a table shows: groups such as "position" where there are any, else the first three."""
+    """Return the components of a table: groups such as "position" where there are any, else the first three."""
     first = records[0]
     names = [
         r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
@@ -113,13 +117,13 @@ def main_components(records: Sequence[Any]) -> list[str]:
 
 
 def select_components(names: Sequence[str]) -> list[str]:
-    """Of components and groups of them: the groups where there are any, else the first three."""
+    """Return the groups among components and groups where there are any, else the first three."""
     # One namesake is no group: "range" is not made of "range_rate".
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
 
 def rank_competitors(records: Sequence[Any]) -> list[tuple[str, str, str]]:
-    """Name, kind and control of every competitor: those that are ranked by their cost, then those that are not."""
+    """Return name, kind and control of every competitor: first the ranked ones by their cost, then the others."""
     cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("geometric_cost", "all")}
     found = dict.fromkeys((r.policy, r.kind, r.control) for r in records)
 
@@ -132,7 +136,7 @@ def rank_competitors(records: Sequence[Any]) -> list[tuple[str, str, str]]:
 
 
 def cost_title(paper: str) -> str:
-    """Title of the column of costs against the paper's algorithm of this name; a long name has a line of its own."""
+    """Return the title of the column of costs against the paper's algorithm; a long name has a line of its own."""
     return f"cost vs{' ' if len(paper) < 10 else chr(10)}{paper or 'paper'}, %"
 
 
@@ -147,10 +151,10 @@ def results_tables(
 
     Args:
         records: tidy records of one environment and scenario.
-        knows: what references and bounds know, by their names.
-        width: columns of the terminal. What does not fit beside each other stands below: the errors in tables of their
-            own, so that no number is cut.
-        paper: name of the paper's algorithm that costs are compared with.
+        knows: knowledge of references and bounds, by their names.
+        width: columns of the terminal; errors that do not fit stand below in tables of their own, so that no number
+            is cut.
+        paper: name of the paper's algorithm, with which costs are compared.
         own: names of the user's own competitors, whose rows are marked.
     """
     first = records[0]
@@ -182,11 +186,11 @@ def results_tables(
 
 
 Columns = Mapping[str, Callable[[str], str]]
-"""What each competitor has in a column, by the column's title."""
+"""Cells of each competitor, by the title of the column."""
 COST_NOTE = (
-    "cost is the geometric mean of the ratios of the episodes' costs, which no single episode owns; means that of the "
-    "mean costs, which few lost tracks may rule. A track is lost where an episode's mean cost is beyond the bound of "
-    "the environment."
+    "cost is the geometric mean of the ratios of the episodes' costs, which no single episode dominates; means "
+    "that of the mean costs, which few lost tracks may dominate. A track is lost where an episode's mean cost is "
+    "beyond the bound of the environment."
 )
 MEAN_COST_NOTE = "cost is the mean cost of a measurement."
 RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
@@ -195,7 +199,7 @@ RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
 def _cost_columns(
     records: Sequence[Any], found: Mapping[Any, Any], paper: str
 ) -> tuple[dict[str, Any], list[str]]:
-    """Columns on cost, consistency and time, and the sentences that explain them."""
+    """Return the columns on cost, consistency and time, and the sentences that explain them."""
     columns: dict[str, Callable[[str], str]] = {
         cost_title(paper): lambda name: with_interval(
             found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
@@ -209,7 +213,7 @@ def _cost_columns(
     for title in ["cost"] if compared else [cost_title(paper), "means,\n%"]:
         del columns[title]
     notes = [
-        f"{COST_NOTE if compared else MEAN_COST_NOTE} ANEES is 1 if errors are as large as the covariance says; "
+        f"{COST_NOTE if compared else MEAN_COST_NOTE} ANEES is 1 if errors are as large as the covariance states; "
         f"{INCONSISTENT} marks one that is off "
         "by more than a factor of two.",
     ]
@@ -229,13 +233,13 @@ def _cost_columns(
     if lost:
         columns["failed"] = lambda name: f"{lost.get(name, 0)}"
         notes.append(
-            "failed counts episodes in which an answer was not finite, or no covariance; the last valid one is held."
+            "failed counts episodes with an estimate that was not finite, or had no covariance; the last valid one is "
+            "repeated."
         )
     return columns, notes
 
 
 def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: bool) -> dict[str, Any]:
-    """Columns of the RMSE of the main components."""
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
 
     def rmse(component: str, name: str) -> str:
@@ -253,7 +257,9 @@ def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: 
 def _tables_below_each_other(
     draw: Callable[..., Table], costs: Columns, errors: Columns, width: int
 ) -> list[Table]:
-    """Costs in one table and errors below, each in a table of its own where they do not fit beside each other."""
+    """Return the costs in one table and the errors below, each in a table of its own where they do not fit side by
+    side.
+    """
     costs, errors = dict(costs), dict(errors)
     table = first_fitting([draw(costs, False, compact) for compact in (False, True)], width)
     if table is None:
@@ -266,12 +272,12 @@ def _tables_below_each_other(
 
 
 def first_fitting(tables: Iterable[Table], width: int) -> Table | None:
-    """Return the first table that needs no more columns than there are."""
+    """Return the first table that fits into the available columns."""
     return next((table for table in tables if _widest(table) <= width), None)
 
 
 def plain_table(title: str | None = None) -> Table:
-    """Return an empty table as all look: no lines but one below its head, two spaces between columns."""
+    """Return an empty table in the common form: one line below the head, two spaces between columns."""
     return Table(
         title=title,
         title_justify="left",
@@ -290,9 +296,7 @@ def competitors_table(
     compact: bool = False,
     own: Collection[str] = (),
 ) -> Table:
-    """Return a table of what each competitor has in each column: those that are not ranked in sections of their own,
-    and marks on the rows of what a user brings.
-    """
+    """Return a table of the competitors, with unranked ones in sections of their own, and marks on the user's rows."""
     table = plain_table()
     table.add_column("policy", overflow="fold")
     if control:
@@ -316,7 +320,6 @@ def competitors_table(
 
 
 def _widest(table: Table) -> int:
-    """Columns that a table takes where nothing is folded."""
     return Measurement.get(_MEASURING, _MEASURING.options, table).maximum
 
 
@@ -326,7 +329,7 @@ _MEASURING = Console(width=10_000, file=io.StringIO(), markup=False, emoji=False
 HEAD = 10
 """Columns of a title over a column of short numbers."""
 SHOWN_OF_FLIGHTS = 8
-"""Competitors in a table flight by flight: what fits beside each other."""
+"""Number of competitors in a table of flights that fit side by side."""
 
 
 def flights_table(
@@ -335,17 +338,17 @@ def flights_table(
     """Compare competitors flight by flight: error of the paper's algorithm, and what the others cost against it.
 
     Args:
-        dataset: from an evaluation of a set of flights.
-        records: of every flight.
-        over_all: records of all of them together, which rank the competitors.
-        width: columns of the terminal: of the competitors the best are shown, as many as fit.
+        dataset: dataset of an evaluation of flights.
+        records: records of every flight.
+        over_all: records over all flights, which rank the competitors.
+        width: columns of the terminal; as many of the best competitors are shown as fit.
     """
     tables = [_flights(dataset, records, over_all, shown) for shown in range(SHOWN_OF_FLIGHTS, 0, -1)]
     return first_fitting(tables, width) or tables[0]
 
 
 def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int) -> Table:
-    """Return the table with at most some competitors beside the one that they are compared with."""
+    """Return the table with a limited number of competitors beside the one of the comparison."""
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
     names = [name for name, kind, _ in rank_competitors(over_all) if kind in RANKED]
     shown, paper = main_components(over_all), dataset.attrs["paper"]
@@ -397,7 +400,7 @@ def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most
 
 
 def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
-    """Return what a search has found beside the values that it started from."""
+    """Return the values that a search has found beside those from which it started."""
     table = plain_table(f"{outcome.policy} on {outcome.scenario}")
     table.add_column("value")
     for title in ("untuned", "tuned"):

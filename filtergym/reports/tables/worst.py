@@ -24,17 +24,17 @@ def find_worst(
     competitors: Sequence[Competitor],
     explained: Sequence[str],
 ) -> dict[str, list[WorstTrack]]:
-    """Run the worst episodes of some competitors once more, each beside the opponent; their tracks by name.
+    """Run the worst episodes of some competitors once more, each beside the opponent; return their tracks by name.
 
     Args:
-        experiment: of the evaluation.
-        evaluation: of these competitors.
-        competitors: of the evaluation.
-        explained: names of those whose episodes are run.
+        experiment: experiment of the evaluation.
+        evaluation: evaluation of the competitors.
+        competitors: competitors of the evaluation.
+        explained: names of the competitors whose episodes are run.
     """
     found: dict[str, list[WorstTrack]] = {name: [] for name in explained}
     for name in found.keys() & evaluation.costs.keys():
-        opponent = opponent_in(evaluation.records, name)
+        opponent = find_opponent(evaluation.records, name)
         numbers = select_worst(evaluation.costs[name])
         makers = {one.name: one.maker for one in competitors if one.name in (name, opponent)}
         dataset = run_episodes(experiment, makers, numbers)
@@ -56,13 +56,13 @@ def find_worst(
 
 
 def _label(dataset: xarray.Dataset, number: int) -> str:
-    """Return what shows an episode again: its seed, or of a recording its name there."""
+    """Return the identity of an episode: its seed, or in a recording its name there."""
     name = "flight" if dataset.attrs["recorded"] else "episode_seed"
     return str(dataset[name].values[number])
 
 
-def opponent_in(records: Sequence[Record], name: str) -> str:
-    """Return with whom the records compare a competitor's cost; empty: with nobody."""
+def find_opponent(records: Sequence[Record], name: str) -> str:
+    """Return the competitor to which the records compare a competitor's cost; empty: none."""
     ratios = [reason.ratio.component for reason in reasons_of(records, name) if reason.ratio is not None]
     return ratios[0] if ratios else ""
 
@@ -70,12 +70,12 @@ def opponent_in(records: Sequence[Record], name: str) -> str:
 def worst_figures(
     worst: Mapping[str, Sequence[WorstTrack]], phrases: Mapping[str, str], columns: int
 ) -> Iterator[tuple[str, Any]]:
-    """Draw the worst episodes of each competitor: the name of a file, and the figure.
+    """Draw the worst episodes of each competitor; yield the name of a file, and the figure.
 
     Args:
-        worst: of :func:`find_worst`.
+        worst: episodes from :func:`find_worst`.
         phrases: when each cause holds, by name.
-        columns: of a paper, 1 or 2, as wide as which figures are.
+        columns: width of the figures in columns of a paper, 1 or 2.
     """
     for name, episodes in worst.items():
         own = [(one, one.track) for one in episodes if one.track is not None]
@@ -86,12 +86,10 @@ def worst_figures(
 
 
 def _titles(one: WorstTrack, phrases: Mapping[str, str]) -> tuple[str, str]:
-    """Seed and main cause, and cost, of an episode."""
     against = "" if one.ratio is None else f",\n{one.ratio:.3g} times {one.opponent}"
     cause = phrases.get(one.causes[0], one.causes[0]) if one.causes else "under no cause in particular"
     return f"episode {one.seed}\nmostly {cause}", f"mean cost {one.cost:.3g}{against}"
 
 
 def _file_name(name: str) -> str:
-    """Return a competitor's name as a part of a file's."""
     return re.sub(r"[^\w.-]", "_", Path(name).name)

@@ -3,7 +3,7 @@
   const [FIRST, OTHERS] = ["#D55E00", ["#0072B2", "#5a6472"]];
   const lineOf = (i) => ({ color: i ? OTHERS[(i - 1) % OTHERS.length] : FIRST, width: i ? 1.2 : 2 });
 
-  // What each stretch of the log served for: a strip below the figure, on the same axis of time.
+  // The use of each stretch of the log: a strip below the figure, on the same axis of time.
   function strip(spans) {
     return spans.map(([role, from, to]) => ({ type: "rect", xref: "x", yref: "paper", x0: from, x1: to, y0: 0, y1: 0.04, line: { width: 0 }, fillcolor: ROLES[role], opacity: 0.75 }));
   }
@@ -17,7 +17,7 @@
   const time = { title: { text: "time, s since the first row" } };
   const reach = (seconds) => [seconds[0], seconds[seconds.length - 1]];
 
-  // Parts of a line where something was measured, and where not: one is solid, the other dotted, and they meet.
+  // Parts of a line with measurements are solid, those without dotted; they are connected.
   function parts(values, isMissed) {
     const measured = values.map((y, i) => (isMissed[i] ? null : y));
     const missed = values.map((y, i) => (isMissed[i] || isMissed[i + 1] || (i && isMissed[i - 1]) ? y : null));

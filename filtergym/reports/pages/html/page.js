@@ -1,7 +1,7 @@
-// What all pages share: data packed in the page, how figures look, and light or dark. Whatever the data name is text:
-// `plain` keeps Plotly from reading marks in it.
+// Common parts of all pages: packed data, style of figures, and light or dark. All names in the data are text:
+// `plain` prevents Plotly from reading marks in them.
   const COLOURS = ["#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"]; // Okabe and Ito
-  const OWN = "#9B5DE5"; // of what the user brings
+  const OWN = "#9B5DE5"; // of the user's competitors
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
   const words = (text) => plain(text).replace(/_/g, " ");
   const root = document.documentElement;
@@ -11,12 +11,12 @@
     const bytes = Uint8Array.from(atob(script.textContent.trim()), (c) => c.charCodeAt(0));
     return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip")));
   }
-  // Plotly stands in the page once, packed; the page's policy lets it run by its hash.
+  // Plotly is in the page once, packed; the page's policy allows it by its hash.
   const library = unpacked(document.getElementById("plotly")).text().then((text) => {
     document.head.append(Object.assign(document.createElement("script"), { textContent: text }));
   });
 
-  // --- how figures look
+  // --- style of figures
 
   function layout(changes) {
     const axis = { gridcolor: css("--line"), zerolinecolor: css("--soft"), linecolor: css("--line"), automargin: true };
@@ -34,7 +34,7 @@
   }
   const config = { displayModeBar: window.innerWidth < 640 ? false : "hover", responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
 
-  // --- themes; what is drawn is drawn again
+  // --- themes; visible figures are drawn again
 
   const redraw = [];
   const dark = matchMedia("(prefers-color-scheme: dark)");

@@ -22,7 +22,7 @@
   }
   const something = (values) => values.some((x) => x !== null);
 
-  // --- how lines look: kinds always alike, one colour for a name in all figures of an environment
+  // --- style of lines: by kind, with one colour for a name in all figures of an environment
 
   function look(line) {
     const style = { color: css("--soft"), width: 1, dash: "solid" };
@@ -40,7 +40,7 @@
     return `rgba(${r},${g},${b},0.16)`;
   };
 
-  // --- lines with bands; those that nobody can tell apart are drawn once, with all their names
+  // --- lines with bands; indistinguishable ones are drawn once, with all their names
 
   function together(lines, of, [bottom, top], log) {
     const kept = [], at = (y) => log ? Math.log10(y) : y;
@@ -59,14 +59,14 @@
     return { name: all.length > 2 ? `${all[0]}${sign}${all.length - 1} others` : all.join(sign), every: all.join(`${sign}<br>`) };
   }
 
-  // Of the values that are drawn, the ends of an axis: numbers, or on a logarithmic axis their logarithms.
+  // Ends of an axis of the drawn values: numbers, or on a logarithmic axis their logarithms.
   function ends(lines, of, log) {
     const all = lines.flatMap((line) => (of(line).mid || []).filter((y) => y !== null && (!log || y > 0)).map((y) => log ? Math.log10(y) : y));
     const [low, high] = all.reduce(([l, h], y) => [Math.min(l, y), Math.max(h, y)], [Infinity, -Infinity]);
     return [low, high > low ? high : low + 1];
   }
 
-  // A band tells something where it is narrow on the axis; wide ones hide each other and the lines.
+  // A band is informative where it is narrow on the axis; wide ones hide each other and the lines.
   function isNarrow({ low, high }, [bottom, top], log) {
     const at = (y) => Math.min(Math.max(log ? Math.log10(Math.max(y, 1e-30)) : y, bottom), top);
     const widths = high.map((y, i) => y === null || low[i] === null ? 0 : at(y) - at(low[i]));
@@ -89,7 +89,7 @@
     return drawn;
   }
 
-  // --- what each figure offers: choices, each a function that returns traces and layout
+  // --- choices of each figure, each a function that returns traces and layout
 
   function overTime(cell, variable, indices, title, changes = {}, [x, numbers] = [cell.curves.time, cell.curves.numbers("time")]) {
     const { curves, lines } = cell;
@@ -128,7 +128,7 @@
       const names = curves.words("policy"), share = curves.numbers("share");
       const drawn = traces(lines, [], (line) => ({ mid: curves.row("error_exceeded", names.indexOf(line.name), i) }), null, true);
       for (const trace of drawn) [trace.x, trace.y, trace.hovertemplate] = [trace.y, share, "%{y:.3g} of measurements above %{x:.4g}" + trace.hovertemplate.slice(trace.hovertemplate.indexOf("<extra>"))];
-      // Tiny errors are told apart by nobody.
+      // Tiny errors are indistinguishable.
       const sizes = drawn.flatMap(({ x }) => x.filter((size, k) => size > 0 && share[k] < 0.9)), largest = Math.max(...drawn.flatMap(({ x }) => x));
       const range = [Math.log10(Math.min(...sizes) || 1), Math.log10(largest || 1) + 0.05];
       return [drawn, layout({ xaxis: { title: { text: `error of ${words(name)}, ${plain(curves.words("unit")[i])}` }, ...logarithmic, range }, yaxis: { title: { text: "share of measurements above" }, type: "log", exponentformat: "power", dtick: 1 } })];
@@ -153,12 +153,12 @@
           const varies = (line) => { const values = curves.row(variable, curves.words("policy").indexOf(line.name), ...indices).filter((y) => y !== null); return values.some((y) => Math.abs(y - values[0]) > 1e-6); };
           return { moving: cell.lines.filter(varies).length, choice: [title, () => overTime(cell, variable, indices, title, axis)] };
         }));
-      // What nobody moves is no picture; what most of them move comes first.
+      // An action that no competitor changes has no picture; the one that most change comes first.
       return found.filter(({ moving }) => moving).sort((a, b) => b.moving - a.moving).map(({ choice }) => choice);
     },
   };
 
-  // Who costs more than an axis shows.
+  // Competitors beyond the axis.
   const over = (end, names) => `over +${Math.round(end)} %: ${names.slice(0, 3).join(", ")}${names.length > 3 ? ` and ${names.length - 3} more` : ""}`;
 
   function dotted(rows, lines, paper) {
@@ -180,7 +180,7 @@
         marker: { color: style.color, size: single ? 8 : 7, symbol: { learned: "diamond", reference: "square-open", estimator: "triangle-up", yours: "cross" }[line.origin] || "circle" },
         error_x: { type: "data", symmetric: false, array: high, arrayminus: low, color: style.color, thickness: 1.2, width: 0 } };
     });
-    // Beyond three times the paper's cost a point is on the edge: near zero is where they are told apart.
+    // Beyond three times the paper's cost a point is on the edge: near zero is where they differ visibly.
     const ends = drawn.flatMap(({ x, error_x }) => x.flatMap((value, i) => [value - error_x.arrayminus[i], value + error_x.array[i]]));
     const range = [Math.max(-100, Math.min(...ends, 0) * 1.05 - 3), Math.min(200, Math.max(...ends, 5) * 1.05 + 3)];
     const beyond = drawn.filter(({ x }) => x.some((value) => value > range[1])).map(({ name }) => name);
@@ -199,7 +199,7 @@
 
   function frontOf(points, paper) {
     const ranked = points.filter(([, origin]) => origin !== "reference"), reference = points.find(([, origin]) => origin === "reference");
-    // Beyond twice the paper's cost is nobody on the front.
+    // Beyond twice the paper's cost no competitor is on the front.
     const most = Math.min(100, Math.max(5, ...ranked.map(([, , , cost]) => cost)));
     const top = Math.max(most, ...ranked.filter(([, origin]) => origin === "yours").map(([, , , cost]) => cost)), shown = ranked.filter(([, , , cost]) => cost <= top);
     const steps = shown.filter(([, , , , , on]) => on).sort((a, b) => a[2] - b[2]), times = shown.map(([, , time]) => time);
@@ -240,7 +240,7 @@
     return [low - margin, high + margin];
   }
 
-  // Where somebody's error is largest.
+  // Time of the largest error.
   function worstTime(track, name) {
     if (!track.has("truth")) return 0;
     const at = track.words("policy").indexOf(name);
@@ -281,7 +281,7 @@
       const title = (i) => ({ title: { text: `${words(components[i])}, ${plain(units[i])}` } });
       const rangeX = extent([tx, ...shown.map((line) => state(line, 0))]), rangeY = extent([ty, ...shown.map((line) => state(line, 1))]);
       Plotly.react(left, overview, layout({ xaxis: { ...title(0), range: rangeX }, yaxis: { ...title(1), range: rangeY, scaleanchor: "x", constrain: "domain" }, uirevision: "track" }), config);
-      // A close-up around the truth: what errors and ellipses are like now.
+      // A close-up around the truth with the current errors and ellipses.
       const close = [{ x: [0], y: [0], mode: "markers", name: "truth", marker: { color: css("--fg"), size: 9, symbol: "x-thin-open" }, showlegend: false }];
       if (sx.length && sx[n] !== null && tx[n] !== null) close.push({ x: [sx[n] - tx[n]], y: [sy[n] - ty[n]], mode: "markers", name: "measured", marker: { ...marks, size: 10 }, showlegend: false });
       let reach = 0;
@@ -292,7 +292,7 @@
         const around = ellipse(x[n], y[n], u * u, r * u * v, v * v), style = look(line), group = { legendgroup: plain(line.name), showlegend: false, name: plain(line.name) };
         const errors = x.map((u, i) => Math.hypot(u, y[i])).filter(Number.isFinite).sort((a, b) => a - b);
         reach = Math.max(reach, errors[Math.floor(0.9 * (errors.length - 1))] || 0, 2 * Math.max(u, v) / 1.5);
-        if (line === first) reach = Math.max(reach, Math.hypot(x[n], y[n])); // the one that the picture is about stays inside
+        if (line === first) reach = Math.max(reach, Math.hypot(x[n], y[n])); // the subject of the picture stays inside
         close.push(path(x.slice(Math.max(0, n - 12), n + 1), y.slice(Math.max(0, n - 12), n + 1), { line: { ...style, width: 1 }, opacity: 0.5, hoverinfo: "skip", ...group }),
           path(around.x, around.y, { line: style, hoverinfo: "skip", ...group }),
           { x: [x[n]], y: [y[n]], mode: "markers", marker: { color: style.color, size: 8 }, ...group });
@@ -344,7 +344,7 @@
     box.append(select);
   }
 
-  // One of the worst episodes at a time, with those two in colour whom it is about.
+  // One of the worst episodes at a time, with its two competitors in colour.
   function drawWorst(figure, cell) {
     const box = figure.querySelector(".plot");
     let draw = () => {};
@@ -401,7 +401,7 @@
   const linked = location.hash && document.getElementById(location.hash.slice(1));
   if (linked && linked.matches("details.cell")) linked.open = true;
 
-  // A table that is wider than its place says so.
+  // A table that is wider than its place is marked.
   const places = new ResizeObserver((seen) => seen.forEach(({ target }) => target.classList.toggle("scrolls", target.scrollWidth > target.clientWidth + 1)));
   for (const place of document.querySelectorAll(".table")) places.observe(place);
 
@@ -416,7 +416,7 @@
       const value = (row) => row.cells[column].dataset.sort;
       const order = (a, b) => {
         const [u, v] = [value(a), value(b)];
-        if (u === undefined || v === undefined) return (u === undefined) - (v === undefined); // what is missing stands last
+        if (u === undefined || v === undefined) return (u === undefined) - (v === undefined); // missing values last
         const less = number && !Number.isNaN(Number(u)) && !Number.isNaN(Number(v)) ? Number(u) - Number(v) : u.localeCompare(v);
         return descending ? -less : less;
       };

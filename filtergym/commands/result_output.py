@@ -1,4 +1,4 @@
-"""What several commands print of results, and the report that they make of them."""
+"""Results that several commands print, and the report that they make."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ REPORT = "report.html"
 
 
 def print_outcome(results: Sequence[Result]) -> None:
-    """Print a sentence for each environment, and what they rest on."""
+    """Print a sentence for each environment, and the basis of these."""
     for sentence in outcome_sentences(results):
         plain = sentence.replace("`", "")
         print_sentence(plain, bold=plain.index(":"))
@@ -24,7 +24,7 @@ def print_outcome(results: Sequence[Result]) -> None:
 
 
 def print_headline(results: Sequence[Result]) -> None:
-    """Print the best of every origin as a table, and remarks on it."""
+    """Print the best competitor of every origin as a table, and remarks on it."""
     print_table(headline_table(results))
     console.print()
     for sentence in remarks(results):
@@ -32,10 +32,10 @@ def print_headline(results: Sequence[Result]) -> None:
 
 
 def report_maker() -> Callable[[Sequence[Result], Settings], str]:
-    """Return what makes a report.
+    """Return the function that makes a report.
 
     Raises:
-        ValueError: if it takes packages that are not installed.
+        ValueError: if it needs packages that are not installed.
     """
     try:
         from ..reports.pages.html_report import report_html
@@ -45,7 +45,7 @@ def report_maker() -> Callable[[Sequence[Result], Settings], str]:
 
 
 def make_report(results: Sequence[Result], settings: Settings, out: Path) -> None:
-    """Make a report and say where it is; beside other results it may lack, and then this says why.
+    """Make a report and print its path; beside other results it may be missing, with a printed reason.
 
     Raises:
         ValueError: if it cannot be written.
