@@ -13,7 +13,7 @@ from rich.table import Table
 
 from ...agents import validation
 from ...agents.named_policies import find_learned_policy
-from ...agents.training_run import Passed, TrainingRun
+from ...agents.training_run import FirstWin, TrainingRun
 from ...agents.validation import TrainingEpisodes, validation_backend
 from ...envs.contract.model import Episode, Model
 from ...evaluation.competitors.kinds import RandomPolicy
@@ -94,7 +94,7 @@ def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
     return min(finalists, key=lambda name: episodes.costs(makers[name]).mean())
 
 
-def standing_table(standing: xarray.Dataset, passed: Mapping[str, Passed | None]) -> Table:
+def standing_table(standing: xarray.Dataset, passed: Mapping[str, FirstWin | None]) -> Table:
     """Compare agents with their opponents: cost, its difference to the paper's algorithm, consistency.
 
     Args:
