@@ -282,7 +282,7 @@ def naive_factors(nis, degrees):
     ("fallback", "message"),
     [
         ("fixed-low", r"fallback 'fixed-low' costs [\d.]+ % more than the paper's algorithm 'imm'"),
-        ("imm-smoother", "'imm-smoother' is of kind smoother and nothing that a gate can fall"),
+        ("imm-smoother", "'imm-smoother' is of kind smoother and cannot be the fallback of a gate"),
         ("imm-tuned", "'imm-tuned' has task parameters of its own"),
     ],
 )
@@ -304,8 +304,8 @@ def test_every_environment_falls_back_on_something_better_than_the_paper(env_id)
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("kalman-imm", "'kalman-imm' is of kind estimator and has no actions that follow"),
-        ("random", "'random' is of kind policy and has no actions that follow"),
+        ("kalman-imm", "'kalman-imm' is of kind estimator and has no actions that depend on measurements"),
+        ("random", "'random' is of kind policy and has no actions that depend on measurements"),
         ("immm", "unknown policy 'immm'"),
     ],
 )
