@@ -9,6 +9,7 @@ FUZZ_SECONDS ?= 600
 VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := docs/conf.py docs/make filtergym compiler filters envs evaluation baselines agents tests benchmarks
+WORDS := compiler filters envs evaluation baselines agents filtergym benchmarks docs papers README.md CHANGELOG.md CONTRIBUTING.md SECURITY.md RELEASING.md Makefile
 
 # Numbers, and every library once: gymnasium, scipy, pandas, xarray, matplotlib, typer and rich, safetensors, msgspec.
 CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.py test_parameters.py \
@@ -118,6 +119,7 @@ publishable: $(VENV)/.dev  ## check with the field's own tools packages, workflo
 check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/codespell $(WORDS)
 	$(BIN)/mypy -p filtergym
 	MYPYPATH=docs/make $(BIN)/mypy docs/make
 	$(BIN)/pyright --pythonpath $(BIN)/python

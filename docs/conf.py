@@ -8,7 +8,7 @@ from typing import Any, NewType
 import numpy.typing
 from docutils import nodes
 
-# By its name, not as the union of ten types that it is; said before anything imports it.
+# By its name, not as the union of ten types that it is; set before anything imports it.
 numpy.typing.ArrayLike = NewType("ArrayLike", object)
 
 import filtergym  # noqa: E402
@@ -52,7 +52,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = "filtergym"
 html_static_path = ["_static"]
 html_css_files = ["filtergym.css"]
-# Said before the theme asks, which reports an error where nothing is said; `default_mode` would hide all colours from
+# Set before the theme reads it, which reports an error where nothing is set; `default_mode` would hide all colours from
 # browsers without scripts.
 html_js_files = [(None, {"body": "document.documentElement.dataset.mode ||= 'auto'"})]
 html_show_sourcelink = False
@@ -103,7 +103,7 @@ def _formulas_as_they_stand(app: Any, what: str, name: str, obj: Any, options: A
 
 
 def _without_counted_fields(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Drop what Python itself says of a named tuple's field without documentation."""
+    """Drop Python's own text on a named tuple's field without documentation."""
     if lines and lines[0].startswith("Alias for field number"):
         lines.clear()
 

@@ -95,7 +95,7 @@ class Track {
 
 const normal = () => Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
 
-/* What the radar says of a target at a time. */
+/* Measurement of a target at a time. */
 function measure(target, time, { noise, missed, glint }) {
   const factor = Math.random() < missed / 100 ? NaN : Math.random() < glint / 100 ? GLINT_FACTOR : 1;
   const [x, y] = [target.x, target.y].map((truth) => truth + factor * noise * normal());
@@ -260,7 +260,7 @@ function errorOf(step, name, known) {
   return step.seen ? Math.sqrt(Math.max(estimate.nis, 0) / 2) : NaN;
 }
 
-/* Whether the truth lies outside the ellipse; null where that cannot be said. */
+/* Whether the truth lies outside the ellipse; null where it is unknown. */
 function isOutside({ estimates, truth_x, truth_y }, name) {
   if (!estimates[name]?.taken || !Number.isFinite(truth_x)) return null;
   const { mean, covariance: [[a, b], [, c]] } = estimates[name];
@@ -460,7 +460,7 @@ class Playground {
   }
 
   /* Let the target move, a second at most at a time, so that it turns back before the border however slow the page is;
-     whenever a scan is due, the filters get what it says. */
+     whenever a scan is due, the filters get its measurement. */
   advance(seconds) {
     const end = this.time + seconds;
     while (this.time < end) {

@@ -139,7 +139,7 @@ def flight_of(trajectory: Trajectory) -> str:
 
 
 def _number_namesakes(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Number whole flights with the same name, which are not pieces of one flight."""
+    """Assign numbers to whole flights with the same name, which are not pieces of one flight."""
     names = [flight_of(trajectory) for trajectory in trajectories]
     return [
         replace(trajectory, name=f"{trajectory.name} {i}")

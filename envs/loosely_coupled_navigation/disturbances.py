@@ -87,7 +87,7 @@ class NoiseChanges(Disturbance):
         return Levels(xp.stack(levels), xp.stack(reported), change, levels[0], reported[0])
 
     def quiet(self, state: Levels, calm: Array) -> Levels:
-        """The receiver reports its true noise; the law of its reports stays."""
+        """Return the law of the reports unchanged: the receiver reports its true noise."""
         return state._replace(true=self.xp.where(calm, state.reported, state.true))
 
     def advance(self, state: Levels, step: DisturbanceInput) -> Levels:
@@ -184,7 +184,7 @@ class _Once(Disturbance):
         return state._replace(number=step.number)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """The window, -1 where there is none."""
+        """Return the window, -1 where there is none."""
         return {self.name: _shown(state.window)}
 
 

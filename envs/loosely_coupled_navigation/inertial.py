@@ -152,7 +152,7 @@ def inertial_recording(
 def measurements_beside(
     ins: numpy.ndarray, fixes: numpy.ndarray, deviations: numpy.ndarray, rows: numpy.ndarray
 ) -> dict[str, numpy.ndarray]:
-    """The arrays of a ``Measurement`` by their names, ``(E, K, ...)``.
+    """Return the arrays of a ``Measurement`` by their names, ``(E, K, ...)``.
 
     Args:
         ins: positions of the INS from the start on, m, ``(E, 1 + K, 2)``.

@@ -187,7 +187,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return truth.reference
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """The receiver's position."""
+        """Return the position of the receiver."""
         return self.mask_missing(measurement).fix
 
     def component_deviations(self, measurement: Measurement) -> Array:

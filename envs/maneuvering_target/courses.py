@@ -404,7 +404,7 @@ class Table(Course):
     def motion_at_early_scan(
         self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """A table has no states between its scans: they come on time."""
+        """Return the motion on time: a table has no states between its scans."""
         return on_time
 
     def _states(self, column: Array) -> Motion:

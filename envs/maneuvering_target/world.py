@@ -188,7 +188,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return measurement._replace(odometry=Odometry(nothing, nothing[0]))
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """The measured position; nothing of the velocity."""
+        """Return the measured position, without the velocity."""
         position = self.mask_missing(measurement).position
         return self.xp.concat([position, position * math.nan])
 

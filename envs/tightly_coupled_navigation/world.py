@@ -98,7 +98,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     # --- the episode
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """The nominal ones."""
+        """Return the nominal deviations."""
         return self.task.sensor_sigma + 0.0 * measurement.readings
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:

@@ -47,11 +47,11 @@ class SmoothedTrack(Filter[Task, Any, int]):
         return state + 1
 
     def mean(self, state: int) -> Array:
-        """What was found at the last measurement."""
+        """Return the estimate at the last measurement."""
         return self.means[:, state - 1, self.lanes]
 
     def covariance(self, state: int) -> Array:
-        """What was found at the last measurement."""
+        """Return the estimate at the last measurement."""
         return self.covariances[:, :, state - 1, self.lanes]
 
 
