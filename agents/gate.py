@@ -357,8 +357,8 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         xp, measurement = self.xp, given.measurement
         agent, fallback = self.agent.update(state.agent, given), self.fallback.update(state.fallback, given)
         mean, other_mean = self.agent.mean(agent), self.fallback.mean(fallback)
-        own = Likelihood.told(self.agent.records(agent, measurement))
-        other = Likelihood.told(self.fallback.records(fallback, measurement))
+        own = Likelihood.of_records(self.agent.records(agent, measurement))
+        other = Likelihood.of_records(self.fallback.records(fallback, measurement))
         if isinstance(self.fallback, Adapter) and not self.fallback.tells:
             other = Likelihood(None)
         # A track that is lost altogether, so that its estimate is no number, is no answer either.

@@ -201,7 +201,7 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
 
     def _step(self, state: Any, measurement: Any) -> tuple[Any, Likelihood]:
         after = self.own.step(state, FilterInput(measurement))
-        return after, Likelihood.told(self.own.records(after, measurement))
+        return after, Likelihood.of_records(self.own.records(after, measurement))
 
     def mean(self, state: RobustState) -> Array:
         """That of the filter."""

@@ -82,7 +82,7 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         measurement = measurement._replace(readings=readings)  # the bank weighs each by its availability
         filters = self.bank.predict(state.filters, measurement)
         filters = self.bank.weigh_by_bayes(filters, state.filters.action)
-        return HuberState(filters, Likelihood.told(self.bank.records(filters, measurement)))
+        return HuberState(filters, Likelihood.of_records(self.bank.records(filters, measurement)))
 
     def mean(self, state: HuberState) -> Array:
         """That of the bank."""

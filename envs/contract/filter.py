@@ -62,7 +62,7 @@ class Likelihood(NamedTuple):
         return cls(None).fill_unknown(like)
 
     @classmethod
-    def told(cls, records: Mapping[str, Array]) -> "Likelihood":
+    def of_records(cls, records: Mapping[str, Array]) -> "Likelihood":
         """Return the likelihood in the records of a filter, see :meth:`Filter.records`; None for missing parts."""
         return cls(*(records.get(name) for name in cls._fields))
 

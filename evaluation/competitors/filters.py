@@ -210,7 +210,7 @@ class HeldInPython(Filter[Task, Any, Adapted]):
             covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
         known = (
             None if values is None else self._numbers(name, values, (width,))
-            for name, values in Likelihood.told(self.told)._asdict().items()
+            for name, values in Likelihood.of_records(self.told)._asdict().items()
         )
         return Adapted(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
 
@@ -322,7 +322,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
 
     def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
         """How likely the measurement was, and why the episode is lost."""
-        told = Likelihood.told(self.own.records(state.own, measurement)).fill_unknown(state.fault)
+        told = Likelihood.of_records(self.own.records(state.own, measurement)).fill_unknown(state.fault)
         missing = {} if state.missing is None else {"missing": state.missing}
         return {**told._asdict(), "lost": state.fault, **missing}
 
