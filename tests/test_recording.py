@@ -531,7 +531,7 @@ def test_too_many_rows_are_refused_early():
 # --- NetCDF
 
 
-NOT_FINITE = "position is not finite at measurement 3; what is missing has the value zero"
+NOT_FINITE = "position is not finite at measurement 3; write zero for a missing value"
 
 
 @pytest.mark.parametrize(
@@ -587,7 +587,7 @@ def test_truth_needs_a_cost_of_the_error(recordings, monkeypatch):
     from filtergym.envs.maneuvering_target.world import RadarWorld
 
     monkeypatch.setattr(RadarWorld, "error_cost", World.error_cost)
-    with pytest.raises(ValueError, match="does not say what an error costs"):
+    with pytest.raises(ValueError, match="defines no cost of an error"):
         make_model(TARGET, scenario=recordings[TARGET])
     make_model(TARGET, scenario=blind(recordings[TARGET]))
 

@@ -152,7 +152,7 @@ class Model:
             return own
         return self.task.feedback(self.filter.mean(state), self.filter.covariance(state), measurement)
 
-    # --- what the engine calls
+    # --- called by the engine
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
         """Return the episode at the start of the track.

@@ -305,8 +305,8 @@ def _read(
     return shown if inverse is None else inverse(shown)
 
 
-# --- blocks that several problems show, each with its name, words, scale and bounds; a problem adds the value where its
-# state keeps that under another name, the endings of the rows, and words where they say more than the usual ones
+# --- blocks of several problems, each with its name, words, scale and bounds; a problem adds the value where its state
+# has another name for it, the suffixes of the rows, and words where they are more precise than the usual ones
 
 
 Value = Callable[[Any, Any], Array]

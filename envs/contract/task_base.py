@@ -87,7 +87,7 @@ class TaskBase(ABC):
             self.world = recording.world(self)
         self.noise = self._noise_layout()
 
-    # what the declaration gives, see :class:`~.task.Task`
+    # attributes of the declaration, see :class:`~.task.Task`
     World: ClassVar[Any]
     components: tuple[Any, ...]
 

@@ -88,7 +88,7 @@ def open_foreign(path: Path, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
         ValueError: if it is a device, a pipe or a folder, is larger, or cannot be opened.
     """
     try:
-        # Without O_NONBLOCK to open a pipe would wait for a writer.
+        # Without O_NONBLOCK, opening a pipe would wait for a writer.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except FileNotFoundError:
         raise
@@ -112,7 +112,7 @@ def is_folder(path: Path) -> bool:
     """Return whether there is a folder of this name; False for a name that no folder can have."""
     try:
         return path.is_dir()
-    except (OSError, ValueError):  # a name that no file can have
+    except (OSError, ValueError):  # an impossible name of a file
         return False
 
 
@@ -130,7 +130,7 @@ def read_content(path: Path, most: int | None = None) -> bytes:
     most = limits().memory if most is None else most
     with open_foreign(path, most) as file:
         content = file.read(most + 1)
-    if len(content) > most:  # it grew, or the system does not say how large it is
+    if len(content) > most:  # it grew, or the system does not report its size
         raise ValueError(f"it is larger than {_size(most)}: split it")
     return content
 
@@ -231,7 +231,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
             "options": options,
         }
         one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        # No plugin is loaded because a file of HDF5 names it; memory of Arrow is what is asked for, and no pool.
+        # A file of HDF5 must not load a plugin that it names; Arrow allocates from the system, without a pool.
         own = {"HDF5_PLUGIN_PRELOAD": "::", "ARROW_DEFAULT_MEMORY_POOL": "system"}
         process = subprocess.Popen(
             [sys.executable, "-I", foreign_parsers.__file__, json.dumps(request)],

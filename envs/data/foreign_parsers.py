@@ -53,7 +53,7 @@ def check_column_names(names: Sequence[str]) -> list[str]:
 def check_rows(count: int, most: int) -> None:
     """Raise ValueError for a table with too many rows."""
     if count > most:
-        raise ValueError(f"it has more than {most:,} rows: split it, or keep fewer a second")
+        raise ValueError(f"it has more than {most:,} rows: split it, or reduce the rate of its rows")
 
 
 def check_cells(name: str, cells: Any) -> None:
@@ -190,7 +190,7 @@ def parse_parquet(
         )
         if total > bytes_limit:
             raise LimitError(f"its columns unpacked take {total / 1e6:,.0f} MB")
-    # What comes often as the same word is read as its number: a long word is not repeated a million times.
+    # Repeated words are read as numbers, so that a long word is not copied a million times.
     types = pyarrow.types
     words = [
         n
@@ -520,7 +520,7 @@ def _plain(value: Any, arrays: list[Any]) -> Any:
         return {"array": len(arrays) - 1, "dtype": array.dtype.str, "shape": list(array.shape)}
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise ValueError(f"it holds what is neither numbers nor words: {type(value).__name__}")
+    raise ValueError(f"it contains a value that is neither a number nor a word: {type(value).__name__}")
 
 
 def _answer(handle: int, head: Any, arrays: Sequence[Any] = ()) -> None:
@@ -535,7 +535,7 @@ def _answer(handle: int, head: Any, arrays: Sequence[Any] = ()) -> None:
 def main() -> None:
     """Parse the file of the request in the first argument."""
     request = json.loads(sys.argv[1])
-    # Libraries print what they find strange: the answer has a channel of its own.
+    # Libraries print warnings, so the result has a channel of its own.
     answers = os.dup(1)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
@@ -559,7 +559,7 @@ def main() -> None:
         head, arrays = {"memory": str(error)}, []
     except MemoryError:
         head, arrays = {"memory": "its parser needs more memory"}, []
-    except Exception as error:  # libraries raise whatever a broken file makes them stumble over
+    except Exception as error:  # libraries raise any error for a broken file
         text = " ".join(str(error).split())[:300] or type(error).__name__
         short = "alloc" in text.lower() or "memory" in text.lower()
         head, arrays = {"error": text, "own": type(error) is ValueError}, []

@@ -73,7 +73,7 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
     """
     if task.closes_loop:
         raise ValueError(
-            f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
+            f"{task.id} with these parameters is a closed loop, in which the estimate changes the next measurement: "
             "readings depend on the estimate in the loop, so that they can be neither "
             "recorded nor replayed"
         )

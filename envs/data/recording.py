@@ -125,12 +125,12 @@ class Recording(ScenarioData):
                 f"after {times[wrong]:g} s"
             )
         if self.truth is not None and numpy.isinf(self.truth[episode, :rows]).any():
-            raise ValueError(f"recording {name!r}: truth is infinite; what is not known of it is NaN")
+            raise ValueError(f"recording {name!r}: truth is infinite; write NaN for unknown values")
         for what, values in self.measurements.items():
             if not numpy.isfinite(values[episode, :rows]).all():
                 raise ValueError(
-                    f"recording {name!r}: {what} is not finite at measurement {_first(values[episode]) + 1}; what is "
-                    "missing has the value zero, where the environment can say so"
+                    f"recording {name!r}: {what} is not finite at measurement {_first(values[episode]) + 1}; write "
+                    "zero for a missing value, where the environment has a flag for it"
                 )
         for what, values in self.initial.items():
             if not numpy.isfinite(values[episode]).all():
@@ -148,7 +148,7 @@ class Recording(ScenarioData):
     def rows(self) -> numpy.ndarray:
         """Number of measurements of each episode, ``(E,)``."""
         there = numpy.isfinite(self.seconds)
-        # From the last one backwards: what is missing before it is a mistake, and not the end.
+        # From the last one backwards: a missing value before it is an error, and not the end.
         return self.seconds.shape[1] - numpy.argmax(there[:, ::-1], axis=1) * there.any(axis=1)
 
     @functools.cached_property
@@ -262,8 +262,8 @@ class Recording(ScenarioData):
                     )
         if self.truth is not None and task.World.error_cost is World.error_cost:
             raise ValueError(
-                f"recording {self.name!r} has truth, and {task.id} does not say what an error costs: give its World "
-                "the method error_cost, or leave the truth out"
+                f"recording {self.name!r} has truth, and {task.id} defines no cost of an error: give its World "
+                "the method error_cost, or omit the truth"
             )
         if self.truth is not None and self.truth.shape[2] != len(task.components):
             raise ValueError(
@@ -456,7 +456,7 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
         widths = [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)]
         return numpy.pad(values, widths, constant_values=fill)
 
-    # What only some hold, such as a second sensor, is of none.
+    # Arrays of some recordings only, such as a second sensor, are omitted.
     names = [key for key in first.measurements if all(key in one.measurements for one in recordings)]
     truths = [padded(one.truth) for one in recordings if one.truth is not None]
     times = [padded(one.log_time) for one in recordings if one.log_time is not None]

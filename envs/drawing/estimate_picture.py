@@ -137,7 +137,7 @@ class EstimatePicture(Picture):
         for name, line in (("true", self.true), ("seen", self.seen), ("believed", self.believed)):
             x, y = self._places([history.get(f"{name}.{row}", empty) for row in range(len(self.drawn))])
             line.set_data(x, y)
-        self.now.set_data(x[-1:], y[-1:])  # what is believed came last
+        self.now.set_data(x[-1:], y[-1:])  # the last column is the estimate
         self.ellipse.set_visible(self.plane and len(x) > 0)
         if self.plane and len(x):
             P = numpy.array([[history[f"covariance.{i}{j}"][-1] for j in range(2)] for i in range(2)])

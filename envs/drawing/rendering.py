@@ -354,7 +354,7 @@ class EpisodePicture:
         canvas = figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
         moving = [_moving(axes) for axes in figure.axes]
-        # Frames, ticks and letters take nine tenths of the time: they are drawn again only when they change.
+        # Frames, ticks and letters take nine tenths of the time, so they are drawn again only when they change.
         limits = [tuple(axes.viewLim.extents) for axes in figure.axes]
         if limits != self._limits:
             for artist in [self._title, *(artist for artists in moving for artist in artists)]:
@@ -383,10 +383,10 @@ class EpisodePicture:
         if not opened:
             figure.show()
         elif not pyplot.fignum_exists(figure.number):
-            return  # the user has closed the window: the episode goes on unseen
+            return  # the user has closed the window: the episode continues without it
         figure.canvas.draw_idle()
         due = self._last_shown + 1.0 / self.frames_per_second
-        # The event loop is what draws, also when no time is left to wait.
+        # The event loop draws, so it must run even when no time is left to wait.
         figure.canvas.start_event_loop(max(due - time.monotonic(), 0.001))
         self._last_shown = time.monotonic()
 
@@ -445,7 +445,7 @@ class EpisodePicture:
             rows, columns, left=self.picture.strips_left, right=0.985, bottom=0.075, top=0.9,
             hspace=0.09 * rows, wspace=0.2,
         )  # fmt: skip
-        # Column by column, so that what belongs together stands above each other.
+        # Column by column, so that related strips are above each other.
         axes = [figure.add_subplot(grid[i % rows, i // rows]) for i in range(cells)]
         for i, one in enumerate(axes):
             one.tick_params(labelsize=8)
@@ -564,7 +564,7 @@ def _window(title: str) -> Figure:
 
     try:
         figure = pyplot.figure(figsize=FIGURE_SIZE, dpi=DOTS_PER_INCH)
-    except Exception as error:  # every toolkit has exceptions of its own for a missing display
+    except Exception as error:  # each toolkit has exceptions of its own for a missing display
         raise _WindowError(
             f"the backend {matplotlib.get_backend()!r} cannot open a window ({error}); check DISPLAY and MPLBACKEND"
         ) from error

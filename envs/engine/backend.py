@@ -95,7 +95,7 @@ def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
 
     try:
         chosen = torch.device("cpu" if device is None else device)
-        # An allocation is the only question that every kind of device answers, also whether it has float64.
+        # Only an allocation tests every kind of device, also for float64.
         torch.zeros(1, dtype=torch.float64, device=chosen)
     except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
         there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]

@@ -264,6 +264,6 @@ def register() -> None:
                 id,
                 entry_point="filtergym.envs.interface.environment:TaskEnv",
                 vector_entry_point="filtergym.envs.interface.vector_environment:TaskVectorEnv",
-                # A spawned process gets no more than this, and must find the environment by it.
+                # A spawned process receives only this, and must find the environment by it.
                 kwargs={"task": importable_name(USER_TASKS[id]) if id in USER_TASKS else id},
             )

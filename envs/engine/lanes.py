@@ -41,7 +41,7 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     """
 
     def replaced(old: Array, new: Array) -> Array:
-        # A copy, because states are never changed in place: someone may still hold the old one.
+        # A copy, because states are never changed in place: the old one may still be in use.
         merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
         merged[..., lanes] = new[..., : len(lanes)]
         return merged
@@ -419,7 +419,7 @@ class Lanes:
         self.noise.advance()
         return self.noise.row
 
-    # --- what steps them
+    # --- steppers
 
     def _by_functions(self) -> list[Any]:
         """Return the steppers by the models' functions, without episodes."""

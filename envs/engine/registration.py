@@ -73,7 +73,7 @@ def _check_contract(cls: Any) -> None:
         raise nearest(f"control in actions of {name}", min(strange), cls.banks)
     for key, scenario in cls.scenarios.items():
         if key != scenario.name:
-            raise ValueError(f"scenario {scenario.name!r} of {name} stands in the table as {key!r}")
+            raise ValueError(f"scenario {scenario.name!r} of {name} has the key {key!r} in scenarios")
         unknown = set(scenario.parameters) - fields
         if unknown:
             raise ValueError(
@@ -108,7 +108,7 @@ def _check_action(model: Model) -> None:
         )
     if paper.control == model.control and flat and (len(paper.action),) != space.shape:
         raise ValueError(
-            f"{_name_of(model)} takes actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
+            f"{_name_of(model)} has actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
         )
 
 
@@ -209,7 +209,7 @@ def _check_episodes(model: Model) -> None:
         holds = ask(f"cause {cause.name!r}", cause.holds, model.moment(episode))
         if holds is not None:
             check(f"cause {cause.name!r}", holds, ())
-    episode = measure(episode)  # with what the bank gives back
+    episode = measure(episode)  # with the feedback of the bank
     before = dict([*_leaves("truth", start.truth), *_leaves("filter's state", start.filter)])
     for part in ("truth", "measurement", "filter's state"):
         for name, values in _leaves(part, getattr(episode, part.partition("'")[0])):

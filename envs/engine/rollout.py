@@ -124,7 +124,7 @@ class Rollout:
         given = [self._states[0], self.action[0], self.noise[0], *(each[0] for each in self.teacher)]
         self._forward = forward.bound(given, [self._next, self.reward, self.shown])
         adjoint, other = empty_lanes((rows,), width), empty_lanes((rows,), width)
-        # One reads what the other has written.
+        # One reads the output of the other.
         self._backward = [
             backward.bound(
                 [*given, after, self.reward_adjoint, self.shown_adjoint], [before, self.action_adjoint]

@@ -142,7 +142,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
                 and action.shape == self._plain_action
                 and action.dtype.kind == "f"
                 and all(map(math.isfinite, action.tolist()))
-            ):  # otherwise there is nothing to look at
+            ):  # otherwise no picture is needed
                 action = check_action(self.action_space, action, None)
             observation, reward, over = lanes.step_alone(action, self.reward_kind)
             return observation, reward, False, over, {}

@@ -68,7 +68,7 @@ def check_alike(model: Model, other: Model, name: str) -> None:
         "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
         "the action space": lambda t: t.action_space,
         "decision_interval": lambda t: t.task.decision_interval,
-        "what is estimated": lambda t: t.task.components,
+        "the components of the estimate": lambda t: t.task.components,
     }
     for what, of in properties.items():
         if of(model) != of(other):
@@ -109,7 +109,7 @@ class Fleet:
             self._parts, self._part[:] = [self._make_lanes(distribution.models[0], count)], 0
         self._arrange()
 
-    # --- who flies where
+    # --- places of the lanes
 
     @property
     def only(self) -> Lanes:
@@ -194,12 +194,12 @@ class Fleet:
         self._part = numpy.array([renumbered[int(part)] for part in self._part])
         self._parts = [self._parts[i] for i in kept]
         self._flying = [i for i in range(len(self._parts)) if (self._part == i).any()]
-        # Arrays of all places of those that fly are put side by side: there each lane finds its own.
+        # The arrays of all used places are side by side; each lane has an index into them.
         self._where, self._sources, first = self._place.copy(), [], 0
         for i in self._flying:
             own = numpy.flatnonzero(self._part == i)
             self._where[own] += first
-            # An unused place takes the action of the first environment.
+            # An unused place has the action of the first environment.
             source = numpy.full(self._parts[i].count, own[0])
             source[self._place[own]] = own
             self._sources.append(source)
@@ -255,7 +255,7 @@ class Fleet:
         else:
             self._parts, self._part[:] = [], -1
 
-    # --- what lanes do
+    # --- steps of the lanes
 
     def parts(self, *values: Array) -> list[tuple[Any, ...]]:
         """Return the lanes of every task in use, each with its entries of arrays ``(count, ...)``."""

@@ -47,7 +47,7 @@ FEW = 16
 def _all_finite(values: Array) -> bool:
     if isinstance(values, numpy.ndarray) and values.size <= FEW:
         return all(map(math.isfinite, values.ravel().tolist()))
-    # The sum is finite unless an entry is not, and costs a third of asking for every entry. It may overflow.
+    # The sum is finite unless an entry is not, and costs a third of a check of every entry. It may overflow.
     with numpy.errstate(over="ignore", invalid="ignore"):
         return math.isfinite(values.sum()) or all(map(math.isfinite, values.reshape(-1).tolist()))
 

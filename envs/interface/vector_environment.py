@@ -193,7 +193,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         mask = wanted.get("reset_mask")
         if self.pictures is not None and {"scenario", "parameters"} & wanted.keys():
             raise ValueError(
-                "a vector of environments that is drawn flies one scenario: leave out render_mode, or scenario and "
+                "a vector environment with a render_mode has one scenario: omit render_mode, or scenario and "
                 "parameters in the options of a reset"
             )
         if mask is None:
