@@ -144,7 +144,7 @@ class PlainRows(NamedTuple):
 
     received: tuple[str, ...]
     """Columns of the numbers of ``values``; an empty cell is a value that was not received."""
-    held: tuple[str, ...]
+    inputs: tuple[str, ...]
     """Columns of the numbers of ``inputs``; an empty cell repeats the last number, or before it the first."""
     mean: numpy.ndarray
     """Initial estimate of every track, ``(C,)``, one interval before the first row."""

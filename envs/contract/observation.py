@@ -128,7 +128,7 @@ class Block(NamedTuple):
     """Meaning, in words."""
     parts: Sequence[str] = ()
     """Suffixes of its rows: the fields are ``name_part``. Empty where one row is the field ``name``."""
-    shown: Compression = PLAIN
+    compression: Compression = PLAIN
     unit: str = "1"
     """Unit of the values in the observation."""
     over_interval: Literal["last", "mean"] = "last"
@@ -165,11 +165,11 @@ class Blocks:
         self.quantities: dict[str, Quantity] = {quantity.name: quantity for quantity in quantities}
         self.xp = xp
         self.fields: tuple[Field, ...] = tuple(
-            Field(name, block.unit, block.shown.text + block.text, block.over_interval)
+            Field(name, block.unit, block.compression.text + block.text, block.over_interval)
             for block in self.blocks
             for name in _field_names(block)
         )
-        limits = [block.shown.limits for block in self.blocks for _ in _field_names(block)]
+        limits = [block.compression.limits for block in self.blocks for _ in _field_names(block)]
         self.limits: numpy.ndarray = numpy.array(limits).reshape(-1, 2).T
         """Lower and upper bounds of the observation, ``(2, fields)``."""
         names = [field.name for field in self.fields]
@@ -180,8 +180,8 @@ class Blocks:
         # One call of a compression for all blocks that share it: calls cost more than numbers.
         shared: dict[Callable[[Array, ModuleType], Array], list[int]] = {}
         for i, block in enumerate(self.blocks):
-            if block.shown.forward is not None:
-                shared.setdefault(block.shown.forward, []).append(i)
+            if block.compression.forward is not None:
+                shared.setdefault(block.compression.forward, []).append(i)
         self._shared = [
             (forward, members, [len(_field_names(self.blocks[i])) for i in members])
             for forward, members in shared.items()
@@ -233,7 +233,7 @@ class Blocks:
 
     @functools.cached_property
     def _inverses(self) -> dict[str, Callable[[numpy.ndarray], numpy.ndarray] | None]:
-        return {block.name: block.shown.inverse for block in self.blocks}
+        return {block.name: block.compression.inverse for block in self.blocks}
 
     def reader(self, name: str) -> Reader:
         """Return a function that reads a block, uncompressed, or a quantity from observations.
@@ -320,11 +320,11 @@ def innovation_block(
     value: Value = lambda f, _: f.innovation,
     text: str = "the innovation over its predicted sigma",
     name: str = "innovation",
-    shown: Compression = SIGNED_LOG,
+    compression: Compression = SIGNED_LOG,
     over_interval: Interval = "last",
 ) -> Block:
     """Return the innovation over a deviation; by default the ``innovation`` of the state."""
-    return Block(name, value, text, parts, shown, over_interval=over_interval)
+    return Block(name, value, text, parts, compression, over_interval=over_interval)
 
 
 def average_block(name: str, value: Value, text: str, parts: Sequence[str] = ()) -> Block:
@@ -382,7 +382,7 @@ def expected_nis_block(
         "squared_innovation",
         lambda f, measurement: xp.where(received(measurement), f.likelihood.nis, 0.0),
         text,
-        shown=LOG1P,
+        compression=LOG1P,
         over_interval=over_interval,
     )
 
@@ -391,19 +391,19 @@ def relative_likelihood_block(
     xp: ModuleType,
     parts: Sequence[str],
     text: str = "the log-likelihood minus the largest one, nats",
-    shown: Compression = SIGNED_LOG,
+    compression: Compression = SIGNED_LOG,
     name: str = "log_likelihood",
     value: Callable[[Any], Array] = lambda f: f.log_likelihood,
 ) -> Block:
     """Return the log-likelihoods of the hypotheses, less the largest; by default ``log_likelihood`` of the state."""
-    return Block(name, lambda f, _: value(f) - xp.max(value(f), axis=0), text, parts, shown)
+    return Block(name, lambda f, _: value(f) - xp.max(value(f), axis=0), text, parts, compression)
 
 
 def log_density_block(
     value: Value, text: str, name: str = "log_likelihood", over_interval: Interval = "last"
 ) -> Block:
     """Return the log-density of a measurement in its usual units."""
-    return Block(name, value, text, shown=BOUNDED_LOG, over_interval=over_interval)
+    return Block(name, value, text, compression=BOUNDED_LOG, over_interval=over_interval)
 
 
 def log_predicted_block(
@@ -449,7 +449,7 @@ def entropy_block(xp: ModuleType) -> Block:
         "entropy",
         lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
         "entropy of the hypotheses then over the largest possible",
-        shown=SHARE,
+        compression=SHARE,
     )
 
 
@@ -463,10 +463,10 @@ def prior_block(
 
 
 def last_action_block(
-    parts: Sequence[str] = (), name: str = "last_action", shown: Compression = ACTION
+    parts: Sequence[str] = (), name: str = "last_action", compression: Compression = ACTION
 ) -> Block:
     """Return the action that was applied before, ``action`` of the state."""
-    return Block(name, lambda f, _: f.action, "action applied before", parts, shown)
+    return Block(name, lambda f, _: f.action, "action applied before", parts, compression)
 
 
 def last_weight_block(
@@ -498,6 +498,6 @@ def clock_block(xp: ModuleType, horizon: int, unit: str = "1") -> Block:
         "time",
         lambda _, measurement: xp.astype(measurement.number, xp.float64) / horizon,
         "measurements so far over the horizon",
-        shown=within(0.0, (horizon + 1) / horizon),
+        compression=within(0.0, (horizon + 1) / horizon),
         unit=unit,
     )
