@@ -146,7 +146,9 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         return (
             Block("innovation", lambda f, _: f.innovation, "innovation over its sigma", compression=SIGNED_LOG),
             Block("nis", lambda f, _: f.nis, "normalised innovation squared", compression=LOG1P),
-            Block("last_action", lambda f, _: self.xp.log(f.scale) / decades, "action applied before", compression=ACTION),
+            Block(
+                "last_action", lambda f, _: self.xp.log(f.scale) / decades, "action applied before", compression=ACTION
+            ),
         )
 
     def start(self, initial: Initial) -> Filter:

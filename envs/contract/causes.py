@@ -151,7 +151,7 @@ def cause_number(causes: tuple[Cause, ...], moment: Moment) -> Array:
     xp, total = moment.xp, 0.0 * moment.state[0]
     total = xp.where(total == total, total, 0.0)  # the truth of a recording may be NaN
     for place, cause in enumerate(causes):
-        held = cause.holds(moment)
-        if held is not None:
-            total = total + xp.where(held, 2.0**place, 0.0)
+        is_true = cause.holds(moment)
+        if is_true is not None:
+            total = total + xp.where(is_true, 2.0**place, 0.0)
     return total

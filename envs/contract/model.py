@@ -249,9 +249,9 @@ class Model:
 
     def records(self, episode: Episode) -> dict[str, Array]:
         """Return the further records of each measurement."""
-        kept = {
+        records = {
             **self.filter.records(episode.filter, episode.measurement),
             **self.task.world.records(episode.truth),
         }
         further = find_companion(self.task, LoopRecords)
-        return kept if further is None else {**kept, **further.report(self, episode, kept)}
+        return records if further is None else {**records, **further.report(self, episode, records)}

@@ -261,13 +261,13 @@ def parse_ulog(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False
 
     topics, known = (ONBOARD_TOPICS, ONBOARD_FIELDS) if onboard else (ULOG_TOPICS, ULOG_FIELDS)
     log = pyulog.ULog(file, list(topics))
-    held = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
-    chosen = min(held, key=lambda key: (topics.index(key[0]), key[1]), default=None)
+    present = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
+    chosen = min(present, key=lambda key: (topics.index(key[0]), key[1]), default=None)
     if chosen is None:
         if onboard:
             return {}
         raise ValueError(f"it holds neither {' nor '.join(topics)}")
-    data = held[chosen]
+    data = present[chosen]
     check_rows(len(data["timestamp"]), rows_limit)
     fields = {name: data[name] for name in known if name in data}
     if onboard:
@@ -388,8 +388,8 @@ def parse_bag(file: BinaryIO, path: str, rows_limit: int) -> Any:
         topic = bag.busiest(kind)
         if topic:
             return {"kind": kind, "topic": topic, "values": bag.rows(topic, kind, _pose_values, rows_limit)}
-    held = sorted({connection.msgtype for connection in bag.reader.connections})[:20]
-    raise ValueError(f"it holds no {NAVSAT} and no positions; it holds {', '.join(held) or 'nothing'}")
+    present = sorted({connection.msgtype for connection in bag.reader.connections})[:20]
+    raise ValueError(f"it holds no {NAVSAT} and no positions; it holds {', '.join(present) or 'nothing'}")
 
 
 def _seconds(header: Any) -> float:

@@ -145,14 +145,14 @@ class RecordedWorld(_ForeignWorld):
         plain = type(task)(task.parameters)
         self._initial, self._measurement = measure_once(plain, tables.measurements)
         # RecordedArrays of NumPy are read by compiled code as they are.
-        kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
+        convert = task.constant if "torch" in task.xp.__name__ else numpy.asarray
         self.tables: RecordedArrays = RecordedArrays(
-            {name: kept(values) for name, values in tables.measurements.items()},
-            {name: kept(values) for name, values in tables.initial.items()},
-            None if tables.truth is None else kept(tables.truth),
-            kept(tables.seconds),
-            kept(tables.first),
-            kept(tables.last),
+            {name: convert(values) for name, values in tables.measurements.items()},
+            {name: convert(values) for name, values in tables.initial.items()},
+            None if tables.truth is None else convert(tables.truth),
+            convert(tables.seconds),
+            convert(tables.first),
+            convert(tables.last),
         )
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:

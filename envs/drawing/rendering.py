@@ -303,8 +303,8 @@ class EpisodePicture:
         picture = copy.copy(self.picture)
         for name in self._artists & vars(picture).keys():
             delattr(picture, name)
-        kept = {name: value for name, value in vars(self).items() if name not in _FIGURE}
-        return {**kept, "picture": picture, **_NO_FIGURE}
+        attributes = {name: value for name, value in vars(self).items() if name not in _FIGURE}
+        return {**attributes, "picture": picture, **_NO_FIGURE}
 
     # --- history
 

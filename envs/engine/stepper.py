@@ -54,7 +54,7 @@ class Stepper:
 
     def __init__(self, model: Any, report: Report, width: int, world_of: "Stepper | None" = None) -> None:
         update, advance, predict, episode = model.programs.later
-        tell = model.programs.report_program(report)
+        report_code = model.programs.report_program(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
         self._threads, self._model, self._report = model.threads, model, report
         self.width = width
@@ -62,7 +62,10 @@ class Stepper:
         count = itertools.count()
         self._template = map_arrays(lambda _: next(count), episode)
         self._kinds = [array.dtype.kind for array in leaves(episode)]
-        self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
+        self._report_template, self._report_kinds = (
+            report_code.template,
+            [leaf.kind for leaf in report_code.outputs],
+        )
 
         self.action: numpy.ndarray = empty_lanes(update.inputs[-1].shape, width)
         self.action[...] = 0.0
@@ -75,7 +78,7 @@ class Stepper:
         """Lanes that go through a decision together."""
         self._shown, self._given = numpy.empty((width, fields)), False
         self._first_shown = self._shown[0]
-        self._reported = memory_of(tell.outputs, width)
+        self._reported = memory_of(report_code.outputs, width)
         knows = bool(model.filter.knows)
         # Episodes alternate between two copies, which share the arrays that do not change. Of the filter they share
         # the arrays not read any more when the prediction is written: all but the results of the update.
@@ -118,7 +121,7 @@ class Stepper:
             ahead, predicted = then[: truths + measured], then[truths + measured :]
             step = [
                 update.bound(given, written),
-                tell.bound([*truth, *measurement, *updated[:states]], self._reported),
+                report_code.bound([*truth, *measurement, *updated[:states]], self._reported),
             ]
             begin = [start.bound([*self._initial, *(truth if knows else [])], written)]
             came = ahead[truths:]
@@ -156,7 +159,7 @@ class Stepper:
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
-        self._action_place, self._report_place = len(update.inputs) - 1, len(tell.inputs)
+        self._action_place, self._report_place = len(update.inputs) - 1, len(report_code.inputs)
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Continue from other episodes with this observation, ``(fields, width)``."""
@@ -376,9 +379,9 @@ class Stepper:
         turns: list[list[Call]] = []
         moving: list[Moving] = []
         for now in (self._now, 1 - self._now):
-            update, tell, *others = self._bound_copies(now, noise, reported, moving)
+            update, report_code, *others = self._bound_copies(now, noise, reported, moving)
             others[-1].replace(len(others[-1].arrays) - 1, self._shown)
-            turns.append([update, tell, draw, *others])
+            turns.append([update, report_code, draw, *others])
             if compiled_policy is not None and actions is not None:
                 steer = compiled_policy.bound([self._shown, *memories[0]], [actions[0], *memories[1]])
                 turns[-1].insert(0, steer)
@@ -389,11 +392,11 @@ class Stepper:
         sequence = CallSequence(even, odd, moving, steps, self._tiled(turns), self._together)
         sequence.run_once(self.width, self._threads)
         self._now, self._policy_memory = (self._now + steps) % 2, memories[steps % 2]
-        answers = [
+        reports = [
             array if kind == "f" else array.astype(DTYPES[kind])
             for array, kind in zip(reported, self._report_kinds, strict=True)
         ]
-        return map_arrays(lambda i: answers[i], self._report_template), actions
+        return map_arrays(lambda i: reports[i], self._report_template), actions
 
     def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
         """Return the memory of a policy before its first action."""

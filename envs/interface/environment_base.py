@@ -163,15 +163,15 @@ class EnvBase:
         distributions = []
         for lane in chosen:
             now = self.fleet.course_of(lane)
-            asked = now.scenario, now.parameters
+            choice = now.scenario, now.parameters
             if "scenario" in wanted:
                 scenario = wanted["scenario"]
-                asked = (self._first_distribution.scenario if scenario is None else scenario), asked[1]
+                choice = (self._first_distribution.scenario if scenario is None else scenario), choice[1]
             if "parameters" in wanted:
-                asked = asked[0], dict(parameters or {})
-            found = next((distribution for distribution in known if distribution.is_of(*asked)), None)
+                choice = choice[0], dict(parameters or {})
+            found = next((distribution for distribution in known if distribution.is_of(*choice)), None)
             if found is None:
-                found = self._distribution(*asked)
+                found = self._distribution(*choice)
                 known.append(found)
             distributions.append(found)
         for lane, distribution in zip(chosen, distributions, strict=True):
@@ -276,29 +276,29 @@ class EnvBase:
         if self._rewards_only and watch is None:
             return self.fleet.step_reward(action, self.reward_kind)
         infos: list[dict[str, Array]] = []
-        answers = []
+        results = []
         for part, own in self.fleet.parts(action):
             infos.append({})
-            answers.append(self._step_part(part, own, infos[-1], watch))
+            results.append(self._step_part(part, own, infos[-1], watch))
         if self.privileged:
-            self._scaled_errors = self.fleet.gather([scaled for _, scaled in answers])
+            self._scaled_errors = self.fleet.gather([scaled for _, scaled in results])
         info.update(self._gather_reports(infos)[0])
-        return self.fleet.gather([reward for reward, _ in answers])
+        return self.fleet.gather([reward for reward, _ in results])
 
     def _step_part(
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
     ) -> tuple[Array, Array]:
         """Step lanes of one task; return rewards, and errors in sigmas for privileged observations."""
         task, count = lanes.task, lanes.count
-        asked = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
-        answers = lanes.decide(action, asked)
+        report = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
+        results = lanes.decide(action, report)
         if watch is not None:
-            for own, _ in answers:
+            for own, _ in results:
                 watch(own.episode)
-        last = answers[-1][0]
+        last = results[-1][0]
         for name, values in (last.details or {}).items():
             info[name] = task.xp.moveaxis(values[..., :count], -1, 0)
-        rewards = [own.reward if other is None else own.reward - other.reward for own, other in answers]
+        rewards = [own.reward if other is None else own.reward - other.reward for own, other in results]
         scaled = in_sigmas(last.error, last.covariance, count, task.xp) if self.privileged else None
         return mean_of(rewards)[:count], scaled
 
