@@ -255,7 +255,7 @@ def test_training_and_tuning_refuse_recordings(recordings):
 
 def test_a_closed_loop_says_why_it_cannot_be_recorded():
     for env, scenario in ((UAV, None), (TIGHT, "paper")):
-        with pytest.raises(ValueError, match="is a closed loop, in which the estimate decides"):
+        with pytest.raises(ValueError, match="is a closed loop, in which the estimate changes the next"):
             record(env, scenario, episodes=1)
 
 

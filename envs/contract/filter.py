@@ -102,7 +102,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     kind: str = "estimator"
     """Kind of competitor."""
     in_python: bool = False
-    """Whether it runs as Python code, whatever computes the rest: it cannot be traced."""
+    """Whether it runs as Python code on every backend, since it cannot be traced."""
     adapts_covariance: bool = False
     """Whether the covariance that is reported grows with the innovations."""
     stated: Stated | None = None

@@ -62,7 +62,7 @@ class Model:
         self.action_space = filter.action_space
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Model":
-        """Share the model: nothing in it changes."""
+        """Share the model, which never changes."""
         return self
 
     def __reduce__(self) -> Any:

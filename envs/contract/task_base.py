@@ -100,7 +100,7 @@ class TaskBase(ABC):
         """Return whether the declaration defines a feedback to the world."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Share the task: nothing in it changes."""
+        """Share the task, which never changes."""
         return self
 
     def __reduce__(self) -> Any:

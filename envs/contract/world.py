@@ -43,7 +43,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     elapsed_field: ClassVar[str] = ""
     """Field with the s since the last measurement that was received; empty where there is none."""
     cost_remedy: ClassVar[str] = ""
-    """What an author may change where a component of the truth is unknown, in words that follow a list of columns."""
+    """Remedy for an unknown component of the truth, in words that follow a list of columns."""
 
     disturbances: Disturbances = Disturbances(())
     """Disturbances that the world may apply to its sensors."""

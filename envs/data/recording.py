@@ -288,7 +288,7 @@ class Recording(ScenarioData):
                 raise ValueError(
                     f"recording {name!r}: its truth lacks {', '.join(missing) or 'whole rows'}, which the cost of "
                     f"{task.id} counts: add {', '.join(f'truth_{one}' for one in missing) or 'them'}"
-                    f"{world.cost_remedy}, or leave the truth out"
+                    f"{world.cost_remedy}, or omit the truth"
                 )
 
     # --- as a file

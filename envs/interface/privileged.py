@@ -1,7 +1,7 @@
 """Privileged information for critics in training: the episode's context, and the error of the estimate.
 
 A critic may observe more than the policy that it evaluates (asymmetric actor and critic; Pinto et al., 2018): it is
-needed in training only. The environment keeps the two apart and declares in its metadata that it is privileged.
+needed in training only. The environment separates the two and declares in its metadata that it is privileged.
 """
 
 from typing import Any

@@ -50,7 +50,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
     Args:
         task: environment id.
         num_envs: number of sub-environments; sub-environment i equals the single environment with the same
-            seed, whatever the number.
+            seed, for every number.
         control: name of a control; default: the first of the environment.
         scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
             mixture, ``{"random": 0.8, "paper": 0.2}``.
