@@ -278,5 +278,5 @@ def test_a_vector_of_mixtures_is_not_drawn():
     with pytest.raises(ValueError, match="cannot be drawn"):
         gymnasium.make_vec(ID, num_envs=2, scenario=MIXTURE, render_mode="rgb_array")
     env = gymnasium.make_vec(ID, num_envs=2, render_mode="rgb_array")
-    with pytest.raises(ValueError, match="leave out render_mode"):
+    with pytest.raises(ValueError, match="omit render_mode"):
         env.reset(options={"scenario": "paper"})

@@ -126,7 +126,7 @@ def test_scans_without_a_row_have_no_truth(tmp_path):
     truth = recording.truth[0]
     assert np.isnan(truth).all(axis=1).nonzero()[0].tolist() == [*range(18, 24)]
     np.testing.assert_array_equal(truth[24:], log.iloc[26:, 5:].to_numpy())
-    with pytest.raises(ValueError, match="truth is infinite; what is not known of it is NaN"):
+    with pytest.raises(ValueError, match="truth is infinite; write NaN for unknown values"):
         dataclasses.replace(recording, truth=np.where(recording.truth > 1e3, np.inf, recording.truth))
 
 

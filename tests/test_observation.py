@@ -21,10 +21,10 @@ from filtergym.envs.contract.observation import (
 BLOCKS = (
     Block("a", lambda state, _: state.a, "two numbers", ("x", "y"), SIGNED_LOG),
     Block("b", lambda state, measurement: state.b + measurement, "one number"),
-    Block("c", lambda state, _: state.c, "kept as a logarithm", shown=KEPT_AS_LOG1P),
+    Block("c", lambda state, _: state.c, "kept as a logarithm", compression=KEPT_AS_LOG1P),
     Block("d", lambda state, _: state.d, "four numbers in two axes", ("1x", "1y", "2x", "2y"), SIGNED_LOG),
-    Block("e", lambda state, _: state.e, "scaled", shown=linear_scale(0.1, 45.0), unit="10 dB"),
-    Block("f", lambda state, _: state.f, "a square", shown=LOG1P),
+    Block("e", lambda state, _: state.e, "scaled", compression=linear_scale(0.1, 45.0), unit="10 dB"),
+    Block("f", lambda state, _: state.f, "a square", compression=LOG1P),
 )
 QUANTITIES = (
     Quantity("sum", "m", "a and b", lambda read: read("a") + read("b")),
@@ -93,7 +93,7 @@ def test_limits_follow_a_scale():
 
 
 def test_a_bounded_logarithm_is_the_value_near_zero_and_below_eight_everywhere():
-    blocks = Blocks((Block("g", lambda state, _: state, "anything", shown=BOUNDED_LOG),), (), np)
+    blocks = Blocks((Block("g", lambda state, _: state, "anything", compression=BOUNDED_LOG),), (), np)
     values = np.array([0.0, 1e-7, -1e-7, 1.0, -math.e + 1.0, 1e4, -1e4, 1e300])
     shown = blocks.observe(values, None)[0]
     by_hand = [math.copysign(math.log1p(abs(x)), x) for x in values]

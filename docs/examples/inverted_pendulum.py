@@ -144,9 +144,11 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         """Return the observation blocks of the agent."""
         decades = self.parameters.noise_decades * math.log(10.0)
         return (
-            Block("innovation", lambda f, _: f.innovation, "innovation over its sigma", shown=SIGNED_LOG),
-            Block("nis", lambda f, _: f.nis, "normalised innovation squared", shown=LOG1P),
-            Block("last_action", lambda f, _: self.xp.log(f.scale) / decades, "action applied before", shown=ACTION),
+            Block("innovation", lambda f, _: f.innovation, "innovation over its sigma", compression=SIGNED_LOG),
+            Block("nis", lambda f, _: f.nis, "normalised innovation squared", compression=LOG1P),
+            Block(
+                "last_action", lambda f, _: self.xp.log(f.scale) / decades, "action applied before", compression=ACTION
+            ),
         )
 
     def start(self, initial: Initial) -> Filter:

@@ -72,7 +72,7 @@ def _fields(cls: type[Task]) -> list[str]:
             (
                 _names(block),
                 block.unit,
-                block.shown.text
+                block.compression.text
                 + block.text
                 + (" (mean over the interval)" if block.over_interval == "mean" else ""),
             )

@@ -1,8 +1,8 @@
 """Causes of an estimate's cost: circumstances of a measurement that an author declares, such as a turn.
 
-A cause holds at a measurement or does not, and several may hold at once. Each is computed from what is at hand there, a
-:class:`Moment`, and is traced with the steps of the task. A cause that cannot be known, such as that of a context which
-a recording has not, holds nowhere, and an evaluation leaves it out.
+A cause is true or false at each measurement, and several may be true at once. Each is computed from a :class:`Moment`
+and is traced with the steps of the task. A cause that cannot be computed, such as that of a context which a recording
+does not contain, is false everywhere, and an evaluation omits it.
 """
 
 import itertools
@@ -20,7 +20,7 @@ rightly, one of 16,000."""
 
 
 MOST_CAUSES = 50
-"""Of a task: which of them hold is one number."""
+"""Largest number of causes of a task; the true ones are encoded in one number."""
 RESERVED = ("all", "start", "other")
 """Names that an evaluation gives to causes of its own."""
 
@@ -33,11 +33,11 @@ class Moment(NamedTuple):
     context: Mapping[str, Array]
     """Context that the world reports of the episode, see :meth:`.World.context`; none of a recording."""
     state: Array
-    """True values of the task's components, ``(C, N)``; NaN where a recording does not know them."""
+    """True values of the task's components, ``(C, N)``; NaN where a recording does not contain them."""
     measurement: Any
     """The world's NamedTuple."""
     readings: Array | None
-    """Of the components, ``(C, N)``, NaN where they say nothing; None where a measurement is of no component."""
+    """Readings of the components, ``(C, N)``, NaN where there is none; None where a measurement is of no component."""
     deviations: Array | None
     """Standard deviations that are stated for their errors, ``(C, N)``."""
 
@@ -54,9 +54,9 @@ class Cause(NamedTuple):
     name: str
     """One word or a few, of the rows of a table: ``turn``."""
     phrase: str
-    """What completes "most of its cost falls", with its preposition: ``in turns``."""
+    """Completion of the phrase "most of its cost falls", with its preposition: ``in turns``."""
     holds: Callable[[Moment], Array | None]
-    """From a moment to booleans, ``(N,)``; None where it cannot be known."""
+    """From a moment to booleans, ``(N,)``; None where it cannot be computed."""
 
 
 def bins(
@@ -92,10 +92,10 @@ def _is_between(
 
 
 def context_flag(name: str) -> Callable[[Moment], Array | None]:
-    """Return what holds where a number of the context is above zero.
+    """Return the condition that a number of the context is above zero.
 
     Args:
-        name: of it, ``(N,)``.
+        name: name of that number, ``(N,)``.
     """
 
     def holds(moment: Moment) -> Array | None:
@@ -142,7 +142,7 @@ class Causes(NamedTuple):
 
 
 def cause_number(causes: tuple[Cause, ...], moment: Moment) -> Array:
-    """Return which causes hold, as one number: the sum of 2 to the power of the place of each, ``(N,)``.
+    """Encode the true causes in one number: the sum of 2 to the power of the index of each, ``(N,)``.
 
     Args:
         causes: of the task, at most ``MOST_CAUSES``.
@@ -151,7 +151,7 @@ def cause_number(causes: tuple[Cause, ...], moment: Moment) -> Array:
     xp, total = moment.xp, 0.0 * moment.state[0]
     total = xp.where(total == total, total, 0.0)  # the truth of a recording may be NaN
     for place, cause in enumerate(causes):
-        held = cause.holds(moment)
-        if held is not None:
-            total = total + xp.where(held, 2.0**place, 0.0)
+        is_true = cause.holds(moment)
+        if is_true is not None:
+            total = total + xp.where(is_true, 2.0**place, 0.0)
     return total

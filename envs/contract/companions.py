@@ -1,6 +1,6 @@
 """Companions of a problem: optional objects beside its declaration, found by their types.
 
-:attr:`.Task.companions` names them. The contract needs none of them: each is read by what it is for, with
+:attr:`.Task.companions` names them. The contract needs none of them: each user of a companion finds it with
 :func:`find_companion`. Further ones stand where their subject does: :class:`~.causes.Causes`,
 :class:`~.live_input.LiveReader`, :class:`~.log_format.LogFormat`.
 """
@@ -36,8 +36,8 @@ class Actions(NamedTuple):
     meanings: Mapping[str, str]
     """Return the meaning of an action under each control, in words."""
     reach: Mapping[str, tuple[str, ...]] = {}
-    """Parameters that say how far an action reaches, or how long it holds, by control or trained bank. A learned policy
-    keeps those that it was trained with: under others the same numbers would be other actions."""
+    """Parameters that fix the range of an action, or its duration, by control or trained bank. A learned policy runs
+    with those that it was trained with: with others the same numbers would be other actions."""
 
 
 class TrainedBanks(NamedTuple):
@@ -63,9 +63,9 @@ class ArrayMeanings(NamedTuple):
     """Meanings of arrays, in words for users of another program."""
 
     measurement: str = ""
-    """What the numbers of a measurement are, in a sentence; empty where names say it."""
+    """Meaning of the numbers of a measurement, in a sentence; empty where the names suffice."""
     feedback: str = ""
-    """What a filter may report to steer the world beside its estimate; empty where all that steers follows from the
+    """Meaning of the feedback that a filter may report beside its estimate; empty where the feedback follows from the
     estimate."""
 
 
@@ -73,7 +73,7 @@ class PictureMaker(NamedTuple):
     """Class that draws an episode where the general picture is not enough."""
 
     make: Callable[[Any], Any]
-    """From a model to its :class:`~.rendering.Picture`, or None for the general one. It imports what draws."""
+    """From a model to its :class:`~.rendering.Picture`, or None for the general one. It imports the drawing library."""
 
 
 class FlightScenarios(NamedTuple):
@@ -98,7 +98,7 @@ def trained_banks(task: Any) -> Mapping[str, type]:
 
 
 def action_reach(task: Any, control: str) -> tuple[str, ...]:
-    """Return the parameters that say how far an action of a control reaches, see :class:`Actions`."""
+    """Return the parameters that fix the range of an action of a control, see :class:`Actions`."""
     found = find_companion(task, Actions)
     return () if found is None else found.reach.get(control, ())
 

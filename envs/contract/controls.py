@@ -18,7 +18,7 @@ from .observation import Array
 def bank_action_space(control: str, count: int) -> gymnasium.Space[Any]:
     """Return the action space of a control over a bank of ``count`` hypotheses.
 
-    ``mode``: the one hypothesis that is believed. ``weights``: absolute weights, normalised by the task (all
+    ``mode``: the selected hypothesis. ``weights``: absolute weights, normalised by the task (all
     zero = uniform). ``evidence``: scaled and added to the log-posterior of Bayes' rule; zero is the paper.
     """
     if control == "mode":
@@ -35,7 +35,7 @@ def bank_probabilities(
     evidence_scale: float,
     xp: ModuleType,
 ) -> Array:
-    """Return the weights of the bank that an action puts in force, ``(M, N)``.
+    """Return the weights of the bank under an action, ``(M, N)``.
 
     Args:
         control: "mode", "weights" or "evidence".
@@ -58,20 +58,20 @@ def bank_probabilities(
 
 
 class SteerableFilter(Filter[TaskT, Measurement, State]):
-    """A filter with settings that an action multiplies, at one measurement: :meth:`update` is given the logarithms of
-    their factors as action, ``(n, N)``. Without an action it is an estimator.
+    """Filter with settings that an action multiplies at each measurement. The action of :meth:`update` is the logarithm
+    of each factor, ``(n, N)``. Without an action it is an estimator.
     """
 
     settings: Mapping[str, float]
-    """Factor by which an action of one multiplies each setting: so small that white noise of deviation one, with which
-    a new policy explores, costs a twentieth at most."""
+    """Factor by which an action of one multiplies each setting: white noise of deviation one, with which a new policy
+    explores, then increases the cost by a twentieth at most."""
 
     def heeds(self, measurement: Measurement) -> Array:
         """Return one where an action has an effect, zero where nothing is measured, ``(N,)``."""
         return 1.0
 
     def examine(self, state: State, measurement: Measurement) -> Any:
-        """Return the result of a measurement without an action, from which a bank is observed; here the state after it.
+        """Return the result of a measurement without an action, for the observation; by default the state after it.
 
         Args:
             state: after :meth:`predict`.
@@ -83,11 +83,11 @@ class SteerableFilter(Filter[TaskT, Measurement, State]):
 class SettingsBank(Bank[Any, Any, Any]):
     """A filter, steered by factors of its settings.
 
-    The action a in [-1, 1]^n multiplies setting k by ``r_k^a_k``, where r_k is what the filter declares. All zero is
-    the filter itself, bit for bit: an agent begins where the strongest classical filter ends.
+    The action a in [-1, 1]^n multiplies setting k by ``r_k^a_k``, where the filter declares r_k. The zero action is
+    the filter itself, bit for bit: an agent starts from the strongest classical filter.
 
-    The state is a NamedTuple with ``own``, the state of the filter, ``likelihood``, how well that has predicted the
-    measurement, ``action``, the last one, ``(n, N)``, and what else is shown.
+    The state is a NamedTuple with ``own``, the state of the filter, ``likelihood``, that of the measurement under its
+    prediction, ``action``, the last one, ``(n, N)``, and further values of the observation.
     """
 
     strong: ClassVar[type[SteerableFilter[Any, Any, Any]]]
@@ -103,35 +103,35 @@ class SettingsBank(Bank[Any, Any, Any]):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """A number for each setting."""
+        """Box with a number for each setting."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.own.settings),), numpy.float32)
 
     @abstractmethod
     def look(self, state: Any, found: Any, measurement: Any) -> Any:
-        """Return the state with what is shown of a measurement.
+        """Return the state with the observed values of a measurement.
 
         Args:
-            state: with that of the filter after :meth:`predict`.
-            found: what the filter makes of the measurement, see :meth:`SteerableFilter.examine`.
-            measurement: that arrives.
+            state: contains that of the filter after :meth:`predict`.
+            found: result of the measurement in the filter, see :meth:`SteerableFilter.examine`.
+            measurement: the current one.
         """
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Predict as the filter does, and see what it would make of the measurement."""
+        """Predict with the filter, and examine the measurement without an action."""
         own = self.own.predict(state.own, measurement)
         return self.look(state._replace(own=own), self.own.examine(own, measurement), measurement)
 
     def act(self, state: Any, measurement: Any, action: Array) -> Any:
-        """Update as the filter does, with its settings multiplied."""
+        """Update the filter with its settings multiplied."""
         shown = self.xp.clip(self.xp.astype(action, self.xp.float64), -1.0, 1.0)
         logarithms = self.own.heeds(measurement) * self.log_reach * shown
         own = self.own.update(state.own, FilterInput(measurement, None, logarithms))
         return state._replace(own=own, action=shown)
 
     def mean(self, state: Any) -> Array:
-        """Return that of the filter."""
+        """Return the mean of the filter."""
         return self.own.mean(state.own)
 
     def covariance(self, state: Any) -> Array:
-        """Return that of the filter."""
+        """Return the covariance of the filter."""
         return self.own.covariance(state.own)

@@ -1,8 +1,8 @@
 """The uniform numbers that fix an episode, handed out by name and distribution.
 
-A world asks for what it needs in a fixed order, and how many numbers that takes is counted by asking once
-without any (:meth:`Draws.counting`). What was drawn is kept under its name: an episode's levels, times and
-kinds are its context. What is drawn may hold within a window of time, or step: :func:`within`, :class:`StepSignal`.
+A world draws its quantities in a fixed order. A first pass without random numbers counts how many numbers that takes
+(:meth:`Draws.counting`). Each draw is stored by name: the levels, times and kinds of an episode are its context. A
+draw may be in force within a window of time, or change in steps: :func:`within`, :class:`StepSignal`.
 """
 
 import math
@@ -16,7 +16,7 @@ from .observation import Array
 class Draws:
     """Uniform numbers on [0, 1) in order.
 
-    Every method takes the name of what is drawn and, with ``count``, draws ``(count, N)`` of it in place of
+    Every method takes the name of the quantity and, with ``count``, draws ``(count, N)`` of it in place of
     ``(N,)``.
 
     Args:
@@ -24,7 +24,7 @@ class Draws:
         xp: array namespace.
 
     Attributes:
-        drawn: what was drawn, by name.
+        drawn: the draws, by name.
     """
 
     def __init__(self, uniforms: Array, xp: ModuleType) -> None:
@@ -36,7 +36,7 @@ class Draws:
 
     @classmethod
     def counting(cls, average: Array, xp: ModuleType) -> "Draws":
-        """Return the draws that always give one half and count in ``used`` what is asked for.
+        """Return draws that always give one half and count the requested numbers in ``used``.
 
         Args:
             average: ``(1, N)``, all one half.
@@ -62,40 +62,40 @@ class Draws:
         return values
 
     def unit(self, name: str, count: int | None = None) -> Array:
-        """Return the uniform on [0, 1)."""
+        """Draw uniformly on [0, 1)."""
         return self._keep(name, self._rows(count))
 
     def uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Return the uniform between two limits."""
+        """Draw uniformly between two limits."""
         low, high = limits
         return self._keep(name, low + (high - low) * self._rows(count))
 
     def log_uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Between two positive limits, with a uniform logarithm."""
+        """Draw between two positive limits, with a uniform logarithm."""
         low, high = limits
         return self._keep(name, low * self.xp.exp(math.log(high / low) * self._rows(count)))
 
     def integer(self, name: str, limits: Sequence[int], count: int | None = None) -> Array:
-        """Return the whole number from the first to the last, all equally probable, as a float."""
+        """Draw a whole number from the first to the last, all equally probable, as a float."""
         first, last = limits
         return self._keep(name, first + self.xp.floor((last - first + 1) * self._rows(count)))
 
     def event(self, name: str, probability: float, count: int | None = None) -> Array:
-        """Return the boolean, true with a probability."""
+        """Draw a boolean that is true with a given probability."""
         return self._keep(name, self._rows(count) < probability)
 
     def category(self, name: str, thresholds: Sequence[Array]) -> Array:
-        """Index drawn by the inverse of a cumulative distribution, ``(N,)`` of integers.
+        """Draw an index by the inverse of a cumulative distribution, ``(N,)`` of integers.
 
         Args:
-            name: of what is drawn.
+            name: name of the quantity.
             thresholds: the cumulative probabilities but the last, numbers or ``(N,)`` each.
         """
         return self._keep(name, category(self._rows(None), thresholds, self.xp))
 
 
 def draw_between(draw: Callable[..., Array], name: str, limits: tuple[float, float]) -> Array:
-    """Draw between two limits; where they are one it is that, a float, and no number is used."""
+    """Draw between two limits; where they are equal, return that value as a float and use no random number."""
     return limits[0] if limits[0] == limits[1] else draw(name, limits)
 
 
@@ -113,9 +113,9 @@ class StepSignal(NamedTuple):
     """A signal that is constant between its steps."""
 
     values: Array
-    """At the start and from each step on, ``(J + 1, ..., N)``."""
+    """Values at the start and from each step on, ``(J + 1, ..., N)``."""
     times: Array
-    """Of the steps, ascending, ``(J, N)``: numbers of measurements, or s."""
+    """Times of the steps, ascending, ``(J, N)``: numbers of measurements, or s."""
 
     def at(self, time: Array, xp: ModuleType) -> Array:
         """Return the value at a time, ``(..., N)``."""

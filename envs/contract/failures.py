@@ -29,7 +29,7 @@ def own_line(error: BaseException) -> str:
 
 @contextmanager
 def explain_errors(what: str) -> Iterator[None]:
-    """Turn what a user's code raises into one sentence with the line that raised it.
+    """Turn an error of a user's code into one sentence with the line that raised it.
 
     Args:
         what: beginning of the sentence.

@@ -15,25 +15,25 @@ class DisturbanceInput(NamedTuple):
     """A measurement on its way through the disturbances."""
 
     number: Array
-    """Of the measurement, from 1 on, ``(N,)``."""
+    """Number of the measurement, from 1 on, ``(N,)``."""
     interval: Array | float
-    """s since the measurement before, ``(N,)``, or one number where all are the same."""
+    """Time since the previous measurement, s, ``(N,)``, or one number where all are equal."""
     normals: Array
-    """Standard normal numbers that it takes, ``(normals, N)``."""
+    """Standard normal numbers that it uses, ``(normals, N)``."""
     uniforms: Array
-    """Uniform numbers that it takes, ``(row_uniforms, N)``."""
+    """Uniform numbers that it uses, ``(row_uniforms, N)``."""
     feedback: Any = None
-    """Of a closed loop, see :meth:`.World.advance`."""
+    """Feedback of a closed loop, see :meth:`.World.advance`."""
 
 
 def undisturbed(draws: Draws, parameters: Any) -> Array | None:
-    """Draw which episodes have no hidden disturbance, booleans ``(N,)``; None where no episode is like that.
+    """Draw which episodes have no hidden disturbance, booleans ``(N,)``; None where there is no such episode.
 
     The first call takes a random number. Disturbances that a measurement reports are drawn in these episodes by the
     same law as in all others, so that no report shows whether an episode is one of them.
 
     Args:
-        draws: what fixes the scenario of each episode.
+        draws: random numbers that fix the scenario of each episode.
         parameters: of the task, with the probability ``undisturbed``.
     """
     if not parameters.undisturbed:
@@ -43,22 +43,21 @@ def undisturbed(draws: Draws, parameters: Any) -> Array | None:
 
 
 class Disturbance(ABC):
-    """A disturbance of sensors, with a name, draws, an effect and causes.
+    """Disturbance of sensors, with a name, random draws, an effect and causes.
 
-    It is drawn with the episode, moves on with every measurement, and acts through the methods that it defines: on the
-    deviations of the white errors, on errors, on what is read, or on the whole measurement. What it has drawn and where
-    it stands is its state, nested NamedTuples of arrays ``(..., N)``. By default nothing is drawn, nothing moves and
-    nothing is changed.
+    It is drawn with the episode, advances with every measurement, and acts through the methods that it defines: on the
+    deviations of the white errors, on errors, on the reading, or on the whole measurement. Its state contains its draws
+    and its current values, nested NamedTuples of arrays ``(..., N)``. The default methods draw and change nothing.
 
     Args:
         task: with its parameters.
 
     Attributes:
-        name: under which the truth holds its state, and by which a reference declares that it knows it.
+        name: name of its state in the truth; a reference declares by it that it knows the disturbance.
         causes: circumstances by which an evaluation splits costs.
-        initial_normals: standard normal numbers that it takes at the start of the track.
-        normals: standard normal numbers that it takes at each measurement.
-        row_uniforms: uniform numbers that it takes at each measurement.
+        initial_normals: standard normal numbers that it uses at the start of the track.
+        normals: standard normal numbers that it uses at each measurement.
+        row_uniforms: uniform numbers that it uses at each measurement.
     """
 
     name: ClassVar[str]
@@ -73,22 +72,23 @@ class Disturbance(ABC):
 
     @classmethod
     def is_in(cls, parameters: Any) -> bool:
-        """Return whether a task of these parameters has it; by default every one has."""
+        """Return whether a task with these parameters has the disturbance; by default every task has it."""
         return True
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Any:
-        """Draw what holds for an episode, and return the state at the start of the track.
+        """Draw the quantities of an episode, and return the state at the start of the track.
 
         Args:
-            draws: what fixes the scenario of each episode.
+            draws: random numbers that fix the scenario of each episode.
             normals: ``(initial_normals, N)``.
             zero: ``(N,)``.
         """
         return None
 
     def complete(self, state: Any, draws: Draws) -> Any:
-        """Return the state of :meth:`begin` with what only some scenarios draw, after all that every one draws: so the
-        others take as many numbers as without it.
+        """Return the state of :meth:`begin` with the draws of some scenarios only.
+
+        They come after the draws of all scenarios, so that the other scenarios use the same numbers as without them.
         """
         return state
 
@@ -99,49 +99,47 @@ class Disturbance(ABC):
 
         Args:
             state: at the start of the track.
-            calm: which episodes have no hidden disturbance, booleans ``(N,)``.
+            calm: whether an episode has no hidden disturbance, booleans ``(N,)``.
         """
         return state
 
     def advance(self, state: Any, step: DisturbanceInput) -> Any:
-        """Return the state at a measurement, from that at the one before."""
+        """Return the state at a measurement, from that at the previous one."""
         return state
 
     def change_deviations(self, state: Any, deviations: Array) -> Array:
-        """Return the standard deviations of the white errors over the usual ones, ``(..., N)``, with what it does
-        to them.
-        """
+        """Apply the disturbance to the standard deviations of the white errors over the usual ones, ``(..., N)``."""
         return deviations
 
     def change_errors(self, state: Any, errors: Array) -> Array:
-        """Return the errors, ``(n, N)`` in the world's units of them, with what it does to them."""
+        """Apply the disturbance to the errors, ``(n, N)``, in the world's units of them."""
         return errors
 
     def change_reading(self, state: Any, reading: Array) -> tuple[Any, Array]:
-        """Return the state and what the sensor reads, ``(n, N)`` in its own coordinates, with what it does to them."""
+        """Apply the disturbance to the reading, ``(n, N)`` in the sensor's coordinates; return state and reading."""
         return state, reading
 
     def change_measurement(self, state: Any, measurement: Any, step: DisturbanceInput) -> tuple[Any, Any]:
-        """Return the state and measurement with what it does to them.
+        """Apply the disturbance to the measurement; return state and measurement.
 
         Args:
             state: of :meth:`advance`.
-            measurement: the world's NamedTuple, with what was missed.
-            step: that :meth:`advance` was given.
+            measurement: the world's NamedTuple, with the missed values.
+            step: the argument of :meth:`advance`.
         """
         return state, measurement
 
     def context(self, state: Any) -> dict[str, Array]:
-        """Report what was drawn, see :meth:`.World.context`."""
+        """Return the random draws, see :meth:`.World.context`."""
         return {}
 
     def records(self, state: Any) -> dict[str, Array]:
-        """Report what an evaluation keeps, see :meth:`.World.records`."""
+        """Return further records for an evaluation, see :meth:`.World.records`."""
         return {}
 
 
 class Disturbances:
-    """All that a world may do to its sensors, in the order in which it acts and takes random numbers of measurements.
+    """Disturbances of a world, in the order in which they act and use the random numbers of measurements.
 
     States are a mapping from names.
 
@@ -150,7 +148,7 @@ class Disturbances:
         drawn: the same in the order in which they are drawn with an episode; default: that order.
 
     Attributes:
-        initial_normals: standard normal numbers that all take together at the start of the track.
+        initial_normals: standard normal numbers of all disturbances together at the start of the track.
         normals: standard normal numbers of a measurement.
         row_uniforms: uniform numbers of a measurement.
     """
@@ -169,19 +167,19 @@ class Disturbances:
         kinds: Sequence[type[Disturbance]],
         drawn: Sequence[type[Disturbance]] = (),
     ) -> "Disturbances":
-        """Return those of some kinds that a task has.
+        """Return the disturbances of some kinds that a task has.
 
         Args:
             task: with its parameters.
             kinds: in the order in which they act.
-            drawn: those that are drawn first; the others follow in the order of ``kinds``.
+            drawn: the kinds that are drawn first; the others follow in the order of ``kinds``.
         """
         parts = [kind(task) for kind in kinds if kind.is_in(task.parameters)]
         order = *drawn, *kinds
         return cls(parts, sorted(parts, key=lambda part: order.index(type(part))))
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> dict[str, Any]:
-        """Draw each: the states at the start of the track."""
+        """Draw each disturbance, and return the states at the start of the track."""
         shares, used = {}, 0
         for part in self.parts:
             shares[part.name] = normals[used : used + part.initial_normals]
@@ -189,11 +187,11 @@ class Disturbances:
         return self._draw(lambda part: part.begin(draws, shares[part.name], zero))
 
     def complete(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
-        """Return the states with what only some scenarios draw."""
+        """Return the states with the draws of some scenarios only."""
         return self._draw(lambda part: part.complete(states[part.name], draws))
 
     def _draw(self, draw: Callable[[Disturbance], Any]) -> dict[str, Any]:
-        """Call what draws a state for each, and return the states in the order in which they act."""
+        """Draw the state of each disturbance, and return the states in the order in which they act."""
         states = {part.name: draw(part) for part in self.drawn}
         return {part.name: states[part.name] for part in self.parts}
 
@@ -206,7 +204,7 @@ class Disturbances:
     def share(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
     ) -> dict[str, DisturbanceInput]:
-        """Return the hand out a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
+        """Split a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
         steps, n, u = {}, 0, 0
         for part in self.parts:
             own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
@@ -219,19 +217,19 @@ class Disturbances:
         return {part.name: part.advance(states[part.name], steps[part.name]) for part in self.parts}
 
     def change_deviations(self, states: Mapping[str, Any], deviations: Array) -> Array:
-        """Return the standard deviations of the white errors over the usual ones with what each does to them."""
+        """Apply each disturbance to the standard deviations of the white errors over the usual ones."""
         for part in self.parts:
             deviations = part.change_deviations(states[part.name], deviations)
         return deviations
 
     def change_errors(self, states: Mapping[str, Any], errors: Array) -> Array:
-        """Return the errors with what each does to them."""
+        """Apply each disturbance to the errors."""
         for part in self.parts:
             errors = part.change_errors(states[part.name], errors)
         return errors
 
     def change_reading(self, states: Mapping[str, Any], reading: Array) -> tuple[dict[str, Any], Array]:
-        """Return the states and what the sensor reads, with what each does to them."""
+        """Apply each disturbance to the reading of the sensor; return states and reading."""
         changed = dict(states)
         for part in self.parts:
             changed[part.name], reading = part.change_reading(changed[part.name], reading)
@@ -240,7 +238,7 @@ class Disturbances:
     def change_measurement(
         self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, DisturbanceInput]
     ) -> tuple[dict[str, Any], Any]:
-        """Return the states and measurement with what each does to them."""
+        """Apply each disturbance to the measurement; return states and measurement."""
         changed = dict(states)
         for part in self.parts:
             own = changed[part.name], measurement, steps[part.name]
@@ -248,7 +246,7 @@ class Disturbances:
         return changed, measurement
 
     def context(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """Return the draws that all report."""
+        """Return the random draws of all disturbances."""
         return {name: v for part in self.parts for name, v in part.context(states[part.name]).items()}
 
     def records(self, states: Mapping[str, Any]) -> dict[str, Array]:
@@ -262,7 +260,7 @@ def causes_of(kinds: Sequence[type[Disturbance]]) -> tuple[Cause, ...]:
 
 
 class Outliers(Disturbance):
-    """Measurements whose errors are larger than stated, each one on its own, and which is not reported.
+    """Measurements whose errors are larger than stated, independent of each other and not reported.
 
     Its state is the standard deviation of this measurement's errors over that of usual ones, ``(N,)``.
 
@@ -270,7 +268,7 @@ class Outliers(Disturbance):
         task: with its parameters.
 
     Attributes:
-        probability: of a measurement that is one.
+        probability: probability that a measurement is an outlier.
         factor: standard deviation of its errors over that of the others.
     """
 
@@ -285,14 +283,14 @@ class Outliers(Disturbance):
     @staticmethod
     @abstractmethod
     def limits(parameters: Any) -> tuple[float, float]:
-        """Return the probability and factor."""
+        """Return the probability and the factor."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Start with a usual one."""
+        """Start with a usual measurement."""
         return zero + 1.0
 
     def advance(self, state: Array, step: DisturbanceInput) -> Array:
-        """Draw whether this is one."""
+        """Draw whether this measurement is an outlier."""
         if not self.probability:
             return state
         one = self.xp.ones_like(state)
@@ -306,16 +304,16 @@ class Glint(Outliers):
 
     @classmethod
     def is_in(cls, parameters: Any) -> bool:
-        """Return whether any measurement may be one."""
+        """Return whether a measurement may have glint."""
         return bool(parameters.glint_probability > 0.0)
 
     @staticmethod
     def limits(parameters: Any) -> tuple[float, float]:
-        """Return the limits of glint."""
+        """Return the probability and the factor of glint."""
         return parameters.glint_probability, parameters.glint_factor
 
     def change_errors(self, state: Array, errors: Array) -> Array:
-        """Enlarge them."""
+        """Enlarge the errors."""
         return state * errors
 
 
@@ -325,15 +323,15 @@ class GaussMarkov(NamedTuple):
     """
 
     decay: Array
-    """psi, what is left of the error from one measurement to the next, ``(N,)``."""
+    """psi, factor on the error from one measurement to the next, ``(N,)``."""
     kick: Array
-    """Standard deviation of what it gains, ``sigma sqrt(1 - psi^2)``, ``(N,)``."""
+    """Standard deviation of the driving noise, ``sigma sqrt(1 - psi^2)``, ``(N,)``."""
 
     @classmethod
     def sampled(
         cls, deviation: Array, correlation_time: Array, interval: float, xp: ModuleType
     ) -> "GaussMarkov":
-        """Return the error of a stationary deviation, sampled exactly.
+        """Return the process with a stationary deviation, sampled exactly.
 
         Args:
             deviation: sigma, ``(N,)``.
@@ -360,14 +358,13 @@ class ColouredErrorsState(NamedTuple):
 
 
 class ColouredErrors(Disturbance):
-    """Errors that last from measurement to measurement, beside the white ones, at a fixed interval, which is not
-    reported.
+    """Correlated errors beside the white ones, at a fixed interval; they are not reported.
 
     Args:
         task: with its parameters.
         interval: from one measurement to the next, s.
         count: n, errors of a measurement.
-        present: whether there may be any; else they are zero and take no numbers.
+        present: whether there may be any; else they are zero and use no random numbers.
     """
 
     name = "coloured"
@@ -384,11 +381,11 @@ class ColouredErrors(Disturbance):
         """Draw standard deviation and correlation time, s, each ``(N,)`` or ``(n, N)``."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> tuple[Array, Array]:
-        """Keep what :meth:`complete` takes."""
+        """Store the arguments of :meth:`complete`."""
         return normals, zero
 
     def complete(self, state: tuple[Array, Array], draws: Draws) -> ColouredErrorsState:
-        """Draw how large they are and how long they last; they are stationary from the start."""
+        """Draw standard deviation and correlation time; the errors are stationary from the start."""
         normals, zero = state
         deviation, lasting = self.draw(draws, zero)
         process = GaussMarkov.sampled(deviation, lasting, self.interval, self.xp)
@@ -396,7 +393,7 @@ class ColouredErrors(Disturbance):
         return ColouredErrorsState(deviation, process, level)
 
     def quiet(self, state: ColouredErrorsState, calm: Array) -> ColouredErrorsState:
-        """None of them."""
+        """Set the errors to zero where ``calm``."""
         deviation, kick, level = (
             self.xp.where(calm, 0.0, each) for each in (state.deviation, state.process.kick, state.level)
         )

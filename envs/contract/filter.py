@@ -1,8 +1,9 @@
 """Filters, and the likelihood that they report.
 
 A **filter** starts at the initial estimate given to every filter, predicts to every measurement, updates with it, and
-reports mean and covariance. Everything that competes is one: a bank of filters that a policy steers, an estimator of a
-user, a learned estimator, a reference that is given more, a bound. So there is one rollout and one compilation for all.
+reports mean and covariance. Every competitor is a filter: a bank of filters that a policy steers, an estimator of a
+user, a learned estimator, a reference with additional information, a bound. So one rollout and one compilation serve
+all of them.
 
 State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last axis, and are never changed in place.
 """
@@ -26,19 +27,19 @@ class Initial(NamedTuple):
     """The initial estimate given to every filter; a task may use a NamedTuple with more fields."""
 
     mean: Array
-    """In the units of the task's components, ``(C, N)``."""
+    """Mean in the units of the task's components, ``(C, N)``."""
     covariance: Array
-    """``(C, C, N)``."""
+    """Its covariance, ``(C, C, N)``."""
 
 
 class FilterInput(NamedTuple):
-    """All that a filter may be given at a measurement."""
+    """Input of a filter at a measurement."""
 
     measurement: Any
     truth: Any = None
-    """Of a filter that ``knows`` something: the world's NamedTuple; else None."""
+    """The world's NamedTuple for a filter that ``knows`` something; else None."""
     action: Array = None
-    """Of a bank: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space."""
+    """Action of a bank: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space."""
 
 
 class Likelihood(NamedTuple):
@@ -53,12 +54,12 @@ class Likelihood(NamedTuple):
 
     @classmethod
     def of(cls, values: Any) -> "Likelihood":
-        """Take a log-likelihood alone for one."""
+        """Return a likelihood from its values, or from a log-likelihood alone."""
         return cls(*values) if isinstance(values, tuple) else cls(values)
 
     @classmethod
     def unknown(cls, like: Array) -> "Likelihood":
-        """NaN, in the shape of an array ``(N,)``."""
+        """Return a likelihood of NaN, in the shape of an array ``(N,)``."""
         return cls(None).fill_unknown(like)
 
     @classmethod
@@ -67,7 +68,7 @@ class Likelihood(NamedTuple):
         return cls(*(records.get(name) for name in cls._fields))
 
     def fill_unknown(self, like: Array) -> "Likelihood":
-        """Put NaN in place of what is not known, in the shape of an array ``(N,)``."""
+        """Replace missing parts with NaN, in the shape of an array ``(N,)``."""
         none = math.nan + 0.0 * like
         return Likelihood(*(none if values is None else values for values in self))
 
@@ -97,15 +98,15 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     """
 
     knows: str = ""
-    """What it is given that no competitor knows, in words; empty where that is nothing."""
+    """Information that no competitor receives, in words; empty for a competitor."""
     kind: str = "estimator"
-    """As what it competes."""
+    """Kind of competitor."""
     in_python: bool = False
-    """Whether it runs as Python code, whatever computes the rest: it cannot be traced."""
+    """Whether it runs as Python code on every backend, since it cannot be traced."""
     adapts_covariance: bool = False
     """Whether the covariance that is reported grows with the innovations."""
     stated: Stated | None = None
-    """What it states; None: mean and covariance of all components at every measurement."""
+    """Parts of the estimate that it reports; None: mean and covariance of all components at every measurement."""
     least_interval: ClassVar[float] = 0.0
     """Share of the sampling interval from which on its gains are good for the time between two measurements."""
 
@@ -134,26 +135,24 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         """Return the state at the start of the track, of the task's :class:`Initial`."""
 
     def initialise(self, given: FilterInput) -> State:
-        """Return the state at the start of the track, of all that the filter is given: the initial estimate as
-        measurement.
-        """
+        """Return the state at the start of the track from the whole input; its measurement is the initial estimate."""
         return self.start(given.measurement)
 
     def predict(self, state: State, measurement: Measurement) -> State:
-        """Step 2: predict to the time of a measurement and compare with it; by default nothing is done ahead."""
+        """Step 2: predict to the time of a measurement and compare with it; by default return the state unchanged."""
         return state
 
     @abstractmethod
     def update(self, state: State, given: FilterInput) -> State:
-        """Step 4: take in the measurement that was predicted.
+        """Step 4: update with the measurement that was predicted.
 
         Args:
             state: after :meth:`predict`.
-            given: the same measurement, and what else this filter is given.
+            given: the same measurement, and the further input of this filter.
         """
 
     def step(self, state: State, given: FilterInput) -> State:
-        """Predict to a measurement and take it in, without an action in between."""
+        """Predict to a measurement and update with it, without an action in between."""
         return self.update(self.predict(state, given.measurement), given)
 
     def mean(self, state: State) -> Array:
@@ -169,17 +168,17 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         return covariance
 
     def feedback(self, state: State, measurement: Any) -> Any:
-        """Report what a filter gives back to the world that does not follow from its estimate; None, as by default,
-        where it does, see :meth:`.Task.feedback`.
+        """Return a feedback to the world that does not follow from the estimate; by default None, where it does, see
+        :meth:`.Task.feedback`.
 
         Args:
             state: after :meth:`start` or :meth:`update`.
-            measurement: that it has taken in, or the initial estimate.
+            measurement: of the last update, or the initial estimate.
         """
         return None
 
     def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
-        """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
+        """Return further records of each measurement, for an evaluation: arrays ``(N,)``, or ``(M, N)`` for
         ``mode_probability``.
 
         The quality of the prediction is reported by ``log_likelihood`` (log-density of the measurement as it was
@@ -227,5 +226,5 @@ class Bank(Filter[TaskT, Measurement, State]):
         """
 
     def update(self, state: State, given: FilterInput) -> State:
-        """Apply the action that is given."""
+        """Apply the action of the input."""
         return self.act(state, given.measurement, given.action)

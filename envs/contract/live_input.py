@@ -1,4 +1,4 @@
-"""Measurements that come one by one from outside: values by their names, made into the task's ``Measurement``."""
+"""Live measurements, one by one: values by their names, converted into the task's ``Measurement``."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 LARGEST = 1e15
 """Largest reading of a sensor: nothing in SI units is larger here, and its square is still a number."""
 Memory = dict[str, Any]
-"""What an input remembers of the measurements before: values by name."""
+"""Memory of an input from the previous measurements: values by name."""
 
 
 class LiveInput:
-    """Makes measurements of values as they come.
+    """Converter of live values into measurements.
 
-    This one serves every task: the values are the arrays of its ``Measurement``, by their names. Where the sensors of a
-    task say the same in plainer words, it has a subclass.
+    This class serves every task: the values are the arrays of its ``Measurement``, by their names. A task whose sensors
+    have simpler values has a subclass.
 
     Values of N tracks are arrays ``(..., N)``. Those of one track lack this axis, and a single number is a float:
     arithmetic of floats takes a tenth of the time of that of small arrays.
@@ -32,10 +32,10 @@ class LiveInput:
         task: on NumPy arrays.
         initial: an initial estimate, for its names and shapes.
         measurement: a measurement, for its shapes and types.
-        tracks: how many come side by side, N.
+        tracks: number of tracks side by side, N.
 
     Attributes:
-        values: names of what it takes at a measurement, and what they are.
+        values: names and descriptions of the values of a measurement.
         start_values: names and descriptions of the values at the start, beside mean and covariance.
         lanes: shape of the axis of tracks: ``(N,)``, or empty of one track.
     """
@@ -43,7 +43,7 @@ class LiveInput:
     counter: ClassVar[str] = "number"
     """Array of the measurement that counts measurements."""
     fuses: bool = False
-    """Whether measurements may come at the same time."""
+    """Whether several measurements may have the same time."""
     values: Mapping[str, str]
     start_values: Mapping[str, str]
 
@@ -58,7 +58,7 @@ class LiveInput:
         self.values, self.start_values = self.describe()
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return what :attr:`values` and :attr:`start_values` are."""
+        """Return the descriptions :attr:`values` and :attr:`start_values`."""
 
         def shapes(part: Any, left_out: Iterable[str]) -> dict[str, str]:
             return {
@@ -70,10 +70,10 @@ class LiveInput:
         return shapes(self.measurement, [self.counter]), shapes(self.initial, ["mean", "covariance"])
 
     def read(self, values: Mapping[str, Any], name: str, shape: tuple[int, ...] = ()) -> Any:
-        """Return a value ``(*shape, N)``, of one track ``shape``; NaN where it did not come.
+        """Return a value ``(*shape, N)``, of one track ``shape``; NaN where it is missing.
 
         Raises:
-            ValueError: for what is no number, or another shape.
+            ValueError: for a value that is no number, or has another shape.
         """
         value: Any = values.get(name)
         if not shape and not self.lanes:
@@ -127,7 +127,7 @@ class LiveInput:
             given: ``mean``, ``covariance`` and other values by name; arrays of one track, or with N last.
 
         Raises:
-            ValueError: for what is missing, unknown, or of another shape.
+            ValueError: for a value that is missing, unknown, or of another shape.
         """
         found = {}
         for name, array in self.initial._asdict().items():
@@ -137,14 +137,14 @@ class LiveInput:
         return type(self.initial)(**found), {"time": time, "count": self.same_of_all(0.0)}
 
     def same_of_all(self, number: float, shape: tuple[int, ...] = ()) -> Any:
-        """Return one number in every place, ``(*shape, N)``, of one track ``shape``."""
+        """Repeat one number for all tracks, ``(*shape, N)``, of one track ``shape``."""
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 
     def _read_finite(self, given: Mapping[str, Any], name: str, like: numpy.ndarray, what: str) -> Any:
         """Return a value as :meth:`read` does, rounded to the type of an array.
 
         Raises:
-            ValueError: for what is missing or not finite.
+            ValueError: for a value that is missing or not finite.
         """
         values, dtype = self.read(given, name, like.shape[:-1]), like.dtype
         if numpy.count_nonzero(numpy.isfinite(values)) < numpy.size(values):
@@ -154,15 +154,15 @@ class LiveInput:
         return values > 0.5 if dtype.kind == "b" else numpy.trunc(values)
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Make the measurement of the values that came at a time, floats also where the task's are of another type.
+        """Make the measurement from the values of one time, as floats also where the task has another type.
 
         Args:
-            memory: of the measurements before.
+            memory: of the previous measurements.
             time: s, ``(N,)``, of one track a float.
-            values: by name; what did not come is None, NaN or left out.
+            values: by name; a missing one is None, NaN or omitted.
 
         Raises:
-            ValueError: for what is missing, unknown, or of another shape.
+            ValueError: for a value that is missing, unknown, or of another shape.
         """
         count = memory["count"] + 1.0
         made = {self.counter: count} if self.counter in self._fields else {}
@@ -187,21 +187,21 @@ class LiveInput:
         """Return the initial mean and covariance from the first two measurements, each with its ``time``.
 
         Raises:
-            ValueError: if two measurements start no track here, or one lacks what it takes.
+            ValueError: if two measurements cannot start a track of this task, or a value is missing.
         """
         raise ValueError(f"a track of {self.task.id} does not start from two measurements: call start")
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
-        """Return the numbers that stand for what was not received; zeros."""
+        """Replace values that were not received; by default with zeros."""
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
 
 
 class LiveValues:
-    """Values that came live, as :class:`~.log_format.Readings` of several tracks.
+    """Live values, as :class:`~.log_format.Readings` of several tracks.
 
     Args:
-        input: that reads them.
-        values: by name; what did not come is None, NaN or left out.
+        input: converter that reads them.
+        values: by name; a missing one is None, NaN or omitted.
     """
 
     def __init__(self, input: LiveInput, values: Mapping[str, Any]) -> None:
@@ -213,7 +213,7 @@ class LiveValues:
         return all(self.values.get(name) is not None for name in names)
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the value of each track, ``(N,)``; NaN where none came."""
+        """Return the value of each track, ``(N,)``; NaN where it is missing."""
         return numpy.atleast_1d(self.input.read(self.values, name))
 
     def place(self, number: int) -> str:

@@ -1,4 +1,4 @@
-"""Readings of sensors as rows of a table and as live values, and the reading of a table."""
+"""Formats of sensor readings, as rows of a table and as live values, and how a table is read."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ TIME = ("time", "timestamp", "seconds")
 RECORDING = "recording"
 """Name of the column that names the recording of each row."""
 TRUTH = "truth_"
-"""Begins the names of columns of true values."""
+"""Prefix of the names of columns of true values."""
 
 
 class Column(NamedTuple):
-    """A number that a sensor reports: a column of a table, and a value that comes live."""
+    """A number that a sensor reports: a column of a table, and a live value."""
 
     text: str
-    """Its unit, and what it is."""
+    """Unit and meaning."""
     live: str = ""
-    """The same of a value that comes live; empty where ``text`` serves."""
+    """Unit and meaning of the live value; empty where ``text`` applies."""
 
     @property
     def live_text(self) -> str:
@@ -33,14 +33,14 @@ class Column(NamedTuple):
 
 
 class Readings(Protocol):
-    """Numbers by the names of their columns: n rows of a table, or what came for n tracks."""
+    """Numbers by the names of their columns: n rows of a table, or the live values of n tracks."""
 
     def has(self, *names: str) -> bool:
         """Return whether all of these are given."""
         ...
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the numbers of a column, ``(n,)``; NaN where one did not come."""
+        """Return the numbers of a column, ``(n,)``; NaN where one is missing."""
         ...
 
     def place(self, number: int) -> str:
@@ -49,7 +49,7 @@ class Readings(Protocol):
 
 
 def optional(readings: Readings, name: str, count: int) -> numpy.ndarray:
-    """Return the numbers of a column that may lack, ``(n,)``; then NaN.
+    """Return the numbers of an optional column, ``(n,)``; NaN without it.
 
     Args:
         readings: given.
@@ -63,7 +63,7 @@ def check_deviations(readings: Readings, name: str, values: Any) -> None:
     """Raise ValueError if a standard deviation is not above zero.
 
     Args:
-        readings: that they are of.
+        readings: source of the values.
         name: of the column.
         values: ``(n,)``; NaN where none is stated.
     """
@@ -78,11 +78,11 @@ def check_deviations(readings: Readings, name: str, values: Any) -> None:
 NO_DEVIATIONS = "no column states deviations"
 """First words of the source of assumed deviations."""
 UNITS = {"azimuth_sigma": "degrees"}
-"""Of deviations that are no metres."""
+"""Units of deviations that are not in metres."""
 
 
 def is_assumed(words: str) -> bool:
-    """Return whether words say of deviations that no column states them."""
+    """Return whether the source of deviations is an assumption, since no column states them."""
     return words.startswith(NO_DEVIATIONS)
 
 
@@ -92,38 +92,38 @@ def deviation_words(deviations: Mapping[str, float]) -> str:
 
 
 class TrackStart(NamedTuple):
-    """The start of the tracks of E episodes, made of their first measurements."""
+    """Start of the tracks of E episodes, computed from their first measurements."""
 
     measurements: Mapping[str, numpy.ndarray]
-    """Those after the start, ``(E, T, ...)``."""
+    """Measurements after the start, ``(E, T, ...)``."""
     initial: Mapping[str, numpy.ndarray]
     """The initial estimate, ``(E, ...)``."""
     used: int
-    """Measurements that the start took."""
+    """Number of measurements that the start used."""
 
 
 class TrackLog(NamedTuple):
-    """The measurements of one track, made of the columns of a table; T measurements."""
+    """The T measurements of one track, from the columns of a table."""
 
     measurements: Mapping[str, numpy.ndarray]
-    """``(T, ...)``."""
+    """Arrays of the measurements, ``(T, ...)``."""
     initial: Mapping[str, numpy.ndarray]
     """The initial estimate, ``(...)``."""
     rows: numpy.ndarray
-    """Row of the table that each measurement is of, ``(T,)``; -1 where it is of none."""
+    """Row of the table of each measurement, ``(T,)``; -1 where there is none."""
     parameters: Mapping[str, Any]
     """Parameters of the environment that follow from the table."""
     start: float
     """Time of the start of the track, s, as in the table."""
     time: numpy.ndarray
-    """Recording of each measurement, ``(T,)``."""
+    """Time of each measurement as it stands in the table, ``(T,)``."""
     notes: tuple[str, ...] = ()
-    """What was done to the table, a line each."""
+    """Changes made to the table, a line each."""
     typical: Mapping[str, float] = {}
-    """Parameters that are a typical size of what the table states of its errors, and may differ from track to track;
-    the user has not set them."""
+    """Parameters set to typical sizes of the errors that the table states. They may differ from track to track; the
+    user has not set them."""
     deviations: Mapping[str, float] = {}
-    """Typical deviations of what was measured, in the names and units of the columns that state them, or would."""
+    """Typical deviations of the measured values, by the names and in the units of the columns for them."""
     deviations_from: str = ""
     """Source of the deviations, in words."""
 
@@ -134,7 +134,7 @@ class Predicted(NamedTuple):
     name: str
     unit: str
     group: str
-    """Of coordinates whose errors are one length, such as a position."""
+    """Group of coordinates whose errors are one length, such as a position."""
 
 
 class PlainRows(NamedTuple):
@@ -143,80 +143,82 @@ class PlainRows(NamedTuple):
     """
 
     received: tuple[str, ...]
-    """Columns of the numbers of ``values``; an empty cell was not received."""
-    held: tuple[str, ...]
-    """Columns of the numbers of ``inputs``; where a cell is empty the last one holds on, and before all the first."""
+    """Columns of the numbers of ``values``; an empty cell is a value that was not received."""
+    inputs: tuple[str, ...]
+    """Columns of the numbers of ``inputs``; an empty cell repeats the last number, or before it the first."""
     mean: numpy.ndarray
     """Initial estimate of every track, ``(C,)``, one interval before the first row."""
     covariance: numpy.ndarray
-    """``(C, C)``."""
+    """Covariance of the initial estimate, ``(C, C)``."""
     interval: float | None
-    """Time between rows, s; None where they may come at any time: the median then lies before the first."""
+    """Time between rows, s; None where it varies: the track then starts one median interval before the first row."""
 
 
 class PlotRows(NamedTuple):
     """Rows of a table that are plots of a track, which starts from the first two of them."""
 
     farthest: float
-    """m from the origin."""
+    """Largest distance from the origin, m."""
     most_missed: int
-    """Scans that may be missing between two rows."""
+    """Largest number of scans missing between two rows."""
     finer: float
-    """Times that a deviation exceeds the resolution of positions where noise does not repeat one by chance."""
+    """Ratio of deviation to resolution of positions from which on noise does not repeat a position by chance."""
     deviation: float
-    """m, of a scan without a plot where columns state those of plots."""
+    """Deviation of a scan without a plot, where columns state those of plots, m."""
 
 
 @dataclass(frozen=True)
 class LogFormat:
-    """The tables of real measurements that an environment reads."""
+    """Format of the tables of real measurements that an environment reads."""
 
     columns: Mapping[str, Column]
     """The columns beside ``time``, by their names."""
     read: Callable[[Any], TrackLog]
-    """Makes the measurements of one track of its columns (:class:`~.recorded_tables.Columns`); raises
-    :class:`ValueError` for what lacks or cannot be."""
+    """Function that makes the measurements of one track from its columns (:class:`~.recorded_tables.Columns`); raises
+    :class:`ValueError` for missing or impossible values."""
     start: Callable[[Mapping[str, numpy.ndarray], numpy.ndarray, Any], TrackStart]
-    """Makes the start of the tracks of measurements ``(E, T, ...)`` by name, of their times ``(E, T)``, s, and of the
-    parameters, where a file gives no initial estimate; raises :class:`ValueError` if that cannot be."""
+    """Function that makes the start of the tracks from measurements ``(E, T, ...)`` by name, their times ``(E, T)``, s,
+    and the parameters, where a file gives no initial estimate; raises :class:`ValueError` if that is impossible."""
     targets_move: bool = False
-    """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
+    """Whether targets never stand still, such as aircraft: a recording that hardly moves then has another unit."""
     scale_noise: Callable[[Any, Any], Any] | None = None
-    """Multiplies the deviations stated in a ``Measurement`` by a factor, a number or ``(N,)``; None where none are."""
+    """Function that multiplies the deviations stated in a ``Measurement`` by a factor, a number or ``(N,)``; None
+    where none are stated."""
     predict: Callable[[Any, Any, Any], tuple[Any, Any]] | None = None
-    """What an estimate before a measurement predicts of it, and what was measured, ``(m, N)`` each, NaN where nothing
-    was received: from the mean ``(C, N)`` after the measurement before, the ``Measurement`` and the parameters."""
+    """Function that returns the predicted and the measured coordinates, ``(m, N)`` each, NaN where nothing was
+    received. Its arguments are the mean ``(C, N)`` after the previous measurement, the ``Measurement`` and the
+    parameters."""
     predicted: tuple[Predicted, ...] = ()
-    """What is predicted, at least m, the main ones first."""
+    """Predicted coordinates, at least m, the main ones first."""
     plane: tuple[str, ...] = ()
-    """Two columns of metres, east and north, and two of them that are true, which latitude and longitude may stand for;
-    empty where they may not."""
+    """Two columns of metres, east and north, and two of their true values, which latitude and longitude may
+    replace; empty where they may not."""
     plain_rows: PlainRows | None = None
-    """How the rows are measurements as they stand; None where more is done to them."""
+    """Format of rows that are measurements without a conversion; None where they need one."""
     plot_rows: PlotRows | None = None
-    """How the rows are plots of a track; None where they are not."""
+    """Format of rows that are plots of a track; None where they are not."""
     regular_rows: Callable[[Any], Mapping[str, float]] | None = None
-    """Numbers that the reading of rows at one rate needs, by the parameters; None where rows come otherwise."""
+    """Numbers that the reading of rows at one rate needs, by the parameters; None where the rate of rows varies."""
     noise_hint: str = ""
-    """How a column that states noise is read, a clause for the note on one that is not; empty where there is no way."""
+    """Remedy for a column of noise that is not read, a clause for the note on it; empty where there is none."""
     decision_interval: int | None = None
-    """Measurements for which an action holds in a recording that names no number; None: as by default. With one no
-    measurement is lost."""
+    """Measurements of a decision in a recording that states no number; None: the default. With one, no measurement is
+    dropped."""
     longest_interval: float = float("inf")
-    """Between measurements, s: what is longer in a table is taken for another unit."""
+    """Longest time between measurements, s: a longer one in a table is taken for another unit."""
 
 
 class LogSetup(NamedTuple):
     """Reading of the log for which a filter is advised, so that the filter can be run on the same input."""
 
     interval: float
-    """Median time between measurements, s: the filter was judged with a missed scan wherever more time passes."""
+    """Median time between measurements, s: the filter was evaluated with a missed scan wherever more time passes."""
     parameters: dict[str, Any]
-    """Of the task."""
+    """Parameters of the task."""
     columns: dict[str, str]
-    """Names in the log, by what the columns are called here; empty where the log was no table."""
+    """Names in the log, by the names of the columns here; empty where the log was no table."""
     deviations: dict[str, float]
-    """Of measurements that state none, in the names and units of the columns."""
+    """Deviations of measurements that state none, by the names and in the units of the columns."""
     deviations_from: str
     """Source of the deviations."""
     origin: dict[str, float]
@@ -226,7 +228,7 @@ class LogSetup(NamedTuple):
     """Measurements of the longest track; zero: not known."""
 
     def scenario(self, task: Any) -> Scenario:
-        """Return the parameters of a task on logs that are read in the same way, in place of those of a simulated
+        """Return the parameters of a task on logs that are read in the same way, instead of those of a simulated
         scenario.
         """
         log_format: Any = find_companion(task, LogFormat)
@@ -240,6 +242,6 @@ class LogSetup(NamedTuple):
 
     @property
     def assumed(self) -> dict[str, float]:
-        """Parameters under which a log without deviations is read as the fitted one was; empty where it stated any."""
+        """Parameters that make a log without deviations be read as the fitted log was; empty where that stated any."""
         isotropic = self.deviations.get("sigma_x") if is_assumed(self.deviations_from) else None
         return {} if isotropic is None else {"range_sigma": isotropic}

@@ -22,12 +22,12 @@ from .task import Task, named_arrays
 
 
 class Episode(NamedTuple):
-    """N episodes at one moment: all that the engine keeps between steps."""
+    """N episodes at one moment: everything that the engine stores between steps."""
 
     truth: Any
-    """What is; the world's NamedTuple."""
+    """True state; the world's NamedTuple."""
     measurement: Any
-    """What the sensors say; between ``begin`` and the first measurement the initial estimate."""
+    """Readings of the sensors; between ``begin`` and the first measurement the initial estimate."""
     filter: Any
     """State of the filter."""
 
@@ -37,12 +37,12 @@ class Model:
 
     Args:
         task: the estimation problem; compiled models share it with those that are not.
-        control: what the action steers; the filter is its bank, until :meth:`with_filter` puts another in its place.
+        control: name of the control; the filter is its bank, until :meth:`with_filter` replaces it.
 
     Attributes:
-        filter: what estimates.
-        fields: what an agent is shown, component by component.
-        action_space: what the action may be.
+        filter: the filter in the loop.
+        fields: components of the observation.
+        action_space: Gymnasium space of the action.
     """
 
     filter: Any
@@ -62,11 +62,11 @@ class Model:
         self.action_space = filter.action_space
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Model":
-        """Share the model: nothing in it changes."""
+        """Share the model, which never changes."""
         return self
 
     def __reduce__(self) -> Any:
-        """Pickle what it is made of."""
+        """Pickle the arguments of the model, not what is computed from them."""
         return type(self), (self.task, self.control)
 
     @property
@@ -83,7 +83,7 @@ class Model:
         return self._blocks.columns(names)
 
     def reader(self, name: str) -> Reader:
-        """Return what reads a block or quantity of the observation by its name, uncompressed.
+        """Return a function that reads a block or quantity of the observation by its name, uncompressed.
 
         Raises:
             ValueError: for a name that is neither.
@@ -102,7 +102,7 @@ class Model:
         """Return the same problem with another filter in place of the bank.
 
         Args:
-            make: makes the filter for a model; not made anew for each call, since what is compiled is kept by it.
+            make: makes the filter for a model. Pass the same function each time: compiled code is stored by it.
         """
         other = copy.copy(self)
         other._take_filter(make(self))
@@ -112,7 +112,7 @@ class Model:
         """Call ``function(model, *parts)`` on this model's backend.
 
         Args:
-            function: of this module or another, not made anew for each call: it may be compiled, once.
+            function: of this module or another; pass the same one each time, since it may be compiled once.
             *parts: nested tuples of arrays ``(..., N)``.
 
         Returns:
@@ -121,12 +121,12 @@ class Model:
         return function(self, *parts)
 
     def picture(self) -> Any:
-        """Return the :class:`~.rendering.Picture` made for an episode of this task; None for the general one."""
+        """Make the :class:`~.rendering.Picture` of an episode of this task; None for the general one."""
         maker = find_companion(self.task, PictureMaker)
         return None if maker is None or self.task.recording is not None else maker.make(self)
 
     def truth_for_filter(self, truth: Any) -> Any:
-        """Return the truth as the filter is given it: None unless it ``knows`` something."""
+        """Return the truth that the filter receives: None unless it ``knows`` something."""
         return truth if self.filter.knows else None
 
     # --- the filter's part of a step
@@ -136,11 +136,11 @@ class Model:
         return self.filter.initialise(FilterInput(initial, truth))
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
-        """Return the state of the filter when a measurement has come, before it is taken in."""
+        """Return the state of the filter predicted to a measurement, before the update."""
         return self.filter.predict(state, measurement)
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
-        """Return the state of the filter when the measurement is taken in, by a bank with the action."""
+        """Return the state of the filter after the update with the measurement; a bank uses the action."""
         return self.filter.update(state, FilterInput(measurement, truth, action))
 
     def feedback(self, state: Any, measurement: Any) -> Any:
@@ -152,7 +152,7 @@ class Model:
             return own
         return self.task.feedback(self.filter.mean(state), self.filter.covariance(state), measurement)
 
-    # --- what the engine calls
+    # --- called by the engine
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
         """Return the episode at the start of the track.
@@ -165,20 +165,20 @@ class Model:
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Return the steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
+        """Apply steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.task.world.advance(episode.truth, noise, feedback)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 
     def observe(self, episode: Episode) -> Array:
-        """Step 3: what the agent is shown, ``(len(fields), N)``."""
+        """Step 3: return the observation of the agent, ``(len(fields), N)``."""
         if not self.fields:  # nothing steers the filter
             N = next(named_arrays(episode.measurement))[1].shape[-1]
             return self.task.xp.zeros((0, N), dtype=self.task.xp.float64, device=self.task.device)
         return self._blocks.observe(episode.filter, episode.measurement)
 
     def act(self, episode: Episode, action: Array) -> Episode:
-        """Step 4: the filter takes the measurement in, a bank with the action."""
+        """Step 4: update the filter with the measurement; a bank uses the action."""
         truth = self.truth_for_filter(episode.truth)
         return episode._replace(filter=self.update_filter(episode.filter, episode.measurement, action, truth))
 
@@ -187,7 +187,7 @@ class Model:
         return self.filter.mean(episode.filter)
 
     def context(self, episode: Episode) -> dict[str, Array]:
-        """Return the draws of the episode, and those in force now: arrays of floats ``(..., N)``."""
+        """Return the random draws of the episode, and those in force now: arrays of floats ``(..., N)``."""
         context = self.task.world.context(episode.truth)
         return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
 
@@ -204,11 +204,11 @@ class Model:
         )
 
     def causes(self, episode: Episode) -> Array:
-        """Return the causes of the task that hold, ``(N,)``, see :func:`.causes.cause_number`."""
+        """Return the number of the true causes of the task, ``(N,)``, see :func:`.causes.cause_number`."""
         return cause_number(Causes.of(self.task).causes, self.moment(episode))
 
     def cost(self, episode: Episode) -> Array:
-        """Step 5: what the estimate costs, uncapped, ``(N,)``."""
+        """Step 5: return the cost of the estimate, uncapped, ``(N,)``."""
         return self.task.world.cost(episode.truth, self.filter.mean(episode.filter))
 
     def counted_cost(self, episode: Episode) -> Array:
@@ -216,7 +216,7 @@ class Model:
         return self.task.world.counted_cost(episode.truth, self.filter.mean(episode.filter))
 
     def error(self, episode: Episode) -> Array:
-        """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""
+        """Return the estimate minus the truth, ``(len(components), N)``, in the units of ``components``."""
         return self.task.subtract(self.filter.mean(episode.filter), self.task.world.state(episode.truth))
 
     def covariance(self, episode: Episode) -> Array:
@@ -249,9 +249,9 @@ class Model:
 
     def records(self, episode: Episode) -> dict[str, Array]:
         """Return the further records of each measurement."""
-        kept = {
+        records = {
             **self.filter.records(episode.filter, episode.measurement),
             **self.task.world.records(episode.truth),
         }
         further = find_companion(self.task, LoopRecords)
-        return kept if further is None else {**kept, **further.report(self, episode, kept)}
+        return records if further is None else {**records, **further.report(self, episode, records)}

@@ -1,8 +1,8 @@
 """Observations: a list of blocks gives fields, observation and decoding.
 
-A :class:`Block` is one quantity of the observation: a function of what the filters know, and a
-:class:`Compression` with which it is shown. The base class of the banks derives the observation from the
-list, and a :class:`Reader` that gives a quantity back: policies never undo a compression by hand.
+A :class:`Block` is one quantity of the observation: a function of the state of the filters, and the
+:class:`Compression` of its values. The base class of the banks derives the observation from the list, and a
+:class:`Reader` that inverts it: policies never undo a compression by hand.
 """
 
 import functools
@@ -23,25 +23,25 @@ class Field(NamedTuple):
 
     name: str
     unit: str
-    """Unit of the value as shown; "1" for a pure number."""
+    """Unit of the value in the observation; "1" for a pure number."""
     description: str
-    """What it is and how it is scaled."""
+    """Meaning and scale."""
     over_interval: Literal["last", "mean"] = "last"
-    """How the component is shown when one action holds for several measurements: the value at the last
-    one, or the mean over all of them."""
+    """Value of the component when one action applies to several measurements: that at the last one, or the mean
+    over all of them."""
 
 
 class Compression(NamedTuple):
     """Compression of a value, and its inverse."""
 
     text: str
-    """Put in front of the description of a block."""
+    """Text in front of the description of a block."""
     forward: Callable[[Array, ModuleType], Array] | None
-    """From the value to what is shown; None where it is shown as it is."""
+    """Function from the value to the observation; None: no compression."""
     inverse: Callable[[numpy.ndarray], numpy.ndarray] | None
-    """From what is shown to the value; None where they are the same."""
+    """Function from the observation to the value; None where they are equal."""
     limits: tuple[float, float] = (-math.inf, math.inf)
-    """Of what is shown, whatever the filters do: bounds of the observation space."""
+    """Bounds of the observation space, for any state of the filters."""
 
 
 def symlog(value: Array, xp: ModuleType) -> Array:
@@ -55,28 +55,28 @@ def symexp(value: Array, xp: ModuleType) -> Array:
 
 
 PLAIN = Compression("", None, None)
-"""As it is, and without limits."""
+"""No compression and no limits."""
 
 
 def within(low: float, high: float) -> Compression:
-    """Return no compression, for values that cannot lie outside these limits."""
+    """Return the identity, for values that cannot lie outside these limits."""
     return Compression("", None, None, (low, high))
 
 
 SHARE = within(0.0, 1.0)
 ACTION = within(-1.0, 1.0)
 LARGEST_LOG = 710.0
-"""No finite number has a larger logarithm, and none but zero one below the negative of :data:`SMALLEST_LOG`."""
+"""Largest logarithm of a finite number; only that of zero is below the negative of :data:`SMALLEST_LOG`."""
 SMALLEST_LOG = 746.0
 SIGNED_LOG = Compression(
     "sign(x) log(1 + |x|) of ", symlog, lambda shown: symexp(shown, numpy), (-LARGEST_LOG, LARGEST_LOG)
 )
 LIMIT = 8.0
-"""What a bounded logarithm stays below."""
+"""Upper bound of a bounded logarithm."""
 
 
 def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
-    """``y / (1 + |y| / 8)`` of the signed logarithm y: close to x near zero, below 8 for the largest of numbers."""
+    """Return ``y / (1 + |y| / 8)`` of the signed logarithm y: close to x near zero, below 8 for the largest number."""
     logarithm = symlog(value, xp)
     return logarithm / (1.0 + (1.0 / LIMIT) * xp.abs(logarithm))
 
@@ -92,9 +92,9 @@ BOUNDED_LOG = Compression(
     bounded_exponential,
     (-LIMIT, LIMIT),
 )
-"""For what a wrong hypothesis makes as large as one likes."""
+"""For values that a wrong hypothesis can make arbitrarily large."""
 KEPT_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1, (0.0, LARGEST_LOG))
-"""The block's function returns log(1 + x) already, because the filters keep that; reading gives x."""
+"""The block's function returns log(1 + x) already, because the filters store that; reading gives x."""
 LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1, KEPT_AS_LOG1P.limits)
 AVERAGE_OF_LOG1P = within(*KEPT_AS_LOG1P.limits)
 KEPT_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LOG))
@@ -104,11 +104,11 @@ KEPT_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LO
 def linear_scale(
     factor: float, offset: float = 0.0, limits: tuple[float, float] = (-math.inf, math.inf)
 ) -> Compression:
-    """``factor (x - offset)``, where the unit of the field describes the rest.
+    """Return the compression ``factor (x - offset)``, where the unit of the field describes the rest.
 
     Args:
         factor: above zero.
-        offset: what is shown as zero.
+        offset: value that becomes zero.
         limits: of x.
     """
     low, high = (factor * (value - offset) for value in limits)
@@ -122,16 +122,15 @@ class Block(NamedTuple):
 
     name: str
     value: Callable[[Any, Any], Array]
-    """From the bank's state and the measurement to ``(parts, N)``, or ``(..., N)`` with the parts in the order
+    """Function from the bank's state and the measurement to ``(parts, N)``, or ``(..., N)`` with the parts in the order
     of their rows, or ``(N,)`` where there is only one."""
     text: str
-    """What it is."""
+    """Meaning, in words."""
     parts: Sequence[str] = ()
-    """Endings that tell its rows apart, one for each: the fields are ``name_part``. Empty where one row is the
-    field ``name``."""
-    shown: Compression = PLAIN
+    """Suffixes of its rows: the fields are ``name_part``. Empty where one row is the field ``name``."""
+    compression: Compression = PLAIN
     unit: str = "1"
-    """Unit of what is shown."""
+    """Unit of the values in the observation."""
     over_interval: Literal["last", "mean"] = "last"
 
 
@@ -154,7 +153,7 @@ class Blocks:
 
     Args:
         blocks: in the order of the observation.
-        quantities: what else can be read from it.
+        quantities: further quantities that can be read from it.
         xp: array namespace.
 
     Raises:
@@ -166,13 +165,13 @@ class Blocks:
         self.quantities: dict[str, Quantity] = {quantity.name: quantity for quantity in quantities}
         self.xp = xp
         self.fields: tuple[Field, ...] = tuple(
-            Field(name, block.unit, block.shown.text + block.text, block.over_interval)
+            Field(name, block.unit, block.compression.text + block.text, block.over_interval)
             for block in self.blocks
             for name in _field_names(block)
         )
-        limits = [block.shown.limits for block in self.blocks for _ in _field_names(block)]
+        limits = [block.compression.limits for block in self.blocks for _ in _field_names(block)]
         self.limits: numpy.ndarray = numpy.array(limits).reshape(-1, 2).T
-        """Lower and upper bounds of what is shown, ``(2, fields)``."""
+        """Lower and upper bounds of the observation, ``(2, fields)``."""
         names = [field.name for field in self.fields]
         known = [*(block.name for block in self.blocks), *self.quantities]
         for table in (names, known):
@@ -181,8 +180,8 @@ class Blocks:
         # One call of a compression for all blocks that share it: calls cost more than numbers.
         shared: dict[Callable[[Array, ModuleType], Array], list[int]] = {}
         for i, block in enumerate(self.blocks):
-            if block.shown.forward is not None:
-                shared.setdefault(block.shown.forward, []).append(i)
+            if block.compression.forward is not None:
+                shared.setdefault(block.compression.forward, []).append(i)
         self._shared = [
             (forward, members, [len(_field_names(self.blocks[i])) for i in members])
             for forward, members in shared.items()
@@ -234,10 +233,10 @@ class Blocks:
 
     @functools.cached_property
     def _inverses(self) -> dict[str, Callable[[numpy.ndarray], numpy.ndarray] | None]:
-        return {block.name: block.shown.inverse for block in self.blocks}
+        return {block.name: block.compression.inverse for block in self.blocks}
 
     def reader(self, name: str) -> Reader:
-        """Return what reads a block, uncompressed, or a quantity from observations.
+        """Return a function that reads a block, uncompressed, or a quantity from observations.
 
         Raises:
             ValueError: for a name that is neither.
@@ -254,14 +253,14 @@ class Blocks:
 
 
 class DecisionMeans:
-    """Fields of the observation that are means over the measurements for which a decision holds.
+    """Fields of the observation that are means over the measurements of a decision.
 
     Args:
         fields: of the observation.
-        interval: measurements for which a decision holds.
+        interval: measurements of a decision.
 
     Attributes:
-        columns: positions of these fields; none where a decision holds for one measurement.
+        columns: positions of these fields; none where a decision has one measurement.
     """
 
     def __init__(self, fields: Sequence[Field], interval: int) -> None:
@@ -275,7 +274,7 @@ class DecisionMeans:
         return total + observation[self.columns]
 
     def write(self, observation: numpy.ndarray, total: numpy.ndarray) -> None:
-        """Put the means into an observation that may be changed; arguments as of :meth:`show`."""
+        """Write the means into an observation in place; arguments as of :meth:`show`."""
         observation[self.columns] = total / self.interval
 
     def show(self, observation: Array, total: Array, xp: ModuleType) -> Array:
@@ -306,14 +305,14 @@ def _read(
     return shown if inverse is None else inverse(shown)
 
 
-# --- blocks that several problems show, each with its name, words, scale and bounds; a problem adds the value where its
-# state keeps that under another name, the endings of the rows, and words where they say more than the usual ones
+# --- blocks of several problems, each with its name, words, scale and bounds; a problem adds the value where its state
+# has another name for it, the suffixes of the rows, and words where they are more precise than the usual ones
 
 
 Value = Callable[[Any, Any], Array]
 """From the bank's state and the measurement to the rows of a block."""
 Interval = Literal["last", "mean"]
-"""How a block is shown where one action holds for several measurements, see :class:`.Field`."""
+"""Value of a block where one action applies to several measurements, see :class:`.Field`."""
 
 
 def innovation_block(
@@ -321,15 +320,15 @@ def innovation_block(
     value: Value = lambda f, _: f.innovation,
     text: str = "the innovation over its predicted sigma",
     name: str = "innovation",
-    shown: Compression = SIGNED_LOG,
+    compression: Compression = SIGNED_LOG,
     over_interval: Interval = "last",
 ) -> Block:
-    """Return the innovation over a deviation; by default the ``innovation`` that the state keeps."""
-    return Block(name, value, text, parts, shown, over_interval=over_interval)
+    """Return the innovation over a deviation; by default the ``innovation`` of the state."""
+    return Block(name, value, text, parts, compression, over_interval=over_interval)
 
 
 def average_block(name: str, value: Value, text: str, parts: Sequence[str] = ()) -> Block:
-    """Return the average over the last measurements of what has both signs, such as an innovation."""
+    """Return the average over the last measurements of a signed value, such as an innovation."""
     return Block(name, value, text, parts, SIGNED_LOG)
 
 
@@ -339,7 +338,7 @@ def nis_block(parts: Sequence[str] = ()) -> Block:
 
 
 def log_squared_block(parts: Sequence[str] = ()) -> Block:
-    """Return the normalised innovation squared, of which the state keeps the logarithm ``log_squared``."""
+    """Return the normalised innovation squared, of which the state has the logarithm ``log_squared``."""
     return Block(
         "log_squared_innovation",
         lambda f, _: f.log_squared,
@@ -354,7 +353,7 @@ def average_log_squared_block(average: str, parts: Sequence[str] = ()) -> Block:
 
     Args:
         average: over which measurements, in words.
-        parts: endings of the rows.
+        parts: suffixes of the rows.
     """
     return Block(
         "average_log_squared_innovation",
@@ -376,14 +375,14 @@ def expected_nis_block(
     Args:
         xp: array namespace.
         received: from a measurement to booleans, ``(N,)``.
-        text: what it is.
-        over_interval: how it is shown over several measurements.
+        text: meaning, in words.
+        over_interval: its value over several measurements, see :class:`Field`.
     """
     return Block(
         "squared_innovation",
         lambda f, measurement: xp.where(received(measurement), f.likelihood.nis, 0.0),
         text,
-        shown=LOG1P,
+        compression=LOG1P,
         over_interval=over_interval,
     )
 
@@ -392,19 +391,19 @@ def relative_likelihood_block(
     xp: ModuleType,
     parts: Sequence[str],
     text: str = "the log-likelihood minus the largest one, nats",
-    shown: Compression = SIGNED_LOG,
+    compression: Compression = SIGNED_LOG,
     name: str = "log_likelihood",
     value: Callable[[Any], Array] = lambda f: f.log_likelihood,
 ) -> Block:
     """Return the log-likelihoods of the hypotheses, less the largest; by default ``log_likelihood`` of the state."""
-    return Block(name, lambda f, _: value(f) - xp.max(value(f), axis=0), text, parts, shown)
+    return Block(name, lambda f, _: value(f) - xp.max(value(f), axis=0), text, parts, compression)
 
 
 def log_density_block(
     value: Value, text: str, name: str = "log_likelihood", over_interval: Interval = "last"
 ) -> Block:
     """Return the log-density of a measurement in its usual units."""
-    return Block(name, value, text, shown=BOUNDED_LOG, over_interval=over_interval)
+    return Block(name, value, text, compression=BOUNDED_LOG, over_interval=over_interval)
 
 
 def log_predicted_block(
@@ -418,9 +417,9 @@ def predicted_block(parts: Sequence[str], measurement: str = "measurement", of: 
     """Return the logarithms of the probabilities ``predicted`` by a bank of hypotheses.
 
     Args:
-        parts: endings of the rows.
-        measurement: what a measurement is called.
-        of: of what they are probabilities, such as " of the level".
+        parts: suffixes of the rows.
+        measurement: word for a measurement.
+        of: words for the hypotheses, such as " of the level".
     """
     return Block(
         "log_predicted",
@@ -450,7 +449,7 @@ def entropy_block(xp: ModuleType) -> Block:
         "entropy",
         lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
         "entropy of the hypotheses then over the largest possible",
-        shown=SHARE,
+        compression=SHARE,
     )
 
 
@@ -459,15 +458,15 @@ def prior_block(
     text: str = "the sigma of the predicted position over that of the measurement",
     value: Value = lambda f, _: f.prior,
 ) -> Block:
-    """Return the deviation of the prediction over that of the measurement; the state keeps the logarithm ``prior``."""
+    """Return the deviation of the prediction over that of the measurement; the state has the logarithm ``prior``."""
     return Block("prior", value, text, parts, KEPT_AS_LOG)
 
 
 def last_action_block(
-    parts: Sequence[str] = (), name: str = "last_action", shown: Compression = ACTION
+    parts: Sequence[str] = (), name: str = "last_action", compression: Compression = ACTION
 ) -> Block:
     """Return the action that was applied before, ``action`` of the state."""
-    return Block(name, lambda f, _: f.action, "action applied before", parts, shown)
+    return Block(name, lambda f, _: f.action, "action applied before", parts, compression)
 
 
 def last_weight_block(
@@ -499,6 +498,6 @@ def clock_block(xp: ModuleType, horizon: int, unit: str = "1") -> Block:
         "time",
         lambda _, measurement: xp.astype(measurement.number, xp.float64) / horizon,
         "measurements so far over the horizon",
-        shown=within(0.0, (horizon + 1) / horizon),
+        compression=within(0.0, (horizon + 1) / horizon),
         unit=unit,
     )

@@ -1,4 +1,4 @@
-"""Parameters of tasks: limits stand beside the fields they hold for, and one checker reads them.
+"""Parameters of tasks: limits beside the fields, and one function that checks them.
 
     @dataclass(frozen=True)
     class ParametersOfMine(TaskParameters):
@@ -6,8 +6,8 @@
         \"\"\"Standard deviation of the range, m (paper).\"\"\"
 
 The type of a field determines the values that it takes (number, whole number, boolean, word, tuples of them, None);
-:func:`parameter` declares further limits. Every refusal is a ``ValueError`` with the name, the value and what
-was expected.
+:func:`parameter` declares further limits. Every error is a ``ValueError`` with the name, the value and the
+expected values.
 """
 
 import dataclasses
@@ -43,9 +43,7 @@ def parameter(default: Any, **limits: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class TaskParameters:
-    """Parameters of every task. Subclasses may give other defaults, and check in :meth:`check` what one field's limits
-    cannot say.
-    """
+    """Parameters of every task. Subclasses may change defaults and check several fields together in :meth:`check`."""
 
     horizon: int = parameter(100, at_least=1)
     """Measurements acted on in one episode."""
@@ -56,7 +54,7 @@ class TaskParameters:
         """Check every field.
 
         Raises:
-            ValueError: with the name of the field, its value and what was expected.
+            ValueError: with the name of the field, its value and the expected values.
         """
         cls: Any = type(self)
         for name, (hint, limits) in field_limits(cls).items():
@@ -71,7 +69,7 @@ class TaskParameters:
         self.check()
 
     def check(self) -> None:
-        """Check what concerns several fields together."""
+        """Check conditions on several fields together."""
 
 
 @cache
@@ -91,10 +89,10 @@ def freeze(value: Any) -> Any:
 
 
 def check(name: str, value: Any, hint: Any, limits: ParameterLimits) -> None:
-    """Check a value against the type and the limits that were declared for it.
+    """Check a value against its declared type and limits.
 
     Raises:
-        ValueError: with the name, the value and what was expected.
+        ValueError: with the name, the value and the expected values.
     """
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         if value is None:
@@ -131,7 +129,7 @@ def _within(value: float, limits: ParameterLimits) -> bool:
 
 
 LARGEST = 1e60
-"""Of a parameter: its fifth power is a number, too."""
+"""Largest parameter: its fifth power is still finite."""
 
 
 def quote_shortened(value: Any, most: int = 80) -> str:
@@ -148,10 +146,10 @@ def quote_shortened(value: Any, most: int = 80) -> str:
 
 
 def read_numbers(name: str, value: Any) -> numpy.ndarray:
-    """Return an array of floats of what a user gave.
+    """Return an array of floats from the input of a user.
 
     Raises:
-        ValueError: for what is no number, or rows of several lengths.
+        ValueError: for a value that is no number, or rows of several lengths.
     """
     try:
         found = numpy.asarray(value)
@@ -183,7 +181,7 @@ def check_integer(name: str, value: Any, at_least: int) -> int:
     """Return a whole number, of Python or NumPy, that a user gave as an argument.
 
     Raises:
-        ValueError: with the name, the value and what was expected.
+        ValueError: with the name, the value and the expected values.
     """
     value = freeze(value)
     _integer(name, value, ParameterLimits(at_least=at_least))

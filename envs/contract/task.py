@@ -1,42 +1,42 @@
-"""The contract that every task keeps.
+"""The contract of every task.
 
 A *task* is one estimation problem, written once for N independent episodes side by side. ``gym.Env`` is the
 task with N = 1, the vector environment is the task with N, an evaluation is the task with N = Monte Carlo
-runs. A task knows nothing of Gymnasium and owns no random generator: numbers come in, states come out.
+runs. A task does not depend on Gymnasium and has no random generator: numbers come in, states come out.
 
-It is made of two halves, and the :class:`Measurement <.model.Episode>` is the only door between them:
+It has two halves, and the :class:`Measurement <.model.Episode>` is the only connection between them:
 
 * the :class:`World` draws the episode, moves the truth and returns the readings of the sensors;
-* a :class:`~.filter.Filter` predicts and estimates. A task brings a :class:`~.filter.Bank` for each control, which
-  also shows what it has found and is steered by an action; :meth:`.Model.with_filter` puts any other filter in its
-  place. No filter that competes receives the truth, nor anything else that the world keeps.
+* a :class:`~.filter.Filter` predicts and estimates. A task declares a :class:`~.filter.Bank` for each control, which
+  also gives the observation and is steered by an action; :meth:`.Model.with_filter` replaces it with any other
+  filter. No competing filter receives the truth, nor any other state of the world.
 
 The clock of every task:
 
 ====  ==============================================================  =========================
- 1    the truth moves on; the sensors say where it seems to be        :meth:`World.advance`
+ 1    the truth advances; the sensors measure it                      :meth:`World.advance`
  2    the filter predicts to that time; innovations and likelihoods   :meth:`Filter.predict`
- 3    the agent is shown them                                         :meth:`.Model.observe`
- 4    the filter takes *that same* measurement in, by the action      :meth:`Filter.update`
+ 3    the agent observes them                                        :meth:`.Model.observe`
+ 4    the filter updates with *that same* measurement and the action :meth:`Filter.update`
  5    the estimate is compared with the truth                         :meth:`World.cost`
 ====  ==============================================================  =========================
 
 ``begin`` makes the episode at the start of the track, as if step 4 had just happened: :meth:`World.begin`
-gives the initial estimate, :meth:`Filter.start` takes it. A reset is ``begin``, 1, 2, 3; an
+gives the initial estimate to :meth:`Filter.start`. A reset is ``begin``, 1, 2, 3; an
 environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation shows a
 real measurement that is not acted on.
 
-A :class:`Task` is what an author declares; :class:`TaskBase` holds what follows from it, the parameters,
-the constants computed of them and its world. What goes with a problem beside its declaration, such as the format of its
-logs or its picture, is a companion, see :mod:`~.companions`. What runs is a :class:`~.model.Model`: a task with a
-filter in the loop.
+A :class:`Task` is the declaration of an author; :class:`TaskBase` derives the rest from it: the parameters, the
+constants computed from them and the world. Optional objects beside the declaration, such as the format of the logs or
+the picture, are companions, see :mod:`~.companions`. The engine runs a :class:`~.model.Model`: a task with a filter in
+the loop.
 
 Arrays inside a task have the batch as their last axis and belong to the namespace ``task.xp`` (NumPy or
 torch). Truth, measurement and the filter's state are NamedTuples of arrays ``(..., N)`` and are never changed
 in place.
 
-A closed loop adds one arrow back, from the estimate to the world, and names it: what :meth:`Task.feedback`
-returns is given to the next :meth:`World.advance`. Each filter then flies a truth of its own, on the same noise.
+A closed loop adds a path back from the estimate to the world: the result of :meth:`Task.feedback` is an argument of
+the next :meth:`World.advance`. Each filter then has a truth of its own, on the same noise.
 """
 
 import ast
@@ -54,7 +54,7 @@ from .task_base import TaskBase
 from .world import World
 
 Banks = Mapping[str, type[Bank[Any, Any, Any]]]
-"""Of each control, the bank that it steers."""
+"""Bank of each control."""
 
 
 class Component(NamedTuple):
@@ -63,9 +63,9 @@ class Component(NamedTuple):
     name: str
     unit: str
     period: float | None = None
-    """Of an angle, in its unit: errors are the shortest differences. None: it is no angle."""
+    """Period of an angle, in its unit: errors are the shortest differences. None: it is no angle."""
     group: str = ""
-    """Of components taken together, such as ``position``: the root of their summed squares; empty where alone."""
+    """Group of components combined into one error, such as ``position``: the root of their summed squares; empty: none."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ class Scenario:
     training: bool = False
     """Whether agents may be trained and policies tuned on it."""
     flights: tuple[str, ...] = ()
-    """Where every episode flies one of several: name of each, and where pieces of one flight are flown, that several
-    times."""
+    """Names of the flights, of which every episode flies one; the name of a flight is repeated for each of its
+    pieces."""
     notes: tuple[str, ...] = ()
     """Notes on where it comes from, a line each."""
     recording: Any = None
@@ -100,43 +100,43 @@ class Reward(NamedTuple):
     """Cost of an estimate, and the reward for it."""
 
     cost: str
-    """What the cost is and its unit, in words."""
+    """Meaning and unit of the cost, in words."""
     kind: str = "cost"
-    """Of the reward that agents get unless another one is asked for, see :mod:`.reward`."""
+    """Default kind of reward, see :mod:`.reward`."""
     unit: float = 1.0
-    """Mean cost of the paper's algorithm in the default scenario, as far as it counts: one in the reward. Where few
-    lost tracks rule that mean, something between them and the median."""
+    """Mean cost of the paper's algorithm in the default scenario, as far as the reward counts it: the unit of the reward. Where
+    few lost tracks dominate that mean, a value between it and the median."""
     log_unit: float | None = None
     """Unit of the reward ``log-relative``, about the cost of an ordinary episode, where that is far below ``unit``;
-    None where it is the same."""
+    None where it equals ``unit``."""
 
 
 class Task(TaskBase):
     """One estimation problem for N independent episodes; see the module's description.
 
     Subclasses declare the class attributes below and compute in :meth:`set_up` the constants that world and
-    banks share. Their class docstring is the environment's documentation. What follows from the declaration stands in
-    :class:`TaskBase`.
+    banks share. Their class docstring is the environment's documentation. :class:`TaskBase` derives the rest from the
+    declaration.
     """
 
     id: ClassVar[str]
     """Gymnasium id, with version."""
     interface: ClassVar[int] = 1
-    """Raised whenever fields or actions come to mean something else under the same names: agents that were trained
-    before are then refused."""
+    """Version of the meanings of fields and actions. An author increases it when they change under the same names:
+    agents that were trained before are then refused."""
     Parameters: ClassVar[type]
     """Frozen dataclass of every constant; its fields are keywords of ``gym.make``."""
     World: ClassVar[type[World[Any, Any, Any]]]
     """Truth and sensors."""
     banks: ClassVar[Banks]
-    """What the action can steer, and the bank that it steers; the first is the default."""
+    """Controls and the bank of each; the first is the default."""
     controls: ClassVar[tuple[str, ...]]
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     reward: ClassVar[Reward]
     """Cost of an estimate, and the reward for it."""
     components: tuple[Component, ...]
-    """What is estimated. This and the two attributes below may be set for each instance."""
+    """Components of the estimate. This and the two attributes below may be set for each instance."""
     modes: tuple[str, ...] = ()
     """Names of the hypotheses of the bank; their probabilities are recorded when a bank reports them."""
     paper_policy: PaperPolicy
@@ -150,16 +150,16 @@ class Task(TaskBase):
             cls.controls = tuple(cls.banks)
 
     def set_up(self) -> None:
-        """Compute the constants that world and banks share; most tasks have some, none must."""
+        """Compute the constants that world and banks share; optional."""
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
-        """Report what an estimate gives back to the world, in a closed loop. A filter may give back something else, see
+        """Return the feedback of an estimate to the world, in a closed loop. A filter may give back something else, see
         :meth:`.Filter.feedback`.
 
         Args:
             mean: of the estimate, ``(C, N)``.
             covariance: that is reported for it, ``(C, C, N)``.
-            measurement: that it has taken in, or the initial estimate.
+            measurement: of the last update, or the initial estimate.
         """
         return None
 

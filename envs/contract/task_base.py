@@ -16,7 +16,7 @@ from .observation import Array
 
 
 class NoiseLayout(NamedTuple):
-    """Numbers of random numbers of an episode.
+    """Counts of the random numbers of an episode.
 
     At its start these are ``uniforms`` numbers between 0 and 1 for the scenario and ``initial_normals`` standard normal
     ones for the start of the track, then one row for each measurement: ``normals`` standard normal numbers followed by
@@ -33,7 +33,7 @@ class TaskBase(ABC):
     """Parts that are computed from the declaration of a task: its parameters on arrays, its world, and how its episodes
     run.
 
-    An author writes none of it; the declaration is :class:`~.task.Task`.
+    The author of a task writes only the declaration, :class:`~.task.Task`.
 
     Args:
         parameters: an instance of the task's ``Parameters``.
@@ -54,14 +54,14 @@ class TaskBase(ABC):
     has_truth: bool
     """Whether true values are known: a recording may lack them, and then there are no errors and no costs."""
     has_whole_truth: bool
-    """Whether every component's is, at every measurement: a recording may lack some, which are NaN. What they would be
-    compared with is then left out of errors, and rewards, which need all, are zero."""
+    """Whether the true value of every component is known at every measurement. A recording may lack some, which are
+    NaN: the errors then omit these components, and rewards, which need all of them, are zero."""
     flights: tuple[int, ...] = ()
-    """Where every episode flies one of several, measurements acted on in each of them, all multiples of
-    ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
+    """Measurements acted on in each flight, of which every episode flies one, all multiples of ``decision_interval``;
+    the longest is the horizon. The first uniform number of the episode draws the flight."""
     closes_loop: bool
-    """Whether an estimate decides what is measured next: where :meth:`.Task.feedback` is written, unless ``set_up``
-    has other parameters; never in a recording."""
+    """Whether an estimate changes the next measurement: where :meth:`.Task.feedback` is defined, unless ``set_up``
+    sets it otherwise; never in a recording."""
     world: Any
     """The :class:`~.world.World`, simulated or replayed."""
     noise: NoiseLayout
@@ -87,7 +87,7 @@ class TaskBase(ABC):
             self.world = recording.world(self)
         self.noise = self._noise_layout()
 
-    # what the declaration gives, see :class:`~.task.Task`
+    # attributes of the declaration, see :class:`~.task.Task`
     World: ClassVar[Any]
     components: tuple[Any, ...]
 
@@ -97,14 +97,14 @@ class TaskBase(ABC):
 
     @abstractmethod
     def _writes_feedback(self) -> bool:
-        """Return whether the declaration gives something back to the world."""
+        """Return whether the declaration defines a feedback to the world."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Share the task: nothing in it changes."""
+        """Share the task, which never changes."""
         return self
 
     def __reduce__(self) -> Any:
-        """Pickle what it is made of; a module, its array namespace, cannot be."""
+        """Pickle the arguments of the task; its array namespace, a module, cannot be pickled."""
         return _remake, (type(self), self.parameters, self.xp.__name__, self.device, self.recording)
 
     def on(self, xp: ModuleType, device: Any = None) -> Self:
@@ -126,7 +126,7 @@ class TaskBase(ABC):
         return {i: one.period for i, one in enumerate(self.components) if one.period is not None}
 
     def subtract(self, estimate: Array, truth: Array) -> Array:
-        """Estimate minus truth, ``(C, ...)`` each; of an angle the shortest difference."""
+        """Return estimate minus truth, ``(C, ...)`` each; of an angle the shortest difference."""
         return shorten(estimate - truth, self.periods)
 
     def _noise_layout(self) -> NoiseLayout:
@@ -138,8 +138,8 @@ class TaskBase(ABC):
 
     @property
     def interval(self) -> float | None:
-        """Seconds from one measurement to the next, where all of them are that far apart, and the first that far from
-        the start of the track; None where they come at times of their own, or the times are not known.
+        """Constant time between measurements, s, also from the start of the track to the first one; None where the
+        times vary or are unknown.
 
         It is the parameter ``sampling_interval`` where there is one, unless a recording has another.
         """

@@ -34,19 +34,19 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     """Parameters that only the simulated world reads and that are too much for a recording, such as tables."""
     received_field: ClassVar[str] = ""
     """Field of the measurement whose values are received only where its field ``available`` is above zero, of the same
-    shape or ``(N,)``; empty where everything is received."""
+    shape or ``(N,)``; empty where every value is received."""
     reading_field: ClassVar[str] = ""
     """Field of the measurement that sensors read with errors; empty: the received field."""
     stated_field: ClassVar[str] = ""
     """Field that states how large these errors are, variances where its name contains the word, else deviations;
-    empty where a measurement does not say."""
+    empty where a measurement does not state it."""
     elapsed_field: ClassVar[str] = ""
     """Field with the s since the last measurement that was received; empty where there is none."""
     cost_remedy: ClassVar[str] = ""
-    """What an author may change where a component of the truth is unknown, in words that follow a list of columns."""
+    """Remedy for an unknown component of the truth, in words that follow a list of columns."""
 
     disturbances: Disturbances = Disturbances(())
-    """What it may do to its sensors."""
+    """Disturbances that the world may apply to its sensors."""
 
     def __init__(self, task: TaskT) -> None:
         self.task = task
@@ -58,7 +58,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """Return the truth at the start of the track, and the initial estimate given to every filter.
 
         Args:
-            draws: what fixes the scenario of each episode.
+            draws: random numbers that fix the scenario of each episode.
             normals: ``(initial_normals, N)``, the errors of the track's start.
 
         Returns:
@@ -67,12 +67,12 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     @abstractmethod
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
-        """Step 1: the truth moves on and the sensors answer.
+        """Step 1: advance the truth and return it with the readings of the sensors.
 
         Args:
-            truth: at the measurement before.
+            truth: at the previous measurement.
             noise: ``(normals + row_uniforms, N)``.
-            feedback: of a closed loop, what :meth:`.Task.feedback` returned; else None.
+            feedback: in a closed loop, the result of :meth:`.Task.feedback`; else None.
         """
 
     def state(self, truth: Truth) -> Array:
@@ -81,10 +81,10 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return state
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
-        """Return a measurement as an estimator is given it: NaN in place of every value that was not received.
+        """Replace every value that was not received with NaN, for an estimator.
 
-        The filters of a bank weigh a value by its availability, so its number does not matter to them. An estimator
-        that overlooks the availability must not take that number for a measurement. Here the values of
+        The filters of a bank weight a value by its availability, so its number does not matter to them. An estimator
+        that ignores the availability must not use that number as a measurement. By default the values of
         ``received_field`` are replaced.
 
         Args:
@@ -98,8 +98,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return replaced
 
     def add_recorded_fields(self, measurement: Measurement) -> Measurement:
-        """Return a measurement with zeros in the fields, None else, that only recordings may hold; by default there are
-        none.
+        """Replace None with zeros in the fields that only recordings may contain; by default there are no such fields.
 
         Args:
             measurement: of :meth:`advance`.
@@ -109,13 +108,13 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     def component_readings(self, measurement: Measurement) -> Array | None:
         """Return the readings of the task's components, ``(C, N)`` in their units, for pictures.
 
-        NaN where they say nothing; None, as here, where what is measured is no component at all.
+        NaN where there is no reading; None, as by default, where the measured quantity is no component.
         """
         return None
 
     def component_deviations(self, measurement: Measurement) -> Array | None:
         """Return the standard deviations that are stated for the errors of :meth:`component_readings`, in the same
-        form; None where that is None.
+        shape; None where those are None.
         """
         return None
 
@@ -134,7 +133,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     def error_cost(self, error: Array) -> Array:
         """Return the cost of an error of the estimate alone, ``(N,)``; :meth:`cost` then need not be
-        written, and recordings of the task can be judged.
+        defined, and recordings of the task can be evaluated.
 
         Args:
             error: estimate minus truth, ``(C, N)``, in the units of the task's components.
@@ -142,7 +141,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         raise NotImplementedError(f"{type(self).__name__} needs error_cost, or a cost of its own")
 
     def cost(self, truth: Truth, mean: Array) -> Array:
-        """Step 5: what an estimate costs, uncapped, ``(N,)``.
+        """Step 5: return the cost of an estimate, uncapped, ``(N,)``.
 
         A squared error in units of the sensor's nominal variance (:meth:`error_cost`), or, where the estimate drives a
         control loop, the quadratic cost of the loop in a fixed unit.
@@ -155,7 +154,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
         """Return the part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it,
-        unless some is known not to be its fault.
+        except a part that the estimate is known not to cause.
 
         Args:
             truth: at the measurement that the estimate is for.
@@ -164,11 +163,11 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.cost(truth, mean)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Report what an evaluation keeps of the truth at each measurement: arrays ``(N,)``."""
+        """Return further records of the truth at each measurement, for an evaluation: arrays ``(N,)``."""
         return {}
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Report what was drawn for the episode, and what of it holds now: finite arrays ``(..., N)`` of one shape
-        throughout; -1 where a time is one of what does not happen.
+        """Return the random draws of the episode, and those in force now: finite arrays ``(..., N)`` of constant
+        shape. The time of an event that does not occur is -1.
         """
         return {}

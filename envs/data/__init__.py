@@ -1,5 +1,5 @@
-"""Data from outside: recordings and trajectories that take the place of a simulated world, and the one door, with
-limits, for foreign files.
+"""Data from outside: recordings and trajectories that replace a simulated world, and the reading of foreign files under
+limits.
 
-Knows the contract. Begin with :mod:`.recording`, what every log becomes. The readers of logs stand in :mod:`..logs`.
+Imports the contract. Begin with :mod:`.recording`, the form of every log. The readers of logs are in :mod:`..logs`.
 """

@@ -1,9 +1,10 @@
-"""Times as numbers: seconds of a log or since 1970, and in which unit."""
+"""Times as numbers: seconds of a log or since 1970, and their unit."""
 
 SINCE_1970 = 1e8
-"""s, from which on a time in seconds is one since 1970: a log of three years begins with zero, a date after 1973."""
+"""Smallest time that counts from 1970, s: that of a log of three years from zero on is below it, a date after 1973
+above."""
 TIME_UNITS = 1e9, 1e6, 1e3
-"""Of a second, in which numbers since 1970 may count."""
+"""Units per second of times since 1970."""
 
 
 def time_unit(time: float) -> float:

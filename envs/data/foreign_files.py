@@ -1,8 +1,8 @@
-"""The one door for files from outside: each is opened, measured and parsed here, under one set of limits.
+"""Reading of files from outside: each is opened, measured and parsed here, under one set of limits.
 
-What was opened must be a file, no device, pipe or folder, and no larger than its reader takes. JSON is counted before
-it is parsed. Whatever a library of others parses (NetCDF-4, Parquet, ULog, bags, SQLite, YAML) is parsed in a process
-of its own (:mod:`.foreign_parsers`) with limits of memory and of processor time, which hands back plain arrays.
+The path must be a file, no device, pipe or folder, and no larger than its reader accepts. JSON is counted before it is
+parsed. Formats that need other libraries (NetCDF-4, Parquet, ULog, bags, SQLite, YAML) are parsed in a process of their
+own (:mod:`.foreign_parsers`) with limits of memory and of processor time, which returns plain arrays.
 
 A file that breaks a limit is refused in one sentence, with the way to raise it: ``FILTERGYM_READ_MEMORY`` in MB and
 ``FILTERGYM_READ_SECONDS`` in the environment.
@@ -29,30 +29,30 @@ from . import foreign_parsers
 MEMORY, SECONDS = "FILTERGYM_READ_MEMORY", "FILTERGYM_READ_SECONDS"
 """Environment variables that raise the limits."""
 MOST_BYTES = 1_000_000_000
-"""Of a file that is read row by row."""
+"""Largest size of a file that is read row by row, bytes."""
 MOST_NUMBERS = 50_000_000
-"""Of a recording: 400 MB; to replay it takes twice as much again."""
+"""Most numbers of a recording: 400 MB; replaying it needs twice as much again."""
 BYTES_OF_VALUE = 100
-"""What a value of JSON takes at most, beside its text and its container."""
+"""Largest memory of a value of JSON, beside its text and its container, bytes."""
 BYTES_OF_CONTAINER = 160
 SECONDS_OF_MEGABYTE = 0.5
-"""s that a megabyte of a file may take beside the limit: a bag of a million messages is honest, and slow."""
+"""Processor time per megabyte of a file beyond the limit, s: a valid bag of a million messages is slow."""
 
 
 class ReadingLimits(NamedTuple):
     """Limits of reading one file."""
 
     memory: int
-    """Bytes."""
+    """Memory, bytes."""
     seconds: float
-    """s of processor time, and for large files some more."""
+    """Processor time, s; large files get more."""
 
 
 def limits() -> ReadingLimits:
     """Return the limits in force.
 
     Raises:
-        ValueError: if an environment variable is no limit.
+        ValueError: if an environment variable is not a valid limit.
     """
     found = []
     for name, otherwise in ((MEMORY, 512.0), (SECONDS, 5.0)):
@@ -67,7 +67,7 @@ def limits() -> ReadingLimits:
 
 
 def refuse_memory(what: str) -> ValueError:
-    """Return the error for a file that needs more memory than it may take; ``what`` names what needs it."""
+    """Return the error for a file that needs more memory than the limit; ``what`` names the part that needs it."""
     most = limits().memory / 1e6
     return ValueError(
         f"{what}, and reading a file may take {most:,.0f} MB: split it, or set {MEMORY}={2 * most:.0f} (MB) if you "
@@ -77,18 +77,18 @@ def refuse_memory(what: str) -> ValueError:
 
 @contextlib.contextmanager
 def open_foreign(path: Path, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
-    """Open a file for reading, if what was opened is one and is not too large.
+    """Open a file for reading, if it is a regular file and not too large.
 
     Args:
-        path: of it.
-        most: bytes that it may have.
+        path: path of the file.
+        most: largest size, bytes.
 
     Raises:
         FileNotFoundError: if there is none.
         ValueError: if it is a device, a pipe or a folder, is larger, or cannot be opened.
     """
     try:
-        # Without O_NONBLOCK to open a pipe would wait for a writer.
+        # Without O_NONBLOCK, opening a pipe would wait for a writer.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except FileNotFoundError:
         raise
@@ -109,10 +109,10 @@ def _size(count: int) -> str:
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether there is a folder of this name; not for a name that no folder can have."""
+    """Return whether there is a folder of this name; False for a name that no folder can have."""
     try:
         return path.is_dir()
-    except (OSError, ValueError):  # a name that no file can have
+    except (OSError, ValueError):  # an impossible name of a file
         return False
 
 
@@ -120,8 +120,8 @@ def read_content(path: Path, most: int | None = None) -> bytes:
     """Return the bytes of a file.
 
     Args:
-        path: of it.
-        most: bytes that it may have; default: the limit of memory.
+        path: path of the file.
+        most: largest size, bytes; default: the limit of memory.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -130,7 +130,7 @@ def read_content(path: Path, most: int | None = None) -> bytes:
     most = limits().memory if most is None else most
     with open_foreign(path, most) as file:
         content = file.read(most + 1)
-    if len(content) > most:  # it grew, or the system does not say how large it is
+    if len(content) > most:  # it grew, or the system does not report its size
         raise ValueError(f"it is larger than {_size(most)}: split it")
     return content
 
@@ -139,7 +139,7 @@ def parse_json(content: bytes) -> Any:
     """Return the content of JSON, if it fits into the limit of memory.
 
     Raises:
-        ValueError: if it is none, or larger.
+        ValueError: if it is no JSON, or larger.
     """
     openings = content.count(b"{") + content.count(b"[")
     values = openings + content.count(b",") + content.count(b":")
@@ -205,12 +205,12 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
     Args:
         parser: name of one of :data:`.foreign_parsers.PARSERS`.
         path: of the file.
-        extra: what to install where its library is missing.
-        most: bytes that the file may have.
-        **options: of the parser, plain values.
+        extra: extra of this package to install where the library is missing.
+        most: largest size of the file, bytes.
+        **options: arguments of the parser, plain values.
 
     Returns:
-        What the parser returns.
+        The result of the parser.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -231,7 +231,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
             "options": options,
         }
         one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        # No plugin is loaded because a file of HDF5 names it; memory of Arrow is what is asked for, and no pool.
+        # A file of HDF5 must not load a plugin that it names; Arrow allocates from the system, without a pool.
         own = {"HDF5_PLUGIN_PRELOAD": "::", "ARROW_DEFAULT_MEMORY_POOL": "system"}
         process = subprocess.Popen(
             [sys.executable, "-I", foreign_parsers.__file__, json.dumps(request)],
@@ -263,7 +263,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
 
 
 def _explain_end(code: int, seconds: float) -> ValueError:
-    """Return the error for a parser that ended without an answer."""
+    """Return the error for a parser that ended without a result."""
     if code == 3:
         return refuse_memory("its parser needs more memory")
     if -code in (9, 24):  # SIGKILL, SIGXCPU
@@ -275,7 +275,7 @@ def _explain_end(code: int, seconds: float) -> ValueError:
 
 
 def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
-    """Return the head of an answer and its arrays; None where it is not whole."""
+    """Return the head of a result and its arrays; None for an incomplete result."""
     size = answer.read(8)
     if len(size) < 8 or int.from_bytes(size, "little") > memory:
         return None, []

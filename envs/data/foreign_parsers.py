@@ -1,13 +1,12 @@
 """Parsers of other libraries, run as a program of their own under limits of memory and processor time.
 
-:mod:`.foreign_files` starts this file with the interpreter's ``-I`` and gives it a request in JSON: which parser, the
-path, and the limits. The file to read is open as standard input. The answer goes to standard output: the length of a
+:mod:`.foreign_files` starts this file with the interpreter's ``-I`` and a request in JSON: the parser, the
+path, and the limits. The file to read is open as standard input. The result goes to standard output: the length of a
 head in eight bytes, the head in JSON, then the bytes of the arrays that the head names. Nothing of the package is
 imported here, so that a start costs a tenth of a second; a parser may use NumPy and its own library only.
 
-A parser returns plain values: numbers, words, lists, arrays, and dictionaries whose keys are of this file: names that a
-file gives stand in lists of pairs. It raises ``ValueError`` with a sentence
-for the user who gave the file.
+A parser returns plain values: numbers, words, lists, arrays, and dictionaries whose keys are defined here; names from a
+foreign file are in lists of pairs. It raises ``ValueError`` with a sentence for the user.
 """
 
 import json
@@ -19,20 +18,20 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 MOST_COLUMNS = 1000
-"""Of a table."""
+"""Most columns of a table."""
 LONGEST_NAME = 200
-"""Characters of the name of a column."""
+"""Longest name of a column, characters."""
 LONGEST_CELL = 1000
-"""Characters of a cell."""
+"""Longest cell, characters."""
 MOST_NODES = 100_000
-"""Values of a configuration, after its aliases are resolved."""
+"""Most values of a configuration, after its aliases are resolved."""
 
 
 def check_column_names(names: Sequence[str]) -> list[str]:
     """Return names of columns in lower case.
 
     Raises:
-        ValueError: if there are too many, one is too long, or they do not tell the columns apart.
+        ValueError: if there are too many, one is too long, or two are equal.
     """
     if len(names) > MOST_COLUMNS:
         raise ValueError(
@@ -52,13 +51,13 @@ def check_column_names(names: Sequence[str]) -> list[str]:
 
 
 def check_rows(count: int, most: int) -> None:
-    """Raise ValueError for a table of more rows than a table may have."""
+    """Raise ValueError for a table with too many rows."""
     if count > most:
-        raise ValueError(f"it has more than {most:,} rows: split it, or keep fewer a second")
+        raise ValueError(f"it has more than {most:,} rows: split it, or reduce the rate of its rows")
 
 
 def check_cells(name: str, cells: Any) -> None:
-    """Raise ValueError if a cell of a column, a word of it, is longer than a cell may be."""
+    """Raise ValueError if a word in a column is longer than the limit of a cell."""
     longest = max((len(cell) for cell in cells if isinstance(cell, str | bytes)), default=0)
     if longest > LONGEST_CELL:
         raise ValueError(
@@ -76,9 +75,9 @@ def parse_netcdf4(
     """Return attributes and variables of the root group.
 
     Args:
-        file: open.
-        path: of it; unused.
-        wanted: ``names``, in lower case, and ``prefix``: of the variables whose values are read; None: of all.
+        file: the open file.
+        path: path of the file; unused.
+        wanted: ``names``, in lower case, and ``prefix``: of the variables whose values are read; None: all variables.
         bytes_limit: of all values together, counted before any is read.
         numbers_limit: limit of their number.
     """
@@ -165,8 +164,8 @@ def parse_parquet(
     """Return names of all columns, and the known ones: arrays, dates, or words by their numbers.
 
     Args:
-        file: open.
-        path: of it; unused.
+        file: the open file.
+        path: path of the file; unused.
         wanted: ``names``, in lower case, and ``prefix``, of the columns that are read.
         rows_limit: of the table.
         bytes_limit: of these columns unpacked, as the file states.
@@ -191,7 +190,7 @@ def parse_parquet(
         )
         if total > bytes_limit:
             raise LimitError(f"its columns unpacked take {total / 1e6:,.0f} MB")
-    # What comes often as the same word is read as its number: a long word is not repeated a million times.
+    # Repeated words are read as numbers, so that a long word is not copied a million times.
     types = pyarrow.types
     words = [
         n
@@ -205,7 +204,7 @@ def parse_parquet(
 
 
 def _arrow_column(name: str, column: Any, pyarrow: Any) -> Any:
-    """Return a column as what a message may hold; missing numbers are NaN, missing words have the number -1."""
+    """Return a column in the types of a message; missing numbers are NaN, missing words have the number -1."""
     import numpy
 
     types, kind = pyarrow.types, column.type
@@ -242,7 +241,7 @@ def _arrow_column(name: str, column: Any, pyarrow: Any) -> Any:
 # --- logs of receivers
 
 ULOG_TOPICS = ("vehicle_gps_position", "sensor_gps")
-"""With positions of a receiver, the first that a log has."""
+"""Topics with positions of a receiver; the first in a log is read."""
 ULOG_FIELDS = (
     "timestamp", "latitude_deg", "lat", "longitude_deg", "lon", "altitude_ellipsoid_m", "alt_ellipsoid", "fix_type",
     "eph",
@@ -250,25 +249,25 @@ ULOG_FIELDS = (
 
 
 ONBOARD_TOPICS = ("vehicle_local_position", "estimator_local_position")
-"""With positions of the vehicle's own filter, the first that a log has."""
+"""Topics with positions of the vehicle's own filter; the first in a log is read."""
 ONBOARD_FIELDS = ("timestamp", "timestamp_sample", "x", "y", "ref_lat", "ref_lon", "xy_valid")
 
 
 def parse_ulog(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
     """Return the topic with positions of a log of PX4, names of all its fields, and the known ones; ``onboard`` the
-    topic and the fields of the vehicle's own filter, and nothing where there is none.
+    topic and the fields of the vehicle's own filter, empty without one.
     """
     import pyulog
 
     topics, known = (ONBOARD_TOPICS, ONBOARD_FIELDS) if onboard else (ULOG_TOPICS, ULOG_FIELDS)
     log = pyulog.ULog(file, list(topics))
-    held = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
-    chosen = min(held, key=lambda key: (topics.index(key[0]), key[1]), default=None)
+    present = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
+    chosen = min(present, key=lambda key: (topics.index(key[0]), key[1]), default=None)
     if chosen is None:
         if onboard:
             return {}
         raise ValueError(f"it holds neither {' nor '.join(topics)}")
-    data = held[chosen]
+    data = present[chosen]
     check_rows(len(data["timestamp"]), rows_limit)
     fields = {name: data[name] for name in known if name in data}
     if onboard:
@@ -280,14 +279,14 @@ def parse_ulog(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False
 FIXES = {"GPS": ("TimeUS", "Lat", "Lng", "Alt", "Status"), "GPA": ("TimeUS", "HAcc")}
 """Messages of ArduPilot with positions of a receiver, and their fields."""
 ESTIMATES = dict.fromkeys(("XKF1", "NKF1"), ("TimeUS", "PN", "PE"))
-"""Messages of the vehicle's own filter, the first that a log has: EKF3, EKF2."""
+"""Messages of the vehicle's own filter, EKF3 and EKF2; the first in a log is read."""
 ORIGINS = {"ORGN": ("TimeUS", "Type", "Lat", "Lng")}
 
 
 def parse_dataflash(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
     """Return the fixes of the first receiver in a log of ArduPilot, a column each, and the stated errors;
-    ``onboard`` the estimates of the first core of the vehicle's own filter and their origins, and nothing where there
-    are none.
+    ``onboard`` the estimates of the first core of the vehicle's own filter and their origins, empty without
+    them.
     """
     import numpy
     from pymavlink import DFReader
@@ -322,10 +321,10 @@ class _Bag(NamedTuple):
     reader: Any
     parse: Callable[[bytes, str], Any]
     digests: Callable[[str], str] | None
-    """Of a type's definition as the library knows it; None where a bag holds none."""
+    """Digests of the library's definitions of types; None where a bag contains none."""
 
     def busiest(self, kind: str) -> str:
-        """Return the topic that has most messages of a type; empty where there are none."""
+        """Return the topic with most messages of a type; empty where there are none."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             if connection.msgtype == kind:
@@ -333,7 +332,7 @@ class _Bag(NamedTuple):
         return next(iter(counts.most_common(1)), ("", 0))[0]
 
     def rows(self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int) -> Any:
-        """Return the numbers of the messages of a topic, a column each: messages take a hundred times as much.
+        """Return the numbers of the messages of a topic, a column each, since messages need a hundred times the memory.
 
         Raises:
             ValueError: if there are none or too many, or they are of another definition.
@@ -354,7 +353,7 @@ class _Bag(NamedTuple):
 
 
 def _open_bag(path: str) -> _Bag:
-    """Open a bag with types as the library knows them: definitions in a bag become code."""
+    """Open a bag with the library's definitions of types, since definitions in a bag would become code."""
     from rosbags.typesys import Stores, get_typestore
 
     reader: Any
@@ -389,8 +388,8 @@ def parse_bag(file: BinaryIO, path: str, rows_limit: int) -> Any:
         topic = bag.busiest(kind)
         if topic:
             return {"kind": kind, "topic": topic, "values": bag.rows(topic, kind, _pose_values, rows_limit)}
-    held = sorted({connection.msgtype for connection in bag.reader.connections})[:20]
-    raise ValueError(f"it holds no {NAVSAT} and no positions; it holds {', '.join(held) or 'nothing'}")
+    present = sorted({connection.msgtype for connection in bag.reader.connections})[:20]
+    raise ValueError(f"it holds no {NAVSAT} and no positions; it holds {', '.join(present) or 'nothing'}")
 
 
 def _seconds(header: Any) -> float:
@@ -398,7 +397,7 @@ def _seconds(header: Any) -> float:
 
 
 def _fix_values(fix: Any) -> tuple[float, ...]:
-    """Time, status, latitude, longitude, altitude, variances east and north, and what is known of them."""
+    """Time, status, latitude, longitude, altitude, variances east and north, and their type."""
     variances = fix.position_covariance.reshape(3, 3).diagonal()
     place = fix.latitude, fix.longitude, fix.altitude
     known = fix.position_covariance_type
@@ -462,7 +461,7 @@ LIBRARIES: Mapping[str, tuple[str, ...]] = {
     "bag": ("rosbags.rosbag1", "rosbags.rosbag2"),
     "yaml": ("yaml",),
 }
-"""That a parser imports."""
+"""Libraries that each parser imports."""
 
 
 class LimitError(Exception):
@@ -473,17 +472,17 @@ class LimitError(Exception):
 
 
 class _WithoutPandas:
-    """Finds no pandas, which Arrow would import, for 0.2 s, and needs for nothing that is asked of it here."""
+    """Import hook that hides pandas, which Arrow would import in 0.2 s and does not need here."""
 
     def find_spec(self, name: str, *_: Any) -> None:
-        """Leave every other module to those who can find it."""
+        """Leave every other module to the next finders."""
         if name == "pandas":
             raise ImportError(name)
 
 
 def _limit(memory: int, seconds: int) -> None:
-    """Limit this process to it has now and ``memory`` bytes, ``seconds`` of processor time, and
-    write no file.
+    """Limit this process to its present memory and ``memory`` bytes more, to ``seconds`` of processor time, and to
+    no written files.
     """
     try:
         import resource
@@ -499,7 +498,7 @@ def _limit(memory: int, seconds: int) -> None:
 
 
 def _plain(value: Any, arrays: list[Any]) -> Any:
-    """Return a value as JSON can say it; arrays go into a list, in their native order of bytes."""
+    """Return a value in the types of JSON; append its arrays to a list, in their native order of bytes."""
     if isinstance(value, dict):
         return {name: _plain(item, arrays) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -521,7 +520,7 @@ def _plain(value: Any, arrays: list[Any]) -> Any:
         return {"array": len(arrays) - 1, "dtype": array.dtype.str, "shape": list(array.shape)}
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise ValueError(f"it holds what is neither numbers nor words: {type(value).__name__}")
+    raise ValueError(f"it contains a value that is neither a number nor a word: {type(value).__name__}")
 
 
 def _answer(handle: int, head: Any, arrays: Sequence[Any] = ()) -> None:
@@ -536,7 +535,7 @@ def _answer(handle: int, head: Any, arrays: Sequence[Any] = ()) -> None:
 def main() -> None:
     """Parse the file of the request in the first argument."""
     request = json.loads(sys.argv[1])
-    # Libraries print what they find strange: the answer has a channel of its own.
+    # Libraries print warnings, so the result has a channel of its own.
     answers = os.dup(1)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
@@ -560,7 +559,7 @@ def main() -> None:
         head, arrays = {"memory": str(error)}, []
     except MemoryError:
         head, arrays = {"memory": "its parser needs more memory"}, []
-    except Exception as error:  # libraries raise whatever a broken file makes them stumble over
+    except Exception as error:  # libraries raise any error for a broken file
         text = " ".join(str(error).split())[:300] or type(error).__name__
         short = "alloc" in text.lower() or "memory" in text.lower()
         head, arrays = {"error": text, "own": type(error) is ValueError}, []

@@ -1,5 +1,5 @@
-"""Worlds that replay a recording or take what comes from outside, in place of a task's own; and what a task measures,
-asked by measuring once.
+"""Worlds that replay a recording or take live measurements, in place of a task's own; and examples of the measurements
+of a task.
 """
 
 import math
@@ -22,9 +22,9 @@ class Replayed(NamedTuple):
     """Place of an episode in the tables of a recording."""
 
     number: Array
-    """Of the recording, ``(N,)``, as a float, like all that follows."""
+    """Number of the recording, ``(N,)``, as a float, like all fields below."""
     count: Array
-    """Measurements so far."""
+    """Number of measurements so far."""
     first: Array
     """Column of the first measurement."""
     last: Array
@@ -39,7 +39,7 @@ class RecordedArrays(NamedTuple):
     truth: numpy.ndarray | None
     seconds: numpy.ndarray
     first: numpy.ndarray
-    """Column of the first measurement of each recording, ``(E,)``, and column of the last."""
+    """Columns of the first and of the last measurement of each recording, ``(E,)``."""
     last: numpy.ndarray
 
 
@@ -49,8 +49,8 @@ def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
     Args:
         task: on NumPy arrays.
-        names: of the arrays of a recording; where one is of a field that only recordings hold, the measurement has
-            these fields, too.
+        names: of the arrays of a recording; where one is a field that only recordings contain, the measurement has
+            these fields too.
     """
     world = task.World(task)
     draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
@@ -69,11 +69,11 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
     """Return an example of the start of the track and of a measurement; arguments of :func:`measure_examples`.
 
     Raises:
-        ValueError: if what is measured depends on what is estimated.
+        ValueError: if the measurements depend on the estimates.
     """
     if task.closes_loop:
         raise ValueError(
-            f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
+            f"{task.id} with these parameters is a closed loop, in which the estimate changes the next measurement: "
             "readings depend on the estimate in the loop, so that they can be neither "
             "recorded nor replayed"
         )
@@ -81,7 +81,7 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
 
 def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
-    """Put other arrays into nested NamedTuples, in the types of their own.
+    """Replace the arrays of nested NamedTuples by others, converted to their types.
 
     Args:
         like: a measurement, or an initial estimate.
@@ -103,7 +103,7 @@ class _ForeignWorld(World[Task, Any, Any]):
     """Readings of real sensors, in place of a task's own world.
 
     Attributes:
-        simulated: the task's own world, which knows what an error costs.
+        simulated: the task's own world, which computes the cost of an error.
     """
 
     def __init__(self, task: Task) -> None:
@@ -111,7 +111,7 @@ class _ForeignWorld(World[Task, Any, Any]):
         self.simulated: World[Any, Any, Any] = task.World(task)
 
     def mask_missing(self, measurement: Any) -> Any:
-        """Return a measurement with NaN in place of what was not received, as the task's own world does."""
+        """Return a measurement with NaN in place of values that were not received, by the task's own world."""
         return self.simulated.mask_missing(measurement)
 
     def component_readings(self, measurement: Any) -> Array | None:
@@ -131,9 +131,9 @@ class RecordedWorld(_ForeignWorld):
     """Recorded readings, in place of a task's own world.
 
     Args:
-        task: of which.
-        tables: of a recording.
-        name: of the recording, in errors.
+        task: the task.
+        tables: arrays of a recording.
+        name: name of the recording, for errors.
     """
 
     initial_normals = 1
@@ -145,31 +145,31 @@ class RecordedWorld(_ForeignWorld):
         plain = type(task)(task.parameters)
         self._initial, self._measurement = measure_once(plain, tables.measurements)
         # RecordedArrays of NumPy are read by compiled code as they are.
-        kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
+        convert = task.constant if "torch" in task.xp.__name__ else numpy.asarray
         self.tables: RecordedArrays = RecordedArrays(
-            {name: kept(values) for name, values in tables.measurements.items()},
-            {name: kept(values) for name, values in tables.initial.items()},
-            None if tables.truth is None else kept(tables.truth),
-            kept(tables.seconds),
-            kept(tables.first),
-            kept(tables.last),
+            {name: convert(values) for name, values in tables.measurements.items()},
+            {name: convert(values) for name, values in tables.initial.items()},
+            None if tables.truth is None else convert(tables.truth),
+            convert(tables.seconds),
+            convert(tables.first),
+            convert(tables.last),
         )
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:
-        """Draw a recording, and tell of its start."""
+        """Draw a recording, and return its start."""
         number = draws.integer("recording", (0, len(self.tables.first) - 1))
         first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
         initial = self._fill(self._initial, self.tables.initial, number)
         return Replayed(number, 0.0 * number, first, last), initial
 
     def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
-        """Go on to the next measurement; at the end the last one is repeated."""
+        """Advance to the next measurement; at the end the last one is repeated."""
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
 
     def all_observations(self) -> tuple[Array | None, Array | None]:
-        """Return the readings of the components in all measurements of all episodes, and its stated deviation,
-        ``(C, measurements)``; None where it is no component.
+        """Return the readings of the components in all measurements of all episodes, and their stated deviations,
+        ``(C, measurements)``; None where the measurement is of no component.
         """
         columns = self.xp.arange(self.tables.seconds.shape[-1])
         measurement = self._fill(self._measurement, self.tables.measurements, columns)
@@ -187,7 +187,7 @@ class RecordedWorld(_ForeignWorld):
         return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
 
     def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
-        """Return a NamedTuple of arrays of the tables, in the form of another."""
+        """Return a NamedTuple of arrays of the tables, in the types of another."""
         return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
 
     def state(self, truth: Replayed) -> Array:
@@ -211,15 +211,15 @@ class RecordedWorld(_ForeignWorld):
 
 @dataclass(frozen=True)
 class Feed:
-    """Stands in a task in a recording's place: measurements come from outside, and the truth is unknown.
+    """Source of live measurements, in place of a recording; the truth is unknown.
 
     Args:
-        regular: whether every measurement comes, one sampling interval after the one before.
-        second_sensor: whether a measurement has the fields that only recordings hold.
-        deviations: of measurements that come without, in the names and units of the columns of a log.
-        scan_interval: s; where more time passes between two measurements, scans between have missed the target; None:
-            the time between is one step.
-        origin: around which latitude and longitude become metres; None: they are not taken.
+        regular: whether every measurement comes, one sampling interval after the previous one.
+        second_sensor: whether a measurement has the fields that only recordings contain.
+        deviations: of measurements that state none, by the names and in the units of the columns of a log.
+        scan_interval: time between scans, s; a longer time between two measurements contains missed scans. None: the
+            time between is one step.
+        origin: origin of the conversion of latitude and longitude into metres; None: they are not accepted.
     """
 
     regular: bool = False
@@ -231,17 +231,15 @@ class Feed:
     has_whole_truth: ClassVar[bool] = False
 
     def has_interval(self, seconds: float) -> bool:
-        """Return whether measurements come that many seconds apart; where times do not matter to the filters, they
-        do.
-        """
+        """Return whether measurements come that many seconds apart; True where the filters do not use times."""
         return True
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
-        """No episodes: it goes on as long as measurements come."""
+        """Return no lengths: live measurements have no episodes."""
         return ()
 
     def world(self, task: Task) -> "LiveWorld":
-        """Return the world of what comes."""
+        """Return the world of live measurements."""
         return LiveWorld(task, self.second_sensor)
 
 
@@ -250,11 +248,11 @@ class Unknown(NamedTuple):
 
 
 class LiveWorld(_ForeignWorld):
-    """Live measurements in place of a task's own world: numbers of a measurement stand in place of its noise.
+    """Live measurements in place of a task's own world: the noise argument contains the numbers of a measurement.
 
     Args:
-        task: whose world it is.
-        second_sensor: whether a measurement has the fields that only recordings hold.
+        task: the task.
+        second_sensor: whether a measurement has the fields that only recordings contain.
 
     Attributes:
         initial: an initial estimate, for its names, shapes and types.
@@ -269,17 +267,15 @@ class LiveWorld(_ForeignWorld):
         self.normals: int = _count_numbers(self.measurement)
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Unknown, Any]:
-        """Make an initial estimate of its numbers."""
+        """Make an initial estimate from its numbers."""
         return Unknown(), self._fill(self.initial, normals)
 
     def advance(self, truth: Unknown, noise: Array, feedback: None) -> tuple[Unknown, Any]:
-        """Make a measurement of its numbers."""
+        """Make a measurement from its numbers."""
         return truth, self._fill(self.measurement, noise)
 
     def _fill(self, like: Any, numbers: Array) -> Any:
-        """Return a NamedTuple of arrays in the form of another, of their numbers one array after the other,
-        ``(numbers, N)``.
-        """
+        """Return a NamedTuple of arrays like another, from the numbers of all its arrays in order, ``(numbers, N)``."""
         parts, first = {}, 0
         for name, array in named_arrays(like):
             last = first + math.prod(array.shape[:-1])

@@ -1,15 +1,15 @@
 """Recorded measurements in place of a simulated world: readings of real sensors, replayed to any policy.
 
-A :class:`Recording` holds episodes of one environment: every array of its ``Measurement``, the initial estimate of the
-start of the track, the times, and the truth where it is known. As a scenario it puts a :class:`.RecordedWorld` in the
-place of the task's own: an episode replays one recording, which its first uniform number draws. Banks,
-estimators, backends and evaluations know nothing of it.
+A :class:`Recording` contains episodes of one environment: every array of its ``Measurement``, the initial estimate of
+the start of the track, the times, and the truth where it is known. As a scenario it replaces the task's own world by a
+:class:`.RecordedWorld`: an episode replays one recording, which its first uniform number draws. Banks,
+estimators, backends and evaluations are the same as in a simulation.
 
-What the arrays are, the environment is asked: it measures once, and the recording must have arrays of the same names
-and shapes. So this module is the same for every task whose measurements do not depend on what is estimated. In a closed
+The environment determines the arrays: it measures once, and the recording must have arrays of the same names and
+shapes. So this module is the same for every task whose measurements do not depend on the estimates. In a closed
 loop they do, and no recording has the readings that another estimate would have caused.
 
-Where there is no truth there is no error and no cost, and rewards are zero.
+Without truth there are no errors and no costs, and rewards are zero.
 """
 
 import dataclasses
@@ -36,32 +36,32 @@ class Recording(ScenarioData):
     """Recorded episodes of one environment, E of them; the longest has T measurements.
 
     Args:
-        environment: its id.
+        environment: id of the environment.
         measurements: every array of the environment's ``Measurement`` by its name, ``(E, T, ...)``.
         initial: every array of the initial estimate given to every filter, ``(E, ...)``.
         seconds: times since the start of the track, s, ``(E, T)``; NaN beyond the end of an episode.
         lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation shows it,
             otherwise the last measurement again.
-        truth: true values of the task's components in their units, ``(E, T, C)``; NaN where one is not known, None
-            where none is.
+        truth: true values of the task's components in their units, ``(E, T, C)``; NaN for an unknown one, None
+            where all are unknown.
         names: of the episodes; default: their numbers.
         parameters: of the environment, where they differ from the defaults; a horizon makes episodes shorter.
-        name: of the whole, in reports.
-        source: where the data come from, in words.
-        licence: of the data, in words.
+        name: name of the recording, for reports.
+        source: source of the data, in words.
+        licence: licence of the data, in words.
         notes: remarks on the reading, a line each.
-        log_time: times of the measurements as they stand in the log, numbers or words, ``(E, T)``; NaN or empty where
-            the log has no row. None: there is no other time than ``seconds``.
-        started: from the first measurement of the log to the start of the track, s, ``(E,)``; default: zero.
-        typical: parameters that follow from what the log states of its errors, where the user does not name them.
-        columns: names in the log of the columns that were read, by what they are called here.
-        deviations: typical deviations of what was measured, see :class:`.TrackLog`.
+        log_time: times of the measurements as in the log, numbers or words, ``(E, T)``; NaN or empty where
+            the log has no row. None: the only times are ``seconds``.
+        started: time from the first measurement of the log to the start of the track, s, ``(E,)``; default: zero.
+        typical: parameters from the errors that the log states, where the user does not set them.
+        columns: names in the log of the columns that were read, by their names here.
+        deviations: typical deviations of the measured values, see :class:`.TrackLog`.
         deviations_from: source of the deviations.
         origin: latitude and longitude, degrees, and usual altitude, m, around which positions of the first episode were
             made metres; empty where they were metres.
 
     Raises:
-        ValueError: for arrays that do not fit each other, or are not finite where they must be.
+        ValueError: for arrays with inconsistent shapes, or are not finite where they must be.
     """
 
     environment: str
@@ -125,19 +125,19 @@ class Recording(ScenarioData):
                 f"after {times[wrong]:g} s"
             )
         if self.truth is not None and numpy.isinf(self.truth[episode, :rows]).any():
-            raise ValueError(f"recording {name!r}: truth is infinite; what is not known of it is NaN")
+            raise ValueError(f"recording {name!r}: truth is infinite; write NaN for unknown values")
         for what, values in self.measurements.items():
             if not numpy.isfinite(values[episode, :rows]).all():
                 raise ValueError(
-                    f"recording {name!r}: {what} is not finite at measurement {_first(values[episode]) + 1}; what is "
-                    "missing has the value zero, where the environment can say so"
+                    f"recording {name!r}: {what} is not finite at measurement {_first(values[episode]) + 1}; write "
+                    "zero for a missing value, where the environment has a flag for it"
                 )
         for what, values in self.initial.items():
             if not numpy.isfinite(values[episode]).all():
                 raise ValueError(f"recording {name!r}: initial_{what} is not finite")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
-        """Share it: nothing in it changes."""
+        """Share the recording, which never changes."""
         return self
 
     def __repr__(self) -> str:
@@ -146,9 +146,9 @@ class Recording(ScenarioData):
 
     @functools.cached_property
     def rows(self) -> numpy.ndarray:
-        """Measurements that there are of each episode, ``(E,)``."""
+        """Number of measurements of each episode, ``(E,)``."""
         there = numpy.isfinite(self.seconds)
-        # From the last one backwards: what is missing before it is a mistake, and not the end.
+        # From the last one backwards: a missing value before it is an error, and not the end.
         return self.seconds.shape[1] - numpy.argmax(there[:, ::-1], axis=1) * there.any(axis=1)
 
     @functools.cached_property
@@ -180,7 +180,7 @@ class Recording(ScenarioData):
     # --- as a scenario
 
     def fields(self) -> dict[str, Any]:
-        """Return its fields by name."""
+        """Return the fields by name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
@@ -189,14 +189,14 @@ class Recording(ScenarioData):
         return tuple((lengths - lengths % decision_interval).tolist())
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario that replays this, one recording in every episode.
+        """Make a scenario that replays this recording, one of its episodes in every episode.
 
         Args:
             cls: the environment.
-            keywords: parameters that win over those of the recording.
+            keywords: parameters that override those of the recording.
 
         Raises:
-            ValueError: if it is of another environment, or does not fit the parameters.
+            ValueError: for another environment, or parameters that do not fit the recording.
         """
         if self.environment != cls.id:
             raise ValueError(f"recording {self.name!r} is of {self.environment}, not of {cls.id}")
@@ -235,7 +235,7 @@ class Recording(ScenarioData):
         )
 
     def check_fits(self, task: Task) -> None:
-        """Raise ValueError if a task of NumPy measures other arrays than there are, or a closed loop."""
+        """Raise ValueError if a task on NumPy measures arrays that the recording has not, or has a closed loop."""
         initial, measurement = measure_once(task, self.measurements)
         for kind, prefix, example, found, leading in (
             ("measures", "", measurement, self.measurements, 2),
@@ -262,8 +262,8 @@ class Recording(ScenarioData):
                     )
         if self.truth is not None and task.World.error_cost is World.error_cost:
             raise ValueError(
-                f"recording {self.name!r} has truth, and {task.id} does not say what an error costs: give its World "
-                "the method error_cost, or leave the truth out"
+                f"recording {self.name!r} has truth, and {task.id} defines no cost of an error: give its World "
+                "the method error_cost, or omit the truth"
             )
         if self.truth is not None and self.truth.shape[2] != len(task.components):
             raise ValueError(
@@ -274,7 +274,7 @@ class Recording(ScenarioData):
             self._check_cost_known(task)
 
     def _check_cost_known(self, task: Task) -> None:
-        """Raise ValueError if what is known of the truth of some episode does not say what an error costs."""
+        """Raise ValueError if the known part of the truth of an episode does not determine the cost of an error."""
         world, rows = task.World(task), self.rows
         for episode, name in enumerate(self.names):
             nothing = 0.0 * self.truth[episode, : rows[episode]].T  # type: ignore[index]
@@ -288,7 +288,7 @@ class Recording(ScenarioData):
                 raise ValueError(
                     f"recording {name!r}: its truth lacks {', '.join(missing) or 'whole rows'}, which the cost of "
                     f"{task.id} counts: add {', '.join(f'truth_{one}' for one in missing) or 'them'}"
-                    f"{world.cost_remedy}, or leave the truth out"
+                    f"{world.cost_remedy}, or omit the truth"
                 )
 
     # --- as a file
@@ -299,18 +299,18 @@ class Recording(ScenarioData):
         return _dataset_of(self)
 
     def write(self, path: Any) -> None:
-        """Write a NetCDF file that every reader of NetCDF takes, ``read_recording`` reads and ``scenario`` names."""
+        """Write a NetCDF file, for ``read_recording`` and as the path of a scenario."""
         self.dataset.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
 
     # --- as a world
 
     def world(self, task: Task) -> RecordedWorld:
-        """Return the world that replays this."""
+        """Return the world that replays this recording."""
         return RecordedWorld(task, self.tables, self.name)
 
     @functools.cached_property
     def tables(self) -> RecordedArrays:
-        """All episodes one after another, as floats."""
+        """Arrays of all episodes one after another, as floats."""
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         ends = numpy.cumsum(self.rows)
 
@@ -331,7 +331,7 @@ class Recording(ScenarioData):
 
 
 def _dataset_of(recording: Recording) -> Any:
-    """Return a recording as it stands in a file."""
+    """Return the dataset of a recording, as in a file."""
     import xarray
 
     there = numpy.arange(recording.seconds.shape[1]) < recording.rows[:, None]
@@ -372,7 +372,7 @@ def _dataset_of(recording: Recording) -> Any:
 
 
 def recording_from(fields: Mapping[str, Any]) -> Recording:
-    """Return the recording whose fields a dictionary holds, as they come out of JSON.
+    """Return the recording from a dictionary of its fields, as read from JSON.
 
     Raises:
         ValueError: if a field is missing or unknown.
@@ -405,11 +405,11 @@ def recording_from(fields: Mapping[str, Any]) -> Recording:
 
 
 def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
-    """Put recordings of one environment side by side; those with other parameters than the first are left out.
+    """Put recordings of one environment side by side; those with other parameters than the first are omitted.
 
     Args:
         recordings: at least one.
-        name: of the whole.
+        name: name of the result.
         notes: remarks on the reading, a line each; omissions are added.
     """
     first, lines = recordings[0], list(notes)
@@ -446,8 +446,8 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
     """Put the episodes of recordings of one environment side by side.
 
     Args:
-        recordings: at least one; the truth is known if it is of all.
-        **fields: of the whole, where they are not those of the first.
+        recordings: at least one; the truth is known if it is known in all.
+        **fields: fields of the result that differ from those of the first.
     """
     first, longest = recordings[0], max(one.seconds.shape[1] for one in recordings)
 
@@ -456,7 +456,7 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
         widths = [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)]
         return numpy.pad(values, widths, constant_values=fill)
 
-    # What only some hold, such as a second sensor, is of none.
+    # Arrays of some recordings only, such as a second sensor, are omitted.
     names = [key for key in first.measurements if all(key in one.measurements for one in recordings)]
     truths = [padded(one.truth) for one in recordings if one.truth is not None]
     times = [padded(one.log_time) for one in recordings if one.log_time is not None]
@@ -480,7 +480,7 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
 
 
 def _first(values: numpy.ndarray) -> int:
-    """Return the place of the first row that is not finite."""
+    """Return the index of the first row that is not finite."""
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 

@@ -1,4 +1,4 @@
-"""Data in the place of a scenario: objects that make one, and readers that find such data in files."""
+"""Data that replace a scenario: objects that make one, and readers of such data in files."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -9,30 +9,30 @@ from ..contract.task import Scenario, Task
 
 
 class ScenarioData:
-    """Data of which an environment makes a scenario."""
+    """Data from which an environment makes a scenario."""
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario of it.
+        """Make a scenario from the data.
 
         Args:
             cls: the environment.
-            keywords: of ``gym.make`` beside the scenario, which win over parameters of the data.
+            keywords: of ``gym.make`` beside the scenario, which override parameters of the data.
 
         Raises:
-            ValueError: if the environment cannot, or the data do not fit the parameters.
+            ValueError: if the environment does not support such data, or the data do not fit the parameters.
         """
         raise NotImplementedError
 
     def fields(self) -> dict[str, Any]:
-        """Return what makes the same data again, by name, as a dictionary that may be given as scenario."""
+        """Return the fields of the data by name; the dictionary is also a valid scenario."""
         raise NotImplementedError
 
 
 class FlightData(ScenarioData):
-    """Flights, which every episode flies."""
+    """Flights, of which every episode flies one."""
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario of it, as :meth:`ScenarioData.scenario`."""
+        """Make a scenario from the data, as :meth:`ScenarioData.scenario`."""
         of_flights = find_companion(cls, FlightScenarios)
         if of_flights is None:
             raise ValueError(f"{cls.id} does not take flights as scenario")
@@ -44,13 +44,13 @@ class Reader(NamedTuple):
     """A kind of data in files, folders or dictionaries."""
 
     takes: Callable[[Any], bool]
-    """Whether a value, which is no name of a scenario, names or holds data of this kind."""
+    """Function that returns whether a value, not the name of a scenario, names or contains data of this kind."""
     read: Callable[[Any, type[Task]], ScenarioData]
-    """Returns the data of such a value for an environment; raises :class:`ValueError` for what cannot be read."""
+    """Function that returns the data of such a value for an environment; raises ValueError for unreadable data."""
     prefix: str = ""
-    """With which a name of such data may begin."""
+    """Prefix that a name of such data may have."""
     endings: tuple[str, ...] = ()
-    """Of the names of its files."""
+    """Suffixes of the names of its files."""
 
 
 def readers() -> Iterator[Reader]:

@@ -10,7 +10,7 @@ import numpy
 from .scenario_data import FlightData
 
 MOST_SAMPLES = 20_000
-"""Of a flight, 33 h of scans 6 s apart; more are taken for a mistake of units or an outlier among the times."""
+"""Most samples of a flight, 33 h of scans 6 s apart; more indicate a wrong unit or an outlier among the times."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Trajectory(FlightData):
         time: seconds, strictly increasing, ``(n,)`` with n >= 2.
         position: x and y in metres, ``(n, 2)``.
         velocity: m/s, ``(n, 2)``; by default the slope of a cubic spline through the positions.
-        name: what reports call it.
+        name: name in reports.
         flight: name of the flight that it is a piece of; empty where it is a whole one.
 
     Raises:
@@ -59,7 +59,7 @@ class Trajectory(FlightData):
             )
 
     def fields(self) -> dict[str, Any]:
-        """Return its fields by name."""
+        """Return the fields by name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @property
@@ -92,7 +92,7 @@ class Trajectory(FlightData):
             x, y (m) and their rates (m/s), ``(4, count)``.
 
         Raises:
-            ValueError: if that are too many samples.
+            ValueError: for too many samples.
         """
         if count > MOST_SAMPLES:
             raise ValueError(
@@ -115,10 +115,10 @@ class Trajectory(FlightData):
 
 
 def trajectory_of(fields: Mapping[str, Any]) -> Trajectory:
-    """Return the trajectory whose fields a dictionary holds.
+    """Return the trajectory from a dictionary of its fields.
 
     Raises:
-        ValueError: if a field is missing or there is another, or their values are no trajectory.
+        ValueError: if a field is missing or unknown, or the values are no trajectory.
     """
     known = [field.name for field in dataclasses.fields(Trajectory)]
     if not {"time", "position"} <= set(fields) <= set(known):

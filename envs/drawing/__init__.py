@@ -1,4 +1,4 @@
 """Pictures of a running episode.
 
-Knows the contract, and imports matplotlib. Begin with :mod:`.rendering`, whose general picture draws every task.
+Imports the contract and matplotlib. Begin with :mod:`.rendering`, whose general picture draws every task.
 """

@@ -1,6 +1,6 @@
-"""Picture of an episode under a filter of its own: where the target is, what is measured, what is believed, and errors.
+"""Picture of an episode under a filter of its own: true position, measurements, estimates and errors.
 
-It draws any estimator, smoother or reference in any environment, for it asks the filter for nothing but its estimate.
+It draws any estimator, smoother or reference in any environment, since it reads only the estimate of the filter.
 Like :mod:`.rendering` this module imports matplotlib.
 """
 
@@ -19,9 +19,9 @@ from .rendering import BLACK, BLUE, FIGURE_SIZE, ORANGE, PALE, History, Picture,
 PANEL = (0.085, 0.09, 0.405, 0.76)
 """Left, bottom, width, height as shares of the figure."""
 MOST_STRIPS = 4
-"""Components whose errors are drawn."""
+"""Largest number of components whose errors are drawn."""
 MARGIN = 0.06
-"""Beyond the path, as a share of its extent."""
+"""Margin around the path, as a share of its extent."""
 ELLIPSE_SIGMAS = 2.0
 """Half axes of the covariance ellipse, standard deviations."""
 
@@ -30,8 +30,8 @@ class EstimatePicture(Picture):
     """Truth, readings and estimate, in a plane where two components are one; errors with their reported bands.
 
     Args:
-        model: whose episodes are drawn.
-        track: of the whole episode, for limits that need not move, see :meth:`values`.
+        model: of the episodes.
+        track: arrays of the whole episode, for constant limits, see :meth:`values`.
     """
 
     strips_left: float = 0.56
@@ -49,7 +49,7 @@ class EstimatePicture(Picture):
         self.limits: list[tuple[float, float]] = [_extent(path[:, i]) for i in self.drawn]
 
     def values(self, track: Mapping[str, numpy.ndarray], k: int) -> dict[str, float]:
-        """Return what the history keeps of a measurement.
+        """Return the values of a measurement for the history.
 
         Args:
             track: of the episode, as :meth:`.Model.picture_track` returns it of one measurement, ``(K, ...)``.
@@ -75,7 +75,7 @@ class EstimatePicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """Return False: there is none to show."""
+        """Return False: the filter has no observation."""
         return False
 
     def open(self, figure: Figure) -> None:
@@ -116,7 +116,7 @@ class EstimatePicture(Picture):
         )
 
     def arrange(self) -> None:
-        """Limits that hold the whole path."""
+        """Set limits around the whole path."""
         if not self.plane:
             self.panel.set_xlim(0.5, self.task.horizon + 0.5)
             self.panel.set_ylim(*self.limits[0])
@@ -132,12 +132,12 @@ class EstimatePicture(Picture):
         self.panel.set_ylim(south, north)
 
     def draw(self, history: History, state: Any) -> None:
-        """Move everything to where it is now."""
+        """Update all artists to the current measurement."""
         empty = numpy.empty(0)
         for name, line in (("true", self.true), ("seen", self.seen), ("believed", self.believed)):
             x, y = self._places([history.get(f"{name}.{row}", empty) for row in range(len(self.drawn))])
             line.set_data(x, y)
-        self.now.set_data(x[-1:], y[-1:])  # what is believed came last
+        self.now.set_data(x[-1:], y[-1:])  # the last column is the estimate
         self.ellipse.set_visible(self.plane and len(x) > 0)
         if self.plane and len(x):
             P = numpy.array([[history[f"covariance.{i}{j}"][-1] for j in range(2)] for i in range(2)])
@@ -149,7 +149,7 @@ class EstimatePicture(Picture):
             self.ellipse.set_angle(float(numpy.degrees(numpy.arctan2(directions[1, 1], directions[0, 1]))))
 
     def _places(self, values: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the places of values in the panel: in the plane, or over time."""
+        """Return the coordinates of values in the panel: in the plane, or over time."""
         return (values[0], values[1]) if self.plane else (numpy.arange(1, len(values[0]) + 1), values[0])
 
 

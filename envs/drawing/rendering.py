@@ -1,14 +1,14 @@
-"""Pictures of a running episode: what ``render_mode`` "rgb_array" and "human" show.
+"""Pictures of a running episode, for ``render_mode`` "rgb_array" and "human".
 
-An :class:`EpisodePicture` keeps the history of one episode and draws it into one figure, whose axes never
-move. A :class:`Picture` decides what is drawn: that of the problem's :class:`~.companions.PictureMaker`, or, where
-there is none, the base class, which can draw every task: errors with the band that the estimator reports, actions,
+An :class:`EpisodePicture` stores the history of one episode and draws it into one figure, whose axes never
+move. A :class:`Picture` determines the content: that of the problem's :class:`~.companions.PictureMaker`, or, without
+one, the base class, which can draw every task: errors with the band that the estimator reports, actions,
 observations.
 
-Pictures show the truth, also that of the scans to come (the limits of the axes, marked manoeuvres). Nothing
-here is seen by an agent.
+Pictures show the truth, also that of the scans to come (the limits of the axes, marked manoeuvres). An agent
+observes none of it.
 
-This module imports matplotlib; the environment imports it only when a render mode is asked for.
+This module imports matplotlib; the environment imports it only for a render mode.
 """
 
 import copy
@@ -37,9 +37,9 @@ BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, BLACK, GREY = (
 PALE = "#EBEBEB"
 """Ground of marked stretches, and lines of a grid."""
 COLOURS = (BLACK, BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, PALE)
-"""All that a picture should be drawn in: animations have these and their shades."""
+"""Colours of all pictures: animations have these and their shades."""
 CURVES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, "-."), (PURPLE, ":"), (ORANGE, "-"), (SKY, "--"))
-"""Colour and line style of the curves of a strip: two ways to tell them apart."""
+"""Colour and line style of the curves of a strip: two ways to distinguish them."""
 FIGURE_SIZE = (12.0, 7.6)
 """Width and height, inches."""
 DOTS_PER_INCH = 80.0
@@ -47,9 +47,9 @@ DOTS_PER_INCH = 80.0
 BAND_SIGMAS = 2.0
 """Half the width of the shaded band, reported standard deviations."""
 MAX_PICTURES = 4
-"""Sub-environments of a vector that are drawn."""
+"""Largest number of sub-environments that are drawn."""
 MOST_COMPONENTS = 8
-"""Error components that the general picture has room for."""
+"""Largest number of error components in the general picture."""
 LADDER = (1.0, 2.0, 5.0)
 """Limits grow by these factors and their multiples by ten: seldom, and by enough to be noticed."""
 
@@ -58,10 +58,10 @@ History = Mapping[str, numpy.ndarray]
 
 
 class Strip(NamedTuple):
-    """A panel that shows something against the number of the measurement."""
+    """Panel of curves over the number of the measurement."""
 
     title: str
-    """What is shown, with its unit."""
+    """Title, with the unit."""
     curves: Mapping[str, str]
     """Name in the legend -> name of the series."""
     limits: tuple[float, float]
@@ -71,7 +71,7 @@ class Strip(NamedTuple):
     guides: tuple[float, ...] = ()
     """Levels of thin lines."""
     steps: bool = False
-    """Whether values hold for their measurement and jump to the next, as choices do."""
+    """Whether values are constant during a measurement and then jump, like choices."""
 
 
 def error_strip(title: str, component: str, limit: float) -> Strip:
@@ -82,7 +82,7 @@ def error_strip(title: str, component: str, limit: float) -> Strip:
 
 
 def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-    """Return the stretch limits about zero by the least factor 1, 2, 5, 10, ... that lets them hold low and high."""
+    """Stretch limits about zero by the least factor 1, 2, 5, 10, ... with which they contain low and high."""
     lowest, highest = limits
     # A value on the far side of a limit at zero cannot be reached by stretching, and is cut off.
     needed = max(
@@ -106,24 +106,24 @@ class Picture:
     (:meth:`open`, :meth:`begin`, :meth:`draw`).
 
     Args:
-        model: whose episodes are drawn; its states hold lane 0 of a batch that is padded to several.
+        model: of the episodes; its states contain lane 0 of a batch that is padded to several.
     """
 
     clock = "measurement"
-    """What a measurement is called on the time axis and in the title."""
+    """Word for a measurement on the time axis and in the title."""
     strips_left: float = 0.065
-    """Where the strips begin, as a share of the figure's width: what is left of it belongs to the panels."""
+    """Left edge of the strips, as a share of the figure's width; the panels are left of it."""
     strip_columns = 0
-    """Columns of strips; 0 for as many as their number asks for."""
+    """Columns of strips; 0: chosen by the number of strips."""
     steered = True
-    """Whether an action steers the filter, whose control the title then names."""
+    """Whether an action steers the filter; the title then names its control."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
         self.task: Any = model.task
 
     def records(self, state: Any) -> dict[str, float]:
-        """Return the values that the history keeps of a state after the action, beside errors, sigmas and actions."""
+        """Return further values of a state after the action for the history, beside errors, sigmas and actions."""
         return {}
 
     def strips(self) -> Sequence[Strip]:
@@ -153,26 +153,26 @@ class Picture:
         """Make panels and artists; called once, before the strips are made."""
 
     def begin(self, state: Any) -> None:
-        """Take note of a new episode, from its state after the first measurement."""
+        """Prepare for a new episode, from its state after the first measurement."""
 
     def shading(self) -> Sequence[tuple[float, float]]:
         """Return the measurements, from and to, that every strip marks with a grey ground."""
         return ()
 
     def arrange(self) -> None:
-        """Set limits for the episode that :meth:`begin` has announced; called before its first drawing."""
+        """Set limits for the episode of :meth:`begin`; called before its first drawing."""
 
     def draw(self, history: History, state: Any) -> None:
         """Update the panels.
 
         Args:
             history: of the measurements acted on.
-            state: after the measurement that has arrived and is not yet acted on.
+            state: after the last measurement, which is not yet acted on.
         """
 
 
 def picture_of(model: Model) -> Picture:
-    """Return the picture made for a model, or the general one."""
+    """Return the picture of a model's task, or the general one."""
     return model.picture() or Picture(model)
 
 
@@ -252,20 +252,20 @@ class _ObservationPanel:
 _NO_FIGURE: Mapping[str, Any] = {"_figure": None, "_ground": None, "_limits": (), "_fresh": True}
 """Attributes of an episode's picture before its first drawing."""
 _FIGURE = (*_NO_FIGURE, "_title", "_panels", "_observation", "_shades")
-"""Those that belong to the figure."""
+"""Attributes that belong to the figure."""
 
 
 class EpisodePicture:
     """History and picture of one episode.
 
     Args:
-        model: whose episode it is.
-        scenario: its scenario's name, for the title.
+        model: of the episode.
+        scenario: name of the scenario, for the title.
         mode: "rgb_array" or "human".
-        frames_per_second: how fast a window shows them at most.
-        picture: what is drawn; default: what is made for the model, or the general one.
+        frames_per_second: largest frame rate of a window.
+        picture: content; default: the picture of the model's task, or the general one.
 
-    Where "human" finds no window to open, the episode goes on unseen, with a warning of Gymnasium.
+    If "human" cannot open a window, the episode continues without one, with a warning of Gymnasium.
     """
 
     def __init__(
@@ -294,22 +294,22 @@ class EpisodePicture:
         self._artists: set[str] = set()
         """Attributes of the picture that are parts of the figure."""
         self._unseen = False
-        """Whether there is no window, nor will be: the episode goes on without one."""
+        """Whether no window can be opened: the episode continues without one."""
         if mode == "human" and (problem := _missing_display()):
             self._go_on_unseen(problem)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the figure: a copy draws its own."""
+        """Return all attributes but the figure: a copy draws its own."""
         picture = copy.copy(self.picture)
         for name in self._artists & vars(picture).keys():
             delattr(picture, name)
-        kept = {name: value for name, value in vars(self).items() if name not in _FIGURE}
-        return {**kept, "picture": picture, **_NO_FIGURE}
+        attributes = {name: value for name, value in vars(self).items() if name not in _FIGURE}
+        return {**attributes, "picture": picture, **_NO_FIGURE}
 
     # --- history
 
     def begin(self, state: Any) -> None:
-        """Forget the last episode; ``state`` is the new one's after its first measurement."""
+        """Start a new episode; ``state`` is the one after its first measurement."""
         self.history, self.observations, self.count = {}, [], 0
         self.picture.begin(state)
         self._fresh = True
@@ -318,9 +318,9 @@ class EpisodePicture:
         """Add a measurement that has been acted on.
 
         Args:
-            state: after the action; lane 0 is kept.
-            action: ``(A,)`` or a scalar, what was applied.
-            observation: ``(len(model.fields),)``, what it answered.
+            state: after the action; lane 0 is stored.
+            action: the applied action, ``(A,)`` or a scalar.
+            observation: the observation before the action, ``(len(model.fields),)``.
         """
         nothing = numpy.full(len(self.model.task.components), numpy.nan)
         error = self.model.error(state)[:, 0] if self.model.task.has_truth else nothing
@@ -340,7 +340,7 @@ class EpisodePicture:
         """Add the values of a measurement to the history.
 
         Args:
-            values: by the name of the series.
+            values: by the names of the series.
         """
         for name, value in values.items():
             self.history.setdefault(name, []).append(float(value))
@@ -354,7 +354,7 @@ class EpisodePicture:
         canvas = figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
         moving = [_moving(axes) for axes in figure.axes]
-        # Frames, ticks and letters take nine tenths of the time: they are drawn again only when they change.
+        # Frames, ticks and letters take nine tenths of the time, so they are drawn again only when they change.
         limits = [tuple(axes.viewLim.extents) for axes in figure.axes]
         if limits != self._limits:
             for artist in [self._title, *(artist for artists in moving for artist in artists)]:
@@ -369,7 +369,7 @@ class EpisodePicture:
         return numpy.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
     def show(self, state: Any) -> None:
-        """Draw into the window, not faster than ``frames_per_second``; where there is none, do nothing."""
+        """Draw into the window, not faster than ``frames_per_second``; without one, do nothing."""
         if self._unseen:
             return
         from matplotlib import pyplot
@@ -383,10 +383,10 @@ class EpisodePicture:
         if not opened:
             figure.show()
         elif not pyplot.fignum_exists(figure.number):
-            return  # the user has closed the window: the episode goes on unseen
+            return  # the user has closed the window: the episode continues without it
         figure.canvas.draw_idle()
         due = self._last_shown + 1.0 / self.frames_per_second
-        # The event loop is what draws, also when no time is left to wait.
+        # The event loop draws, so it must run even when no time is left to wait.
         figure.canvas.start_event_loop(max(due - time.monotonic(), 0.001))
         self._last_shown = time.monotonic()
 
@@ -395,7 +395,7 @@ class EpisodePicture:
         self._unseen = True
 
     def close(self) -> None:
-        """Close the window and forget the figure."""
+        """Close the window and delete the figure."""
         if self._figure is not None and self.mode == "human":
             from matplotlib import pyplot
 
@@ -445,7 +445,7 @@ class EpisodePicture:
             rows, columns, left=self.picture.strips_left, right=0.985, bottom=0.075, top=0.9,
             hspace=0.09 * rows, wspace=0.2,
         )  # fmt: skip
-        # Column by column, so that what belongs together stands above each other.
+        # Column by column, so that related strips are above each other.
         axes = [figure.add_subplot(grid[i % rows, i // rows]) for i in range(cells)]
         for i, one in enumerate(axes):
             one.tick_params(labelsize=8)
@@ -478,10 +478,10 @@ class EpisodePictures:
     """Pictures of the first few episodes of many side by side.
 
     Args:
-        model: whose episodes they are, of any backend.
-        scenario: its scenario's name.
+        model: of the episodes, on any backend.
+        scenario: name of the scenario.
         count: number of episodes.
-        frames_per_second: how fast a video shows them.
+        frames_per_second: frame rate of a video.
     """
 
     def __init__(self, model: Model, scenario: str, count: int, frames_per_second: float) -> None:
@@ -496,7 +496,7 @@ class EpisodePictures:
             picture.caption = f"sub-environment {i}"
 
     def begin(self, state: Any, lanes: Sequence[int]) -> None:
-        """Forget the last episodes in some lanes; ``state`` holds the new ones after their first measurement."""
+        """Start new episodes in some lanes; ``state`` contains them after their first measurement."""
         for i, picture in enumerate(self.pictures):
             if i in lanes:
                 picture.begin(_alone(state, i))
@@ -506,30 +506,30 @@ class EpisodePictures:
 
         Args:
             state: of all episodes after the action.
-            actions: what was applied, ``(count, ...)``.
-            observations: what it answered, ``(count, len(model.fields))``.
+            actions: the applied actions, ``(count, ...)``.
+            observations: those before the actions, ``(count, len(model.fields))``.
         """
         for i, picture in enumerate(self.pictures):
             picture.keep(_alone(state, i), actions[i], observations[i].copy())
 
     def frames(self, state: Any) -> tuple[numpy.ndarray, ...]:
-        """Draw: a frame ``(height, width, 3)`` for each episode, the same blank one beyond the first few."""
+        """Draw a frame ``(height, width, 3)`` for each episode, the same blank one beyond the first few."""
         drawn = [picture.frame(_alone(state, i)) for i, picture in enumerate(self.pictures)]
         return (*drawn, *[numpy.full_like(drawn[0], 255)] * (self.count - len(drawn)))
 
     def close(self) -> None:
-        """Forget the figures."""
+        """Delete the figures."""
         for picture in self.pictures:
             picture.close()
 
 
 def _alone(state: Any, lane: int) -> Any:
-    """Return the episode in one lane as a picture takes it: on the host, padded with itself."""
+    """Return the episode in one lane for a picture: on the host, padded with itself."""
     return map_arrays(lambda values: host_array(values)[..., [lane] * round_up_lanes(1)], state)
 
 
 def _moving(axes: Axes) -> list[Artist]:
-    """Everything inside the axes, in the order of drawing."""
+    """Return all artists inside the axes, in the order of drawing."""
     return sorted(
         [*axes.images, *axes.collections, *axes.patches, *axes.lines], key=lambda artist: artist.get_zorder()
     )
@@ -564,7 +564,7 @@ def _window(title: str) -> Figure:
 
     try:
         figure = pyplot.figure(figsize=FIGURE_SIZE, dpi=DOTS_PER_INCH)
-    except Exception as error:  # every toolkit has exceptions of its own for a missing display
+    except Exception as error:  # each toolkit has exceptions of its own for a missing display
         raise _WindowError(
             f"the backend {matplotlib.get_backend()!r} cannot open a window ({error}); check DISPLAY and MPLBACKEND"
         ) from error

@@ -1,5 +1,5 @@
 """Engine of tasks: episodes side by side, steps in NumPy or compiled, noise by counter, names and scenarios of tasks.
 
-Knows the contract and the data. Begin with :mod:`.lanes`, which runs N episodes; :mod:`.compiled` makes their steps
-code of the processor, and :mod:`.backend` chooses between that, NumPy and torch.
+Imports the contract and the data. Begin with :mod:`.lanes`, which runs N episodes; :mod:`.compiled` compiles their
+steps, and :mod:`.backend` chooses between compiled code, NumPy and torch.
 """

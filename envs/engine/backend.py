@@ -31,17 +31,17 @@ def make_model(
 
     Args:
         cls: the task.
-        control: what the action steers; default: the first of the task's controls.
+        control: name of a control; default: the first of the task.
         scenario: as :func:`~.scenario_choice.find_scenario` takes it.
         backend: "compiled", "numpy", "torch", or "auto": compiled where llvmlite is installed and the task can be
             traced, else NumPy.
         device: of torch, such as "cuda:1".
-        threads: how many share the lanes of the compiled backend.
+        threads: number of threads for the lanes of the compiled backend.
         **keywords: parameters of the task. A keyword wins over the scenario, the scenario over the default.
 
     Raises:
         ValueError: for an unknown name or backend, a parameter out of its limits, a device that is not there, less
-            than one thread, or a task that cannot be compiled and was asked to be.
+            than one thread, or the compiled backend for a task that cannot be compiled.
         ImportError: if the backend needs a library that is not installed.
     """
     check("threads", threads, int, ParameterLimits(at_least=1))
@@ -64,7 +64,7 @@ def make_model(
 def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
     """Return the array namespace of a backend, and its device.
 
-    torch is imported here and only when asked for.
+    Torch is imported only for its own backend.
 
     Args:
         backend: one of ``BACKENDS``; all but "torch" compute on NumPy arrays.
@@ -75,7 +75,7 @@ def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
 
     Raises:
         ValueError: for an unknown backend, a device that NumPy does not have, or a device that is not there.
-        ImportError: if torch is asked for and not installed.
+        ImportError: for the torch backend without torch.
     """
     if not isinstance(backend, str) or backend not in BACKENDS:
         raise nearest("backend", backend, BACKENDS)
@@ -95,7 +95,7 @@ def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
 
     try:
         chosen = torch.device("cpu" if device is None else device)
-        # An allocation is the only question that every kind of device answers, also whether it has float64.
+        # Only an allocation tests every kind of device, also for float64.
         torch.zeros(1, dtype=torch.float64, device=chosen)
     except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
         there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]

@@ -1,7 +1,7 @@
 """Catalogue of the environments, and the modules that users name.
 
 Every folder in ``envs/`` that defines an ``ID`` is an environment; its ``task.py`` defines the class, ``TASK``, which
-is imported when somebody asks for it. Nothing else needs to know about it. A user's own are added by
+is imported on first use. No other file lists it. A user's own environments are added by
 :mod:`.registration`; :mod:`.scenario_choice` makes a task from names and keywords.
 """
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 ENVS = __name__.rsplit(".", 2)[0]
 """The package whose folders are the environments, and the rooms that they stand on."""
 USER_TASKS: dict[str, "type[Task]"] = {}
-"""Environments of users, as they were registered: Gymnasium id -> task class."""
+"""Registered environments of users: Gymnasium id -> task class."""
 
 
 class Catalogue(Mapping[str, "type[Task]"]):
@@ -59,15 +59,15 @@ def catalogue() -> Mapping[str, "type[Task]"]:
 
 @functools.cache
 def folders() -> dict[str, str]:
-    """Return the folders of the environments, those of ``envs/`` that say an ``ID``: Gymnasium id -> name."""
+    """Return the folders of the environments, those of ``envs/`` that define an ``ID``: Gymnasium id -> name."""
     names = [m.name for m in pkgutil.iter_modules(importlib.import_module(ENVS).__path__) if m.ispkg]
     packages = {name: importlib.import_module(f"{ENVS}.{name}") for name in names}
     return {package.ID: name for name, package in packages.items() if hasattr(package, "ID")}
 
 
 class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (the name describes it)
-    """A keyword that an environment does not take: a TypeError as of any function, which clients look for who try
-    whether an environment takes one, and a ValueError as for every other wrong name.
+    """A keyword that an environment does not accept. It is a TypeError, as of any function, for clients that test
+    whether an environment accepts one, and a ValueError as for every other wrong name.
     """
 
 
@@ -85,9 +85,9 @@ def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None
 
 
 _SEARCH_FOLDERS: list[str] = []
-"""Folders in which modules that a user names are looked for, after ``sys.path``."""
+"""Folders that are searched for modules that a user names, after ``sys.path``."""
 FOUND_IN: list[str] = []
-"""Those of them in which one was found; other processes receive them, see :mod:`..evaluation.parallel`."""
+"""Those folders in which a module was found; other processes receive them, see :mod:`..evaluation.parallel`."""
 
 
 @contextmanager
@@ -113,9 +113,9 @@ def on_path(folders: Iterable[str]) -> Iterator[None]:
 
 
 def import_user_module(module: str, refusal: str) -> ModuleType:
-    """Import a module that a user has named: the one function that imports by a name, and doors alone call it.
+    """Import a module that a user has named; the only function that imports by a name.
 
-    A door is an argument of the command line or of a function that the user calls. What was read from a file goes
+    It is called only for arguments of the command line or of a function that the user calls. Names read from a file go
     through :func:`task_class`, which imports nothing.
 
     Args:
@@ -123,7 +123,7 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
         refusal: beginning of the error.
 
     Raises:
-        ValueError: if that is no name of a module, or the import fails, for whatever reason.
+        ValueError: if that is no name of a module, or the import fails, for any reason.
     """
     try:
         if not all(part.isidentifier() for part in module.split(".")):
@@ -204,7 +204,7 @@ def task_class(id: str) -> "type[Task]":
 
 
 class ImportableName(str):
-    """Id of an environment with the module that registers it, ``module:id``, as this process knows it.
+    """Id of an environment with the module that registers it, ``module:id``, in this process.
 
     Sent to another process of ours, where it is unpickled, it imports the module. Written to a file and read again it
     is an ordinary string, which imports nothing.
@@ -264,6 +264,6 @@ def register() -> None:
                 id,
                 entry_point="filtergym.envs.interface.environment:TaskEnv",
                 vector_entry_point="filtergym.envs.interface.vector_environment:TaskVectorEnv",
-                # A spawned process gets no more than this, and must find the environment by it.
+                # A spawned process receives only this, and must find the environment by it.
                 kwargs={"task": importable_name(USER_TASKS[id]) if id in USER_TASKS else id},
             )

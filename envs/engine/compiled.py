@@ -1,8 +1,8 @@
 """Models whose steps are compiled: the same functions, traced once and run as code of the processor.
 
 :class:`CompiledModel` is used like any other; its methods run native code of its :class:`~.programs.Programs`.
-:class:`~.stepper.Stepper` goes further where episodes are only stepped: it keeps the episodes in its own memory, bound
-to the code once and for all.
+Where episodes are only stepped, :class:`~.stepper.Stepper` is faster: it has the episodes in its own memory, bound
+to the code once.
 """
 
 import copy
@@ -39,8 +39,8 @@ class CompiledModel(Model):
 
     Args:
         task: on NumPy arrays.
-        control: what the action steers.
-        threads: how many share the lanes.
+        control: name of a control.
+        threads: number of threads for the lanes.
 
     Raises:
         NotTraceable: if a step is no straight line of arithmetic.
@@ -89,7 +89,7 @@ class CompiledModel(Model):
             make: makes the filter for a model, on NumPy's arrays and on traced ones.
 
         Raises:
-            NotTraceable: if the filter is no straight line of arithmetic, and does not say so.
+            NotTraceable: if the filter is no straight line of arithmetic, and does not declare it.
         """
         other = copy.copy(self)
         other._plain = self._plain.with_filter(make)
@@ -114,11 +114,11 @@ class CompiledModel(Model):
         return self.run(start_filter, initial, truth)[0]
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
-        """Return the state of the filter when a measurement has come."""
+        """Return the state of the filter predicted to a measurement."""
         return self.programs.filter_prediction(state, measurement, threads=self.threads)[0]
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
-        """Return the state of the filter when the measurement is taken in."""
+        """Return the state of the filter after the update with the measurement."""
         if self.filter.in_python:
             return super().update_filter(state, measurement, action, truth)
         return self.programs.filter_update(truth, state, measurement, action, threads=self.threads)[0]
@@ -135,7 +135,7 @@ class CompiledModel(Model):
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Return the steps 1 and 2."""
+        """Apply steps 1 and 2."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
@@ -144,7 +144,7 @@ class CompiledModel(Model):
 def compiled_model(
     cls: type[Task], parameters: Any, control: str, recording: Any = None, threads: int = 1
 ) -> CompiledModel:
-    """Return the compiled model of a task with these parameters; nothing in it changes, so that the last ones are kept.
+    """Return the compiled model of a task with these parameters; the last ones are stored, since they never change.
 
     Raises:
         NotTraceable: if a step is no straight line of arithmetic.
@@ -186,7 +186,7 @@ def _name_of(function: Callable[..., Any]) -> str:
 
 
 def warn_of(what: str, error: BaseException) -> None:
-    """Warn that something runs with NumPy, and name the line that is to blame."""
+    """Warn that a function runs with NumPy, and name the line that prevents compilation."""
     found: BaseException = error.__cause__ or error
     own = Path(namespace.__file__).parent
     frames = [f for f in traceback.extract_tb(found.__traceback__) if Path(f.filename).parent != own]
@@ -197,7 +197,7 @@ def warn_of(what: str, error: BaseException) -> None:
 
 
 def share_world(model: Any, other: Any) -> bool:
-    """Return whether two compiled models are of one task, and neither filter gives anything back to its world."""
+    """Return whether two compiled models are of one task, and neither filter has a feedback to its world."""
     return model.task is other.task and model.programs.is_open_loop and other.programs.is_open_loop
 
 

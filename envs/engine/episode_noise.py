@@ -1,10 +1,10 @@
 """Random numbers of episodes side by side, made from the episodes' identities.
 
-**What an episode is.** When an episode starts, its lane's generator gives its *identity*, two whole numbers of 64 bits.
-Every random number of the episode is a function of its identity, the measurement ``t`` and the number's place in the
-measurement (:mod:`..compiler.counter_numbers`): at ``t = 0`` those of its start, from ``t = 1`` on those of measurement
-``t``. So what came before, actions, the control, other lanes, copies and threads change nothing: policies of different
-controls that start from the same seed face the same noise.
+When an episode starts, its lane's generator gives its *identity*, two whole numbers of 64 bits. Every random number of
+the episode is a function of its identity, the measurement ``t`` and the number's place in the measurement
+(:mod:`..compiler.counter_numbers`): at ``t = 0`` those of its start, from ``t = 1`` on those of measurement
+``t``. So earlier episodes, actions, the control, other lanes, copies and threads do not change them: policies of
+different controls that start from the same seed have the same noise.
 
 With llvmlite compiled code makes the numbers, otherwise NumPy, for many measurements at once; the bits are the same.
 """
@@ -25,14 +25,14 @@ from ..contract.task import Task
 from ..contract.task_base import NoiseLayout
 
 AHEAD = 1 << 13
-"""Lanes times measurements that NumPy makes at once: a call takes longer than the numbers of a few lanes."""
+"""Lanes times measurements that NumPy makes at once, since a call takes longer than the numbers of a few lanes."""
 BLOCKS_OF_SEEDS = 64
-"""Blocks of seeds whose identities a process keeps."""
+"""Number of blocks of seeds whose identities a process stores."""
 
 
 def draw_identity(generator: numpy.random.Generator) -> numpy.ndarray:
     """Draw the identity of an episode, ``(2,)`` uint64."""
-    # The generator's own words: its methods take ten times longer to say the same.
+    # The generator's raw words: its methods take ten times longer for the same numbers.
     found: numpy.ndarray = generator.bit_generator.random_raw(2)
     return found
 
@@ -49,8 +49,8 @@ def _identities_of_seeds(seeds: tuple[int, ...]) -> numpy.ndarray:
 def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
     """Return the identities of the first episodes of environments that are reset with these seeds, ``(2, N)`` uint64.
 
-    To seed a generator takes long, and competitors are compared on the same seeds, so the identities
-    of the last blocks of seeds are kept.
+    Seeding a generator is slow, and competitors are compared on the same seeds, so the identities of the last blocks
+    of seeds are stored.
     """
     return _identities_of_seeds(tuple(seeds))
 
@@ -82,13 +82,13 @@ class EpisodeNoise:
     """Noise of ``count`` lanes.
 
     Args:
-        task: whose layout and namespace it has.
+        task: source of layout and namespace.
         count: number of lanes; they are padded to a multiple of eight by episodes of identity zero.
 
     Attributes:
         identities: of the lanes' episodes, ``(2, width)`` uint64.
-        measurement: whose numbers each lane has got last, ``(width,)`` int64; -1 before those of its start.
-        generators: from which each lane draws the identities of its coming episodes.
+        measurement: last measurement whose numbers were made in each lane, ``(width,)`` int64; -1 before the start.
+        generators: generator of the identities of the coming episodes of each lane.
     """
 
     def __init__(self, task: Task, count: int) -> None:
@@ -105,10 +105,10 @@ class EpisodeNoise:
         self._forget()
 
     def _forget(self) -> None:
-        """Forget what follows from identities and measurements."""
+        """Delete the values derived from identities and measurements."""
         self._next: Call | None = None
         self._due = False
-        """Whether the numbers of the measurement that is gone on to are still to be made."""
+        """Whether the numbers of the current measurement are still to be made."""
         self._row: Array = None
         self._ahead: numpy.ndarray | None = None
         """Rows of the coming measurements, ``(measurements, rows, width)``, where NumPy makes them."""
@@ -137,7 +137,7 @@ class EpisodeNoise:
         self._ahead, self._row, self._due = None, None, False
 
     def start_call(self, memory: numpy.ndarray) -> Call:
-        """Return what makes the numbers of the start after :meth:`put`.
+        """Return the native call that makes the numbers of the start after :meth:`put`.
 
         Args:
             memory: for normals and uniforms, ``(initial_normals + uniforms, width)``.
@@ -145,7 +145,7 @@ class EpisodeNoise:
         return bind_numbers(self.identities, self.measurement, memory, self._layout.initial_normals)
 
     def start(self) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the numbers of the start after :meth:`put`, and go on to the first measurement.
+        """Return the numbers of the start after :meth:`put`, and advance to the first measurement.
 
         Returns:
             Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)``, in new memory.
@@ -176,16 +176,16 @@ class EpisodeNoise:
 
     @property
     def row(self) -> Array:
-        """Numbers of this measurement, ``(row width, width)``, in memory that stays as it is."""
+        """Numbers of this measurement, ``(row width, width)``, in memory that does not change."""
         if self._row is None:
             task, row = self.task, self._copied_from_code() if AVAILABLE else self._next_of_block()
             self._row = row if task.xp is numpy else task.xp.asarray(row, device=task.device)
         return self._row
 
     def call_of_each(self) -> Call:
-        """Return what goes on to the next measurement and makes its numbers at :attr:`address`.
+        """Return the native call that advances to the next measurement and makes its numbers at :attr:`address`.
 
-        It serves native code that runs over several measurements, and is run at least once.
+        It is for native code over several measurements, which runs it at least once.
         """
         if self._due:
             _ = self.row
@@ -230,15 +230,15 @@ class EpisodeNoise:
         """Make room for more lanes.
 
         Args:
-            count: of all of them, a multiple of eight.
-            index: for each the lane whose numbers it gets until it begins an episode.
+            count: new number of lanes, a multiple of eight.
+            index: for each lane the one whose numbers it uses until it begins an episode.
         """
         identities, measurement = self.identities[:, index], self.measurement[index]
         self._set_width(count)
         self.identities[...], self.measurement[...] = identities, measurement
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that the coming numbers depend on; :meth:`restore` goes back to it, as often as one likes."""
+        """Return the complete state of the coming numbers; :meth:`restore` returns to it any number of times."""
         return copy.deepcopy({name: getattr(self, name) for name in _STATE_ATTRIBUTES})
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -255,4 +255,4 @@ class EpisodeNoise:
 
 
 _STATE_ATTRIBUTES = ("width", "identities", "measurement", "generators")
-"""Attributes that numbers depend on."""
+"""Attributes that determine the numbers."""

@@ -1,13 +1,13 @@
 """The engine: episodes of a model side by side, each fixed by its identity.
 
 A *lane* is one episode after another, whose identities one generator draws (:mod:`.episode_noise`). Both Gymnasium
-faces and the evaluation drive this class; it owns the noise and knows nothing of spaces or autoreset.
+classes and the evaluation use this class. It owns the noise and does not depend on spaces or autoreset.
 
 **Bit equality.** The batch is padded to a multiple of eight lanes, also for one episode: BLAS chooses its
 kernels by the width, and widths that are multiples of eight agree. So lane i of N equals the single
 environment with the same seed bit for bit.
 
-**What steps them.** A compiled model whose report can be traced moves its episodes in memory of its own
+**Steppers.** A compiled model whose report can be traced moves its episodes in memory of its own
 (:class:`~.stepper.Stepper`), any other by the model's functions (:class:`ModelStepper`), both by the same calls.
 """
 
@@ -31,7 +31,7 @@ from .stepper import Stepper, mean_of
 
 
 def whole_episode(model: Model, episode: Episode) -> Episode:
-    """Report the state itself."""
+    """Return the state itself, as a report."""
     return episode
 
 
@@ -41,7 +41,7 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     """
 
     def replaced(old: Array, new: Array) -> Array:
-        # A copy, because states are never changed in place: someone may still hold the old one.
+        # A copy, because states are never changed in place: the old one may still be in use.
         merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
         merged[..., lanes] = new[..., : len(lanes)]
         return merged
@@ -52,18 +52,18 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
 class EpisodeStepper(Protocol):
     """Protocol of the steppers of a model: :class:`.Stepper` and :class:`ModelStepper`.
 
-    ``others`` are steppers of the same kind, width and task. What is done with the first one is done with them beside
-    it, on the same noise.
+    ``others`` are steppers of the same kind, width and task. Each call on the first one also
+    applies to them, on the same noise.
     """
 
     def begin(self, identities: numpy.ndarray, noise: EpisodeNoise, others: Any) -> tuple[Array, Array]:
-        """Start episodes everywhere and let their first measurement arrive, see :meth:`.Stepper.begin`."""
+        """Start episodes in all lanes up to their first measurement, see :meth:`.Stepper.begin`."""
         ...
 
     def begin_some(
         self, lanes: numpy.ndarray, identities: numpy.ndarray, noise: EpisodeNoise, others: Any
     ) -> tuple[Array, Array]:
-        """Start episodes in some lanes and let their first measurement arrive, see :meth:`.Stepper.begin_some`."""
+        """Start episodes in some lanes up to their first measurement, see :meth:`.Stepper.begin_some`."""
         ...
 
     def load(self, episode: Episode, shown: Array = None) -> None:
@@ -71,7 +71,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def episode(self) -> Episode:
-        """Return the episodes, in arrays that stay as they are."""
+        """Return the episodes, in arrays that do not change."""
         ...
 
     def take(self, action: Array) -> None:
@@ -79,16 +79,16 @@ class EpisodeStepper(Protocol):
         ...
 
     def decide(self, noise: EpisodeNoise, others: Any) -> None:
-        """Take in all measurements of a decision with the action, and report on each."""
+        """Update with all measurements of a decision and the action, and report on each."""
         ...
 
     def reports(self) -> list[Any]:
-        """Return these reports, each of arrays ``(..., width)`` that stay as they are."""
+        """Return these reports, each of arrays ``(..., width)`` that do not change."""
         ...
 
     @property
     def rewards(self) -> Any:
-        """These reports where each is one number, ``(interval, width)``."""
+        """Return these reports where each is one number, ``(interval, width)``."""
         ...
 
     def observation_by_field(self) -> Array:
@@ -96,7 +96,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def observation(self, count: int) -> Array:
-        """Return the observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first, in memory that the caller may keep."""
         ...
 
     def take_alone(self, action: Array) -> None:
@@ -104,22 +104,22 @@ class EpisodeStepper(Protocol):
         ...
 
     def first_reward(self, beside: Any) -> float:
-        """Return the mean of the rewards of the first lane, less those of what runs beside it, if anything does."""
+        """Return the mean of the rewards of the first lane, less those of the stepper beside it, if there is one."""
         ...
 
     def observation_of_first(self) -> Array:
-        """Return the observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane, in memory that the caller may keep."""
         ...
 
 
 class ModelStepper:
-    """Episodes stepped by the functions of their model, in arrays that never change; calls as of :class:`.Stepper`.
+    """Episodes stepped by the functions of their model, in arrays that never change; methods as of :class:`.Stepper`.
 
-    ``others`` are steppers of the same kind, width and task: what is done with this one is done with them beside it, on
-    the same noise.
+    ``others`` are steppers of the same kind, width and task: each call on this one also applies to them, on the same
+    noise.
 
     Args:
-        model: whose episodes they are.
+        model: of the episodes.
         width: lanes, a multiple of eight.
         report: function of model and episodes after the action; None makes no report.
     """
@@ -130,14 +130,14 @@ class ModelStepper:
         self.report_function = report
         self._episode: Any = None
         self.shown: Array = None
-        """What is shown, ``(fields, width)``; None until it is computed."""
+        """Observation, ``(fields, width)``; None until it is computed."""
         self._action: Array = None
         self._reports: list[Any] = []
 
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()
     ) -> tuple[Array, Array]:
-        """Start episodes everywhere and let their first measurement arrive, see :meth:`.Stepper.begin`."""
+        """Start episodes in all lanes up to their first measurement, see :meth:`.Stepper.begin`."""
         noise.put(identities)
         start = self._start(noise)
         for each in (self, *others):
@@ -161,7 +161,7 @@ class ModelStepper:
         noise: EpisodeNoise,
         others: "Sequence[ModelStepper]" = (),
     ) -> tuple[Array, Array]:
-        """Start episodes in some lanes and let their first measurement arrive, see :meth:`.Stepper.begin_some`."""
+        """Start episodes in some lanes up to their first measurement, see :meth:`.Stepper.begin_some`."""
         noise.put(identities)
         start = self._start(noise)
         for each in (self, *others):
@@ -195,7 +195,7 @@ class ModelStepper:
         self.take(action[None])
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
-        """Take in all measurements of a decision with the action, see :meth:`.Stepper.decide`."""
+        """Update with all measurements of a decision and the action, see :meth:`.Stepper.decide`."""
         means = DecisionMeans(self.model.fields, self.model.task.decision_interval)
         total: Any = 0.0
         for each in (self, *others):
@@ -218,18 +218,16 @@ class ModelStepper:
 
     @property
     def rewards(self) -> list[Array]:
-        """The same."""
+        """Return these reports where each is one number, ``(interval, width)``."""
         return self._reports
 
     def first_reward(self, beside: "ModelStepper | None") -> float:
-        """Return the mean of the same of the first lane, where each is one number, less those of what runs beside
-        it.
-        """
+        """Return the mean of the rewards of the first lane, less those of the stepper beside it, if there is one."""
         others = [0.0] * len(self._reports) if beside is None else beside._reports
         return float(mean_of([a - b for a, b in zip(self._reports, others, strict=True)])[0])
 
     def observation_of_first(self) -> Array:
-        """Return the observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane, in memory that the caller may keep."""
         return self.observation(1)[0]
 
     def observation_by_field(self) -> Array:
@@ -239,7 +237,7 @@ class ModelStepper:
         return self.shown
 
     def observation(self, count: int) -> Array:
-        """Return the observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first, in memory that the caller may keep."""
         shown = self.observation_by_field()[:, :count].T
         # Contiguous, in memory of its own.
         return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
@@ -249,12 +247,12 @@ class Lanes:
     """``count`` episodes of a model side by side.
 
     Args:
-        model: task with a filter; the task's namespace decides where arrays live.
+        model: task with a filter; the task's namespace determines the device of the arrays.
         count: number of lanes.
-        beside: what the reward is relative to, run beside it on the same noise.
+        beside: baseline of a relative reward, run on the same noise.
         on_start: called with new episodes at the start of the track, before their first measurement.
         longest: decisions after which an episode ends at the latest; default: the task's horizon.
-        report: that will be made of them, in whose code they then begin; default: not known.
+        report: function of the later reports; the episodes then start in its code. Default: unknown.
 
     Attributes:
         decisions: actions taken in each lane's current episode, ``(count,)``.
@@ -279,12 +277,12 @@ class Lanes:
         self._models = [model] if beside is None else [model, beside.model]
         self._on_start, self._report = on_start, report
         self._steppers: dict[Report, list[Stepper]] = {}
-        """Those of compiled models, by what they report."""
+        """Steppers of compiled models, by report."""
         self._moving: Sequence[EpisodeStepper] = []
-        """Steppers that hold the episodes, of the task and of what runs beside it; none before the first episode."""
+        """Steppers with the current episodes, of the task and of the baseline; none before the first episode."""
         self.noise: EpisodeNoise = EpisodeNoise(task, count)
         self._some: dict[int, EpisodeNoise] = {}
-        """Noise of lanes that restart while others fly on, by their number."""
+        """Noise of lanes that restart while others continue, by their number."""
         self.decisions: numpy.ndarray = numpy.zeros(count, dtype=numpy.int64)
         horizon = task.horizon // task.decision_interval
         self.decisions_per_episode: int = horizon if longest is None else min(horizon, longest)
@@ -299,16 +297,16 @@ class Lanes:
         self.noise.seed(lane, generator)
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
-        """Start new episodes in some lanes (default: all) and let their first measurement arrive."""
+        """Start new episodes in some lanes (default: all) up to their first measurement."""
         chosen = range(self.count) if lanes is None or len(lanes) == self.count else lanes
         self.begin(self.noise.draw_identities(chosen), chosen)
 
     def begin(self, identities: numpy.ndarray, lanes: Sequence[int] | None = None) -> None:
-        """Start the episodes of these identities and let their first measurement arrive.
+        """Start the episodes of these identities up to their first measurement.
 
         Args:
             identities: ``(2, lanes)``, see :mod:`.episode_noise`.
-            lanes: in which, ascending; default: all.
+            lanes: numbers of the lanes, ascending; default: all.
         """
         task = self.task
         is_whole = lanes is None or len(lanes) == self.count
@@ -331,7 +329,7 @@ class Lanes:
             self._on_start(self.model.begin(*start))
 
     def _noise_of_some(self, count: int) -> EpisodeNoise:
-        """Return the noise of so many lanes that restart, in one of a few sizes."""
+        """Return the noise for a number of lanes that restart, in one of a few sizes."""
         width = LANES
         while width < count:
             width *= 2
@@ -359,7 +357,7 @@ class Lanes:
 
         Args:
             action: as the action space has it.
-            kind: as of :meth:`step_reward`, whose numbers these are.
+            kind: one of :data:`~.reward.REWARDS`; the reward equals that of :meth:`step_reward`.
         """
         steppers, report = self._moving, OWN_REWARDS[kind]
         if steppers is not self._steppers.get(report):
@@ -380,14 +378,14 @@ class Lanes:
         return steppers
 
     def decide(self, action: Array, report: Report = whole_episode) -> list[tuple[Any, Any]]:
-        """Apply one decision to as many measurements as it holds for, and report on each.
+        """Apply one decision to all its measurements, and report on each.
 
         Args:
             action: batch first, as the action space has it.
-            report: function of a model and its episodes after the action; not made anew for each call.
+            report: function of a model and its episodes after the action; pass the same one each time.
 
         Returns:
-            The reports on every measurement that the decision held for, arrays ``(..., width)``: of the model, and of
+            The reports on every measurement of the decision, arrays ``(..., width)``: of the model, and of
             ``beside`` (None without).
         """
         own, *beside = self._take_and_decide(action, report)
@@ -397,12 +395,12 @@ class Lanes:
     def run(
         self, report: Report, compiled_policy: Specialised | None = None, measurements: int | None = None
     ) -> tuple[Any, Any]:
-        """Run episodes on in native code, from where the last call left them, and report on every measurement.
+        """Continue the episodes in native code, and report on every measurement.
 
         Args:
-            report: that :func:`.compiled.can_step` with, as of :meth:`decide`.
+            report: as of :meth:`decide`; :func:`.compiled.can_step` must be true for it.
             compiled_policy: as of :meth:`.stepper.Stepper.run`; None: the action is zero.
-            measurements: after which they are left, a multiple of the decision interval; default: those of an episode.
+            measurements: how many, a multiple of the decision interval; default: those of an episode.
 
         Returns:
             Reports, arrays ``(measurements, ..., width)``, and the actions of the policy in the same form.
@@ -417,11 +415,11 @@ class Lanes:
         return answer
 
     def next_row(self) -> Array:
-        """Return the noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""
+        """Return the noise of the next measurement, ``(row width, width)`` for episodes that are stepped elsewhere."""
         self.noise.advance()
         return self.noise.row
 
-    # --- what steps them
+    # --- steppers
 
     def _by_functions(self) -> list[Any]:
         """Return the steppers by the models' functions, without episodes."""
@@ -431,7 +429,7 @@ class Lanes:
         return steppers
 
     def _beside_action(self, count: int) -> Array:
-        """Return the action of what runs beside, batch first."""
+        """Return the action of the baseline, batch first."""
         assert self.beside is not None
         actions = [self.beside.action] * count
         discrete = isinstance(self.beside.action, int)
@@ -442,7 +440,7 @@ class Lanes:
         )
 
     def _reporting(self, report: Report) -> Sequence[Any]:
-        """Return the steppers that make a report, which hold the episodes from now on."""
+        """Return the steppers that make a report, and move the episodes into them."""
         if self._moving is self._steppers.get(report):
             return self._moving
         if report not in self._steppers and all(can_step(model, report) for model in self._models):
@@ -492,12 +490,12 @@ class Lanes:
         self._moving[0].load(state)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what is bound to memory: a copy makes its own."""
+        """Return all attributes but those bound to memory: a copy makes its own."""
         self._settle()
         return {**self.__dict__, "_steppers": {}, "_some": {}}
 
     def grow(self, count: int) -> None:
-        """Make room for more lanes; the new ones fly some episode until they are restarted.
+        """Make room for more lanes; the new ones run arbitrary episodes until they are restarted.
 
         Args:
             count: a multiple of eight.
@@ -517,7 +515,7 @@ class Lanes:
     # --- copies, growth, gradients
 
     def _episodes(self) -> tuple[Any, ...]:
-        """Return the episodes of every task with what is shown of them; the arrays never change."""
+        """Return the episodes of every task with their observations; the arrays never change."""
         return tuple((stepper.episode(), stepper.shown) for stepper in self._settle())
 
     def _load(self, episodes: tuple[Any, ...]) -> None:
@@ -525,11 +523,11 @@ class Lanes:
             stepper.load(episode, shown)
 
     def detach(self) -> None:
-        """Cut the gradient: what follows no longer remembers how it came about (torch only)."""
+        """Detach the episodes from the graph of the gradient (torch only)."""
         self._load(map_arrays(lambda tensor: tensor.detach(), self._episodes()))
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
+        """Return the complete state of the coming steps; :meth:`restore` returns to it any number of times."""
         self._settle()
         kept = {"decisions": self.decisions.copy(), "_lengths": self._lengths.copy()}
         return {"count": self.count, "episodes": self._episodes(), "noise": self.noise.snapshot(), **kept}
@@ -548,7 +546,7 @@ class Lanes:
         self._load(snapshot["episodes"])
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Shorten the episodes that have just begun in some lanes by so many decisions, to one at least."""
+        """Shorten the episodes that have just begun in some lanes by numbers of decisions, to at least one."""
         self.decisions[list(lanes)] = numpy.minimum(decisions, self._lengths[list(lanes)] - 1)
 
     @property
@@ -557,7 +555,7 @@ class Lanes:
         return self.decisions >= self._lengths
 
     def observe(self) -> Array:
-        """Return the observation of every lane, batch first: ``(count, len(model.fields))``; the caller may keep
-        it.
+        """Return the observation of every lane, batch first: ``(count, len(model.fields))``, in memory
+        that the caller may keep.
         """
         return self._moving[0].observation(self.count)

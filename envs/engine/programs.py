@@ -1,7 +1,7 @@
 """Compiled programs of a model: the parts of a step, and its reports.
 
-A step has four parts. Apart, because scenarios differ in the world, controls in the action and callers in the report:
-what is long, world and filter, is compiled once for all of them.
+A step has four parts. They are separate, because scenarios differ in the world, controls in the action and callers in
+the report. The long parts, world and filter, are compiled once for all of them.
 """
 
 import functools
@@ -21,14 +21,14 @@ from ..contract.model import Episode, Model
 from ..contract.observation import Array
 
 PROGRAM_CACHE_SIZE = 8
-"""Tasks whose programs a process keeps."""
+"""Number of tasks whose programs a process stores."""
 
 Report = Callable[[Model, Episode], Any]
 """Function of a task and its episodes after the action: nested tuples or dictionaries of arrays."""
 
 
 def _update(model: Model, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
-    """Return the filter after the measurement, and what it gives back to the world."""
+    """Return the filter after the measurement, and its feedback to the world."""
     after = model.filter.update(state, FilterInput(measurement, truth, action))
     return after, model.feedback(after, measurement)
 
@@ -39,13 +39,13 @@ def _advance(model: Model, truth: Any, feedback: Any, noise: Array) -> tuple[Any
 
 
 def _predict(model: Model, state: Any, measurement: Any) -> tuple[Any, Array]:
-    """Return the filter at the measurement, and what is shown of it."""
+    """Return the filter at the measurement, and its observation."""
     predicted = model.filter.predict(state, measurement)
     return predicted, model.observe(Episode(None, measurement, predicted))
 
 
 def _predict_unseen(model: Model, state: Any, measurement: Any) -> Any:
-    """Return the filter at the measurement, of which nothing is shown."""
+    """Return the filter at the measurement, without an observation."""
     return model.filter.predict(state, measurement)
 
 
@@ -55,24 +55,24 @@ def begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any
 
 
 def start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
-    """Return the filter at the start of the track, and what it gives back to the world."""
+    """Return the filter at the start of the track, and its feedback to the world."""
     state = model.filter.initialise(FilterInput(initial, truth))
     return state, model.feedback(state, initial)
 
 
 class Parts(NamedTuple):
-    """Programs of a step, and what they are made for."""
+    """Programs of a step, and the episode that they are made for."""
 
     update: Specialised
     advance: Specialised
     predict: Specialised
     episode: Episode
-    """After the measurement, its arrays of the right shapes."""
+    """Episode after the measurement, with arrays of the right shapes."""
 
 
 class _ComputedOnce:
-    """A property that is computed once, as of functools from Python 3.12 on: before, it holds a lock that a fork would
-    leave to a child for ever.
+    """Property that is computed once, without a lock. That of functools has one before Python 3.12, which a fork could
+    leave locked in a child for ever.
     """
 
     def __init__(self, compute: Callable[[Any], Any]) -> None:
@@ -89,8 +89,8 @@ class Programs:
 
     Args:
         traced: the task on traced arrays.
-        graph: where its constants were made.
-        of_world: what is traced of the same task with another filter; the world is the same.
+        graph: graph of its constants.
+        of_world: programs of the same task with another filter, whose world these share.
     """
 
     def __init__(self, traced: Model, graph: Graph, of_world: "Programs | None" = None) -> None:
@@ -104,7 +104,7 @@ class Programs:
         self._kept: dict[Any, Any] = {}
 
     def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "Programs":
-        """Return what is traced of the task with another filter; kept for the next time.
+        """Return the programs of the task with another filter, and store them.
 
         Raises:
             NotTraceable: if the filter is no straight line of arithmetic.
@@ -120,7 +120,7 @@ class Programs:
         return self._with_filter[make]
 
     def keep(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return what is compiled for the task beside it, made where there is none by this key; the last ones stay."""
+        """Return the object stored by a key, or make and store it; the last ones stay."""
         if key not in self._kept:
             made = make()
             while len(self._kept) >= PROGRAM_CACHE_SIZE:
@@ -139,12 +139,12 @@ class Programs:
 
     @_ComputedOnce
     def filter_update(self) -> CompiledFunction:
-        """Return the program of the filter update; a part of it that stays is not written again."""
+        """Return the program of the filter update; a part of it that does not change is not written again."""
         return self.function(_update, unchanged=None)
 
     @_ComputedOnce
     def world_advance(self) -> CompiledFunction:
-        """Return the program of the world; a part of the truth that stays is not written again."""
+        """Return the program of the world; a part of the truth that does not change is not written again."""
         if self._of_world is not self:
             return self._of_world.world_advance
         return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
@@ -156,7 +156,7 @@ class Programs:
 
     @_ComputedOnce
     def world_start(self) -> Specialised:
-        """Return the world at the start of the track."""
+        """Return the program of the world at the start of the track."""
         if self._of_world is not self:
             return self._of_world.world_start
         noise = self.traced.task.noise
@@ -165,7 +165,7 @@ class Programs:
 
     @_ComputedOnce
     def start(self) -> tuple[Specialised, Specialised]:
-        """Return the world and filter at the start of the track."""
+        """Return the program of world and filter at the start of the track."""
         truth, initial = self.world_start.example()
         return self.world_start, self.function(start_filter).specialise(
             initial, self.traced.truth_for_filter(truth)
@@ -173,13 +173,13 @@ class Programs:
 
     @_ComputedOnce
     def first(self) -> Parts:
-        """Return the parts of the way from the start of the track over the first measurement."""
+        """Return the programs from the start of the track over the first measurement."""
         world, started = self.start
         return self._parts(world.example()[0], *started.example())
 
     @_ComputedOnce
     def later(self) -> Parts:
-        """Return the parts of the way from an action to the next.
+        """Return the programs from an action to the next.
 
         Raises:
             NotTraceable: if one is no straight line of arithmetic.
@@ -203,7 +203,7 @@ class Programs:
 
     @property
     def is_open_loop(self) -> bool:
-        """Whether the filter gives nothing back to the world."""
+        """Whether the filter has no feedback to the world."""
         started, first, later = self.start[1], self.first.update, self.later.update
         states = len(leaves(self.later.episode.filter))
         return all(len(program.outputs) == states for program in (started, first, later))

@@ -17,18 +17,18 @@ from .catalogue import USER_TASKS, catalogue, nearest, register
 
 ID = re.compile(r"[\w-]+/[\w.-]+-v\d+")
 WIDTH = 24
-"""Episodes side by side in the check of a task: a multiple of eight, as always, and hardly the number of anything else
-that it has."""
+"""Episodes side by side in the check of a task: a multiple of eight, and unlikely as a size of other arrays of the
+task."""
 
 
 def add_task(cls: type[Task]) -> None:
-    """Put a task into the catalogue and register it with Gymnasium; the same one again changes nothing.
+    """Add a task to the catalogue and register it with Gymnasium; adding it again changes nothing.
 
     Args:
-        cls: class that keeps the contract of :class:`.task.Task`.
+        cls: class that fulfils the contract of :class:`.task.Task`.
 
     Raises:
-        ValueError: if it does not keep the contract, or another environment has its id.
+        ValueError: if it does not fulfil the contract, or another environment has its id.
     """
     _check_contract(cls)
     if USER_TASKS.get(cls.id) is cls:
@@ -42,7 +42,7 @@ def add_task(cls: type[Task]) -> None:
 
 
 def _check_contract(cls: Any) -> None:
-    """Raise ValueError, with what is missing, for what cannot be an environment."""
+    """Raise ValueError for a class that cannot be an environment, with the missing parts."""
     if not (isinstance(cls, type) and issubclass(cls, Task)):
         raise ValueError(f"an environment is a subclass of filtergym.envs.contract.task.Task, got {cls!r}")
     name = cls.__name__
@@ -73,7 +73,7 @@ def _check_contract(cls: Any) -> None:
         raise nearest(f"control in actions of {name}", min(strange), cls.banks)
     for key, scenario in cls.scenarios.items():
         if key != scenario.name:
-            raise ValueError(f"scenario {scenario.name!r} of {name} stands in the table as {key!r}")
+            raise ValueError(f"scenario {scenario.name!r} of {name} has the key {key!r} in scenarios")
         unknown = set(scenario.parameters) - fields
         if unknown:
             raise ValueError(
@@ -108,12 +108,12 @@ def _check_action(model: Model) -> None:
         )
     if paper.control == model.control and flat and (len(paper.action),) != space.shape:
         raise ValueError(
-            f"{_name_of(model)} takes actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
+            f"{_name_of(model)} has actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
         )
 
 
 def _check_causes(model: Model) -> None:
-    """Raise ValueError for causes that a table could not tell apart."""
+    """Raise ValueError for causes with ambiguous names in a table."""
     names = [cause.name for cause in Causes.of(model.task).causes]
     twice = [name for name in names if names.count(name) > 1 or name in RESERVED]
     if twice or len(names) > MOST_CAUSES:
@@ -125,10 +125,10 @@ def _check_causes(model: Model) -> None:
 
 
 def _check_episodes(model: Model) -> None:
-    """Fly some episodes for two measurements on NumPy, and compare what the task computes with what it declares.
+    """Run some episodes for two measurements on NumPy, and compare the results with the declaration of the task.
 
     Raises:
-        ValueError: for the first that does not fit, or raises.
+        ValueError: for the first result that does not fit, or the first error.
     """
     random, noise, names = (
         numpy.random.default_rng(0),
@@ -209,7 +209,7 @@ def _check_episodes(model: Model) -> None:
         holds = ask(f"cause {cause.name!r}", cause.holds, model.moment(episode))
         if holds is not None:
             check(f"cause {cause.name!r}", holds, ())
-    episode = measure(episode)  # with what the bank gives back
+    episode = measure(episode)  # with the feedback of the bank
     before = dict([*_leaves("truth", start.truth), *_leaves("filter's state", start.filter)])
     for part in ("truth", "measurement", "filter's state"):
         for name, values in _leaves(part, getattr(episode, part.partition("'")[0])):
@@ -223,7 +223,7 @@ def _check_episodes(model: Model) -> None:
 
 
 def _leaves(name: str, part: Any) -> Iterator[tuple[str, Any]]:
-    """Return the arrays of nested tuples and dictionaries, and whatever stands in their place, with names such as
+    """Return the arrays of nested tuples and dictionaries, and other objects in their place, with names such as
     "load of the truth".
     """
     if isinstance(part, dict):

@@ -12,13 +12,13 @@
   positive where the agent does better than the paper.
 * ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is the counted cost of the agent and ``x0`` that of the
   zero action of the same control on the same noise, both in units of the paper's average, or where few lost
-  tracks rule that, of an ordinary episode (``Reward.log_unit``). It is zero where the agent does nothing, the
-  difference of small costs, and the logarithm of the ratio of large ones. So a few wild episodes, which rule the mean
-  of the cost, do not hide what an action changes in all others.
+  tracks dominate that, of an ordinary episode (``Reward.log_unit``). It is zero for the zero action, the
+  difference of small costs, and the logarithm of the ratio of large ones. So a few extreme
+  episodes, which dominate the mean of the cost, do not hide the effect of an action in all others.
 
 :attr:`.Reward.kind` of the task is the default.
 
-The counted cost is the cost, or the part of it that :meth:`.World.counted_cost` leaves. What an evaluation compares is
+The counted cost is the cost, or the part of it that :meth:`.World.counted_cost` leaves. An evaluation compares
 the whole cost, neither compressed nor in another unit.
 """
 
@@ -48,30 +48,30 @@ def compressed_cost(model: Model, state: Any) -> Array:
 
 
 def cost_reward(model: Model, state: Any) -> Array:
-    """Return the minus the compressed cost of the estimate, ``(N,)``."""
+    """Return minus the compressed cost of the estimate, ``(N,)``."""
     return -compressed_cost(model, state)
 
 
 def log_cost_reward(model: Model, state: Any) -> Array:
-    """Return the minus ``log(1 + x)`` of the counted cost x in units of an ordinary one, ``(N,)``."""
+    """Return minus ``log(1 + x)`` of the counted cost x in units of an ordinary one, ``(N,)``."""
     unit = model.task.reward.log_unit or model.task.reward.unit
     return -model.task.xp.log1p(model.counted_cost(state) * (1.0 / unit))
 
 
 def log_likelihood_reward(model: Model, state: Any) -> Array:
-    """Return the log-density of the truth under what is reported, ``(N,)``."""
+    """Return the log-density of the truth under the reported Gaussian, ``(N,)``."""
     return log_density(model.error(state), model.covariance(state))[0]
 
 
 def cost_and_likelihood_reward(model: Model, state: Any) -> Array:
-    """Both: minus the compressed cost, plus the log-density of a component, ``(N,)``."""
+    """Return minus the compressed cost plus the log-density per component, ``(N,)``."""
     return cost_reward(model, state) + log_likelihood_reward(model, state) * (
         1.0 / len(model.task.components)
     )
 
 
 LIKELIHOOD_WEIGHTS = {"cost": 0.0, "cost-and-likelihood": 1.0}
-"""Of the log-density of a component, in the rewards that a teacher can give."""
+"""Weight of the log-density per component, in the rewards that :func:`teacher_reward` gives."""
 
 
 def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance: Array) -> Array:
@@ -79,7 +79,7 @@ def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance:
 
     With d = x - m, the student's estimate less the teacher's, and their covariances P and S, the log-density is
     expected to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A cost is a square of errors, and adds that of the teacher's own
-    errors, which the student cannot change: what counts is the cost of d.
+    errors, which the student cannot change: only the cost of d counts.
 
     Args:
         kind: of reward, one of ``LIKELIHOOD_WEIGHTS``.
@@ -100,7 +100,7 @@ def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance:
 
 
 def no_reward(model: Model, state: Any) -> Array:
-    """Zero, ``(N,)``, where the truth is not known."""
+    """Return zero, ``(N,)``, for an unknown truth."""
     return 0.0 * model.mean(state)[0]
 
 
@@ -112,10 +112,10 @@ OWN_REWARDS: dict[str, Callable[[Model, Any], Array]] = {
     "log-relative": log_cost_reward,
     "none": no_reward,
 }
-"""Functions of a model and its episodes. Where there is a :func:`reference`, the same of it is subtracted later. "none"
-is that of recordings without truth."""
+"""Functions of a model and its episodes. Where there is a :func:`reference`, its reward is subtracted later. "none" is
+for recordings without truth."""
 REWARDS = tuple(kind for kind in OWN_REWARDS if kind != "none")
-"""Those that can be asked for."""
+"""Kinds of reward that a user can choose."""
 
 
 class RewardBaseline(NamedTuple):
@@ -124,11 +124,11 @@ class RewardBaseline(NamedTuple):
     model: Model
     """The same task, under a control."""
     action: tuple[float, ...] | int
-    """That holds in every decision, as the control's space has it."""
+    """Its action in every decision, an element of the control's space."""
 
 
 def reference(kind: str, model: Model) -> RewardBaseline | None:
-    """Return what the reward of an agent is relative to; None where it is the agent's own.
+    """Return the baseline of a relative reward; None for a reward without one.
 
     Args:
         kind: of reward.

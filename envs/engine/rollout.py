@@ -1,8 +1,8 @@
-"""Measurements of compiled episodes that are flown, kept, and then differentiated in reverse.
+"""Rollout of compiled episodes, stored and then differentiated in reverse.
 
-Forward every measurement writes the episodes after it into memory of their own. Backward the code of a step's
-pullback (:mod:`..compiler.gradients`) computes the step again from them and turns the gradient with respect to what
-comes out of it into that with respect to what went in.
+Forward, every measurement writes the episodes after it into memory of their own. Backward, the code of a step's
+pullback (:mod:`..compiler.gradients`) computes the step again from them, and turns the gradient with respect to its
+output into that with respect to its input.
 """
 
 import functools
@@ -22,9 +22,9 @@ class TrainingObjective(NamedTuple):
     """Function whose gradient is computed."""
 
     kind: str
-    """Of reward."""
+    """Kind of reward."""
     teacher_share: float = 0.0
-    """Share of what a teacher's estimates say in the place of the truth, see :func:`.reward.teacher_reward`."""
+    """Weight of a teacher's estimates against the truth in the reward, see :func:`.reward.teacher_reward`."""
 
 
 def _unpack(like: Episode, state: Any) -> Episode:
@@ -65,7 +65,7 @@ def _backward(
     """Return the gradients with respect to episodes and action, from those with respect to what :func:`_forward`
     returns.
 
-    The last three arguments are the latter; what stands before them is the teacher's.
+    The last three arguments are the latter; those before them are the teacher's.
     """
     outputs = _forward(programs, reward, state, action, noise, *others[:-3])
     return tuple(pullback(programs.graph, outputs, others[-3:], (state, action)))
@@ -92,15 +92,15 @@ class Rollout:
 
     Args:
         model: compiled.
-        reward: whose gradient it is.
+        reward: objective of the gradient.
         width: lanes, a multiple of eight.
-        measurements: that are kept at once.
+        measurements: number stored at once.
 
     Attributes:
-        action: of every measurement, ``(measurements, A, width)``, to be written before it is flown.
+        action: of every measurement, ``(measurements, A, width)``, to be written before :meth:`forward`.
         noise: of every measurement, ``(measurements, row width, width)``.
         teacher: of every measurement, means ``(measurements, C, width)`` and covariances ``(measurements, C C, width)``
-            of a teacher; nothing where there is none.
+            of a teacher; empty without one.
         reward: of the last action, ``(width,)``.
         shown: last observation, ``(fields, width)``.
         reward_adjoint: gradient with respect to the reward, ``(width,)``, to be written.
@@ -124,7 +124,7 @@ class Rollout:
         given = [self._states[0], self.action[0], self.noise[0], *(each[0] for each in self.teacher)]
         self._forward = forward.bound(given, [self._next, self.reward, self.shown])
         adjoint, other = empty_lanes((rows,), width), empty_lanes((rows,), width)
-        # One reads what the other has written.
+        # One reads the output of the other.
         self._backward = [
             backward.bound(
                 [*given, after, self.reward_adjoint, self.shown_adjoint], [before, self.action_adjoint]
@@ -134,9 +134,9 @@ class Rollout:
         memories = zip(self._states[:-1], self.action, self.noise, *self.teacher, strict=True)
         self._places = numpy.array([[address_of(array) for array in memory] for memory in memories])
         self._adjoint = len(given)
-        """Place among the arrays of a call of the gradient with respect to the episodes after it."""
+        """Index, among the arrays of a call, of the gradient with respect to the episodes after it."""
         self._addresses = slice(1, 1 + 2 * len(given), 2)
-        """Where the table of a :class:`~..compiler.functions.Call` holds the addresses of what is given."""
+        """Places of the addresses of inputs in the table of a :class:`~..compiler.functions.Call`."""
         self._width, self._flown = width, 0
 
     def load(self, episode: Episode) -> None:
@@ -146,12 +146,12 @@ class Rollout:
         self._flown = 0
 
     def go_on(self) -> None:
-        """Begin where the episodes are; what was flown is forgotten."""
+        """Begin with the current episodes, and delete the stored measurements."""
         self._states[0][...] = self._states[self._flown]
         self._flown = 0
 
     def forward(self) -> None:
-        """Fly one measurement."""
+        """Run one measurement."""
         here = self._flown
         self._forward.table[self._addresses] = self._places[here]
         self._forward(0, self._width)

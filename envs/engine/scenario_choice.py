@@ -15,7 +15,7 @@ from ..data.scenario_data import ScenarioData, readers
 from .catalogue import check_names, nearest
 
 ScenarioChoice = str | Path | ScenarioData | Sequence[Any] | Mapping[str, Any] | None
-"""What names a scenario: a name, files of flights, trajectories or their fields, or None for the environment's own."""
+"""Choice of a scenario: a name, files of flights, trajectories or their fields, or None for the environment's own."""
 
 MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
 """A mixture in words: ``random:0.8,paper:0.2``."""
@@ -37,7 +37,7 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
             words, ``"random:0.8,paper:0.2"``. A weight of zero leaves a scenario out.
 
     Raises:
-        ValueError: for an unknown scenario, and for weights that are none.
+        ValueError: for an unknown scenario, and for invalid weights.
     """
     if isinstance(scenario, Mapping):
         given = dict(scenario)
@@ -77,14 +77,14 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
 
 
 def read_files(cls: type[Task], scenario: Any) -> Any:
-    """Return flights or a recording in place of what names them, so that files are read once; anything else as it is.
+    """Return the flights or the recording of a path, so that files are read once; return other choices unchanged.
 
     Args:
         cls: the environment.
-        scenario: as :func:`find_scenario` takes it; a name of one of the environment's own is no file.
+        scenario: as :func:`find_scenario` takes it; the name of one of the environment's own scenarios is no file.
 
     Raises:
-        ValueError: if the files hold neither.
+        ValueError: if the files contain neither.
     """
     if scenario is None or (isinstance(scenario, str) and scenario in cls.scenarios):
         return scenario
@@ -110,11 +110,11 @@ def find_scenario(
         cls: the environment.
         scenario: a name; a trajectory (also as a dictionary of its fields, as it comes out of JSON); a set of
             flights as :func:`~.flights.read_flights` takes it, or returns it; a recording, or a NetCDF file of one; or
-            what was found before.
+            a scenario.
         keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
 
     Raises:
-        ValueError: for an unknown scenario or parameter, or a file that holds no trajectory.
+        ValueError: for an unknown scenario or parameter, or a file without a trajectory.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -148,10 +148,10 @@ def make_task(
     """Make a task.
 
     Args:
-        cls: of which.
+        cls: the class of tasks.
         scenario: as :func:`find_scenario` takes it.
         xp: array namespace, NumPy or ``array_api_compat.torch``.
-        device: where a torch task keeps its arrays.
+        device: device of the arrays of a torch task.
         **keywords: parameters of the task. A keyword wins over the scenario, the scenario over the default.
 
     Raises:

@@ -32,7 +32,7 @@ def mean_of(rewards: Sequence[Any]) -> Any:
 
 
 MANY = 64
-"""Lanes from which on observations are written where the caller will keep them, instead of into a copy."""
+"""Lanes from which on observations are written into memory that the caller may keep, instead of being copied."""
 WIDE = 1024
 """Lanes beyond which the numbers of a tile of them lie side by side: more leave the cache between two steps, and memory
 is read faster in one piece than row by row."""
@@ -43,10 +43,10 @@ class Stepper:
 
     Args:
         model: compiled.
-        report: made of every episode after the action.
+        report: function of the model and its episodes after the action.
         width: lanes, a multiple of eight.
-        world_of: a stepper of the same task, both filters in an open loop. Its world is this one's too, and the
-            observation of this one is not used. Each call on both is made on it first.
+        world_of: a stepper of the same task, both filters in an open loop. The two share its world, and the
+            observation of this one is not used. Call it before this one.
 
     Attributes:
         action: applied at every step, ``(..., width)``.
@@ -54,7 +54,7 @@ class Stepper:
 
     def __init__(self, model: Any, report: Report, width: int, world_of: "Stepper | None" = None) -> None:
         update, advance, predict, episode = model.programs.later
-        tell = model.programs.report_program(report)
+        report_code = model.programs.report_program(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
         self._threads, self._model, self._report = model.threads, model, report
         self.width = width
@@ -62,7 +62,10 @@ class Stepper:
         count = itertools.count()
         self._template = map_arrays(lambda _: next(count), episode)
         self._kinds = [array.dtype.kind for array in leaves(episode)]
-        self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
+        self._report_template, self._report_kinds = (
+            report_code.template,
+            [leaf.kind for leaf in report_code.outputs],
+        )
 
         self.action: numpy.ndarray = empty_lanes(update.inputs[-1].shape, width)
         self.action[...] = 0.0
@@ -75,10 +78,10 @@ class Stepper:
         """Lanes that go through a decision together."""
         self._shown, self._given = numpy.empty((width, fields)), False
         self._first_shown = self._shown[0]
-        self._reported = memory_of(tell.outputs, width)
+        self._reported = memory_of(report_code.outputs, width)
         knows = bool(model.filter.knows)
-        # Episodes go to and fro between two copies, which share what stays as it is. Of the filter they share what is
-        # not read any more when the prediction is written: all but what the update has handed on.
+        # Episodes alternate between two copies, which share the arrays that do not change. Of the filter they share
+        # the arrays not read any more when the prediction is written: all but the results of the update.
         outputs = [*advance.outputs, *predict.outputs[:-1]][self._shared :]
         ahead_of_filter = truths if knows else 0
         handed_on = [ahead_of_filter + i in update.same for i in range(states)]
@@ -87,7 +90,7 @@ class Stepper:
         stay, go = ([o for o, s in zip(outputs, stays, strict=True) if s is which] for which in (True, False))
         self._staying, staying = _side_by_side(stay, width, self._tile)
         self._going: list[numpy.ndarray] = []
-        """Of each copy the numbers of all arrays that are not shared, ``(numbers, tiles, tile)``."""
+        """Numbers of all arrays of each copy that are not shared, ``(numbers, tiles, tile)``."""
         self._copies: list[list[numpy.ndarray]] = []
         for world in ([], []) if world_of is None else world_of._copies:
             numbers, going = _side_by_side(go, width, self._tile)
@@ -118,7 +121,7 @@ class Stepper:
             ahead, predicted = then[: truths + measured], then[truths + measured :]
             step = [
                 update.bound(given, written),
-                tell.bound([*truth, *measurement, *updated[:states]], self._reported),
+                report_code.bound([*truth, *measurement, *updated[:states]], self._reported),
             ]
             begin = [start.bound([*self._initial, *(truth if knows else [])], written)]
             came = ahead[truths:]
@@ -147,16 +150,16 @@ class Stepper:
         self._bound: dict[bool, _Bound] = {}
         """Whole decisions (True) and beginnings (False), bound at the first of either."""
         self._passing: numpy.ndarray | None = None
-        """What is shown at each measurement of a decision, ``(interval, width, fields)``, where means of it are."""
+        """Observation at each measurement of a decision, ``(interval, width, fields)``, for means of them."""
         self.reported: list[numpy.ndarray] = []
-        """What the reports of a decision are written to, ``(interval, ..., width)`` each."""
+        """Memory for the reports of a decision, ``(interval, ..., width)`` each."""
         self._first_rewards = numpy.empty(0)
         self._policy_memory: list[numpy.ndarray] | None = None
-        """Of a policy after the last :meth:`run`; None: before its first action."""
+        """Memory of a policy after the last :meth:`run`; None: before its first action."""
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
-        self._action_place, self._report_place = len(update.inputs) - 1, len(tell.inputs)
+        self._action_place, self._report_place = len(update.inputs) - 1, len(report_code.inputs)
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Continue from other episodes with this observation, ``(fields, width)``."""
@@ -168,22 +171,22 @@ class Stepper:
             self._shown[...] = shown.T
 
     def episode(self) -> Episode:
-        """Return the episodes, in arrays that stay as they are."""
+        """Return the episodes, in arrays that do not change."""
         arrays = [array.reshape(*array.shape[:-2], self.width) for array in self._copies[self._now]]
         return copy_arrays(self._template, arrays, self._kinds)
 
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Start episodes everywhere and let their first measurement arrive; others do so beside it.
+        """Start episodes in all lanes up to their first measurement, in other steppers too.
 
         Args:
             identities: of the episodes, ``(2, lanes)``, see :mod:`.episode_noise`; the other lanes are padding.
-            noise: that makes their numbers.
-            others: of the same task.
+            noise: random numbers of the lanes.
+            others: steppers of the same task.
 
         Returns:
-            Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)`` of the start, until the next.
+            Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)``, valid until the next start.
         """
         self._policy_memory = None
         noise.put(identities)
@@ -191,7 +194,7 @@ class Stepper:
         return self._drawn
 
     def _bind_beginnings(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
-        """Bind the start and the first measurement, of the task and of what runs beside it, to memory."""
+        """Bind the start and the first measurement, of the task and of the other steppers, to memory."""
         turns = [[noise.start_call(self._start_numbers), draw] for _ in (0, 1)]
         for each in (self, *others):
             for begin, turn in zip(each._begin, turns, strict=True):
@@ -208,7 +211,7 @@ class Stepper:
         return _bound(draw, sequences, shown)
 
     def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
-        """Run whole decisions, or beginnings, of the task and of what runs beside it, as one native call."""
+        """Run whole decisions, or beginnings, of the task and of the other steppers, as one native call."""
         draw = noise.call_of_each()
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
@@ -232,16 +235,16 @@ class Stepper:
         noise: EpisodeNoise,
         others: "Sequence[Stepper]" = (),
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Start episodes in some lanes and let their first measurement arrive; others do so beside it.
+        """Start episodes in some lanes up to their first measurement, in other steppers too.
 
         Args:
-            lanes: which, ascending.
+            lanes: numbers of the lanes, ascending.
             identities: of the episodes, ``(2, lanes)``.
-            noise: of as many lanes, or more.
-            others: of the same task.
+            noise: of at least as many lanes.
+            others: steppers of the same task.
 
         Returns:
-            As :meth:`begin`.
+            Uniforms and normals of the start, as of :meth:`begin`.
         """
         steppers = (self, *others)
         for each in steppers:
@@ -268,9 +271,9 @@ class Stepper:
         self._first_action[...] = action
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
-        """Take in all measurements of a decision with the action, and report on each; others do so beside it.
+        """Update with all measurements of a decision and the action, and report on each, in other steppers too.
 
-        A tile of lanes goes through all of it, with the others, as one native call.
+        One native call runs all of it for a tile of lanes.
         """
         self._run_bound(True, noise, others)
         if self._passing is not None:
@@ -281,7 +284,7 @@ class Stepper:
             self._shown[:, self._means.columns] = total[:, self._averages]
 
     def _bind_decisions(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
-        """Bind all measurements of a decision, of the task and of what runs beside it, to memory."""
+        """Bind all measurements of a decision, of the task and of the other steppers, to memory."""
         columns, interval = self._means.columns, self._interval
         if columns:
             self._passing = numpy.empty((interval, *self._shown.shape))
@@ -312,8 +315,8 @@ class Stepper:
     def _let_pass(
         self, turns: Sequence[Sequence[Call]], noise: EpisodeNoise, others: "Sequence[Stepper]"
     ) -> list[tuple[Call, int, int]]:
-        """Give calls of decisions memory of a tile for what is not looked at afterwards: noise, and filters between
-        update and prediction. Returns where, as :class:`.CallSequence` takes it.
+        """Give calls of decisions memory of one tile for temporary values: noise, and filters between update and
+        prediction. Returns the places, as of :class:`.CallSequence`.
         """
         row = noise.call_of_each().arrays[2]
         places = {
@@ -334,7 +337,7 @@ class Stepper:
     def _tiled(
         self, turns: Sequence[Sequence[Call]], others: "Sequence[Stepper]" = ()
     ) -> list[tuple[Call, int, int]]:
-        """Return the places of arrays of the first tile of lanes in the calls, as :class:`.CallSequence` takes it."""
+        """Return the places of arrays of the first tile of lanes in the calls, as of :class:`.CallSequence`."""
         apart = {id(array): hop for each in (self, *others) for array, hop in each._apart}
         calls = [call for turn in turns for call in turn]
         places = [(call, place, apart.get(id(a), 0)) for call in calls for place, a in enumerate(call.arrays)]
@@ -358,8 +361,8 @@ class Stepper:
         Args:
             noise: of the measurements.
             steps: how many.
-            compiled_policy: function of what is shown, read lane by lane, and of a memory that begins with zeros, to
-                an action and the memory; a second run of the same episodes goes on. None: the action stays as it is.
+            compiled_policy: function of the observation, lane by lane, and of a memory that begins with zeros. It
+                returns action and memory; a second run of the same episodes continues. None: a constant action.
 
         Returns:
             The report on every measurement, in arrays ``(steps, ..., width)``, and the actions in the same form; None
@@ -376,9 +379,9 @@ class Stepper:
         turns: list[list[Call]] = []
         moving: list[Moving] = []
         for now in (self._now, 1 - self._now):
-            update, tell, *others = self._bound_copies(now, noise, reported, moving)
+            update, report_code, *others = self._bound_copies(now, noise, reported, moving)
             others[-1].replace(len(others[-1].arrays) - 1, self._shown)
-            turns.append([update, tell, draw, *others])
+            turns.append([update, report_code, draw, *others])
             if compiled_policy is not None and actions is not None:
                 steer = compiled_policy.bound([self._shown, *memories[0]], [actions[0], *memories[1]])
                 turns[-1].insert(0, steer)
@@ -389,11 +392,11 @@ class Stepper:
         sequence = CallSequence(even, odd, moving, steps, self._tiled(turns), self._together)
         sequence.run_once(self.width, self._threads)
         self._now, self._policy_memory = (self._now + steps) % 2, memories[steps % 2]
-        answers = [
+        reports = [
             array if kind == "f" else array.astype(DTYPES[kind])
             for array, kind in zip(reported, self._report_kinds, strict=True)
         ]
-        return map_arrays(lambda i: answers[i], self._report_template), actions
+        return map_arrays(lambda i: reports[i], self._report_template), actions
 
     def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
         """Return the memory of a policy before its first action."""
@@ -410,8 +413,8 @@ class Stepper:
         ]
 
     def first_reward(self, beside: "Stepper | None") -> float:
-        """Return the mean of these reports of the first lane, where each is one number, less those of what runs
-        beside it.
+        """Return the mean of these reports of the first lane, where each is one number, less those of the
+        stepper beside it.
         """
         if self._interval == 1:
             own: float = self._first_rewards.item(0)
@@ -421,7 +424,7 @@ class Stepper:
 
     @property
     def rewards(self) -> numpy.ndarray:
-        """These reports where each is one number, ``(interval, width)``; more than one row changes with the next
+        """Return these reports where each is one number, ``(interval, width)``; several rows are valid until the next
         decision.
         """
         return self.reported[0] if self._interval > 1 else self.reported[0].copy()
@@ -431,14 +434,14 @@ class Stepper:
         return self._shown.T
 
     def observation(self, count: int) -> numpy.ndarray:
-        """Return the observation of the first lanes, batch first; the caller may keep it."""
+        """Return the observation of the first lanes, batch first, in memory that the caller may keep."""
         if count < MANY:
             return self._shown[:count].copy()
         self._given = True
         return self._shown[:count]
 
     def observation_of_first(self) -> numpy.ndarray:
-        """Return the observation of the first lane; the caller may keep it."""
+        """Return the observation of the first lane, in memory that the caller may keep."""
         return self._first_shown.copy()
 
     def _show_in(self, memory: numpy.ndarray) -> None:
@@ -450,14 +453,14 @@ class _Bound(NamedTuple):
     """One native call, from either of the two copies of the episodes."""
 
     draw: Call
-    """What makes the noise of a measurement."""
+    """Call that makes the noise of a measurement."""
     sequences: list[CallSequence]
     shown: list[list[Call]]
-    """From each, the calls whose last array is what is shown: its memory is put there before they run."""
+    """Calls from each copy whose last array is the observation: its memory is inserted before they run."""
 
 
 def _bound(draw: Call, sequences: list[CallSequence], shown: list[list[Call]]) -> _Bound:
-    """Put together what is run from either copy, by the same code."""
+    """Combine the calls from both copies, which have the same code."""
     sequences[1].count_with(sequences[0])
     return _Bound(draw, sequences, shown)
 

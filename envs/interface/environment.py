@@ -24,7 +24,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
 
     Args:
         task: environment id.
-        control: what the action steers; default: the first of the environment's controls.
+        control: name of a control; default: the first of the environment.
         scenario: name of a scenario, a :class:`~filtergym.envs.data.trajectory.Trajectory` or a dictionary of its
             fields, or the path of a file with one; a :class:`~filtergym.envs.data.recording.Recording`, or its file; or
             a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies one scenario, drawn by these
@@ -32,16 +32,16 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative", see :mod:`.reward`; default: the
             environment's own, and zero on a recording without truth.
         render_mode: None, "rgb_array" or "human".
-        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
-            cost and what else an evaluation records.
+        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Model.track`), error,
+            cost and the further records of an evaluation.
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
-        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
-            given out.
-        context: whether ``info["context"]`` holds what was drawn for the episode and what of it holds now
-            (:meth:`.Task.context`), at resets and steps.
+        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
+            return.
+        context: whether ``info["context"]`` contains the random draws of the episode and those in force now
+            (:meth:`.World.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
-            and of what is "privileged", the context and the error after the last action in units of its reported
-            standard deviation (zero at a reset). No policy may be shown that where it is judged.
+            and of "privileged" values, the context and the error after the last action in units of its reported
+            standard deviation (zero at a reset). No policy may observe them where it is evaluated.
         **keywords: parameters of the task.
 
     Raises:
@@ -97,14 +97,14 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode and show its first measurement.
+        """Start an episode and observe its first measurement.
 
-        ``options["scenario"]``: what ``scenario`` of the environment takes; None is the environment's own again.
-        ``options["parameters"]``: parameters that go before those of the environment; ``{}`` for none. Each holds until
-        a reset names another.
+        ``options["scenario"]``: as the argument ``scenario`` of the environment; None: the environment's own again.
+        ``options["parameters"]``: parameters that override those of the environment; ``{}`` for none. Each applies
+        until a reset names another.
 
         Raises:
-            ValueError: for a seed that is none, other options, an unknown name or a value out of its limits in them,
+            ValueError: for an invalid seed, other options, an unknown name or a value out of its limits in them,
                 and for a scenario or parameters that would change the spaces.
         """
         wanted, seed = check_options(options, self.reset_options), check_seed(seed)
@@ -134,7 +134,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Apply the action to the measurement just shown, then show the next one."""
+        """Apply the action to the last measurement, then observe the next one."""
         lanes = self.fleet.whole if self._plain and self._late is None else None
         if lanes is not None and lanes.flies_alone:
             if not (
@@ -142,7 +142,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
                 and action.shape == self._plain_action
                 and action.dtype.kind == "f"
                 and all(map(math.isfinite, action.tolist()))
-            ):  # otherwise there is nothing to look at
+            ):  # otherwise no picture is needed
                 action = check_action(self.action_space, action, None)
             observation, reward, over = lanes.step_alone(action, self.reward_kind)
             return observation, reward, False, over, {}

@@ -36,14 +36,14 @@ class EnvBase:
     """Common base of both environments: a task, its spaces, and the reward."""
 
     model: Model
-    """Where scenarios are mixed: of the single environment the one that is flown, of a vector the first."""
+    """Model of the episode; with a mixture of scenarios in a vector environment, of the first scenario."""
     fleet: Fleet
     options: EnvOptions
     reward_kind: str
     last_decision: int
-    """Actions after which an episode is truncated, where scenarios differ in length the longest one."""
+    """Number of actions after which an episode is truncated; of scenarios that differ in length, the largest."""
     reset_options: ClassVar[tuple[str, ...]] = ("scenario", "parameters")
-    """Names that ``options`` of a reset may have."""
+    """Names allowed in the ``options`` of a reset."""
     _spec: EnvSpec | None = None
 
     @property
@@ -52,7 +52,7 @@ class EnvBase:
         return self.model.task
 
     def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
-        """Keep the options; refuse an unknown environment or parameter before anything is made."""
+        """Store the options; raise ValueError for an unknown environment or parameter, before a model is made."""
         self._class = task_class(task)
         check_names(self._class, names, inspect.signature(type(self)).parameters)
         self.options = options
@@ -61,13 +61,13 @@ class EnvBase:
             raise nearest("reward", self.reward_kind, REWARDS)
         self._rewards_only = not (options.detailed_info or options.privileged)
         self._plain = self._rewards_only and not options.context and options.dtype == "float64"
-        """Whether a step gives nothing but an observation and a reward, as they are computed."""
+        """Whether a step returns only observation and reward, as they are computed."""
         if self.privileged:
             self.metadata: dict[str, Any] = {**self.metadata, "privileged": True}
 
     @property
     def privileged(self) -> bool:
-        """Whether observations hold what no policy can know."""
+        """Whether observations contain privileged values."""
         return self.options.privileged
 
     def _open(
@@ -81,8 +81,8 @@ class EnvBase:
         """Make the lanes.
 
         Args:
-            make: makes a model of a scenario and parameters.
-            scenario: as the user has named it.
+            make: function that makes a model from a scenario and parameters.
+            scenario: choice of the user.
             keywords: parameters of the task.
             count: number of lanes.
             longest: decisions after which an episode ends at the latest.
@@ -95,15 +95,15 @@ class EnvBase:
         self.fleet = Fleet(count, distribution, self.reward_kind, longest)
         self.last_decision = self.fleet.decisions_per_episode
         self._scaled_errors: Array = None
-        """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
+        """Errors after the last action, in sigmas, ``(count, components)``; for privileged observations only."""
         if self.privileged:
             self._scaled_errors = self.task.constant(numpy.zeros((count, len(self.task.components))))
 
     def _disable_reward(self, distribution: EpisodeDistribution) -> None:
-        """Set every reward to zero, where the truth is not known.
+        """Set every reward to zero, for an unknown truth.
 
         Raises:
-            ValueError: if a reward was asked for, or what is privileged.
+            ValueError: if the user has chosen a reward, or privileged observations.
         """
         wanted = f"reward={self.reward_kind!r}" if self.options.reward is not None else ""
         wanted = "observation='asymmetric'" if self.privileged else wanted
@@ -114,10 +114,10 @@ class EnvBase:
     # --- scenarios
 
     def _distribution(self, scenario: Any, parameters: Mapping[str, Any]) -> EpisodeDistribution:
-        """Make the tasks of a scenario or a mixture, with parameters beside those of the environment.
+        """Make the tasks of a scenario or a mixture, with parameters that override those of the environment.
 
         Raises:
-            ValueError: for an unknown name, a value out of its limits, or what would change the spaces.
+            ValueError: for an unknown name, a value out of its limits, or a task with other spaces.
         """
         keywords = {**self._keywords, **parameters}
         mixture = find_mixture(self._class, scenario)
@@ -163,22 +163,22 @@ class EnvBase:
         distributions = []
         for lane in chosen:
             now = self.fleet.course_of(lane)
-            asked = now.scenario, now.parameters
+            choice = now.scenario, now.parameters
             if "scenario" in wanted:
                 scenario = wanted["scenario"]
-                asked = (self._first_distribution.scenario if scenario is None else scenario), asked[1]
+                choice = (self._first_distribution.scenario if scenario is None else scenario), choice[1]
             if "parameters" in wanted:
-                asked = asked[0], dict(parameters or {})
-            found = next((distribution for distribution in known if distribution.is_of(*asked)), None)
+                choice = choice[0], dict(parameters or {})
+            found = next((distribution for distribution in known if distribution.is_of(*choice)), None)
             if found is None:
-                found = self._distribution(*asked)
+                found = self._distribution(*choice)
                 known.append(found)
             distributions.append(found)
         for lane, distribution in zip(chosen, distributions, strict=True):
             self.fleet.send(lane, distribution)
         self.last_decision = self.fleet.decisions_per_episode
 
-    # --- what is shown
+    # --- observations
 
     def _observation_space(self) -> gymnasium.Space[Any]:
         dtype = numpy.dtype(self.options.dtype).type
@@ -197,7 +197,7 @@ class EnvBase:
         )
 
     def _to_dtype(self, values: Array) -> Array:
-        """Return the numbers in the type that was asked for."""
+        """Return the numbers in the chosen type."""
         if self.options.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
@@ -215,7 +215,7 @@ class EnvBase:
         }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Return the context of all lanes, batch first, and which of them has each part of it."""
+        """Return the context of all lanes, batch first, and whether a lane has each part of it."""
         found = []
         for (part,) in self.fleet.parts():
             context, xp = part.model.context(part.state), part.task.xp
@@ -225,9 +225,9 @@ class EnvBase:
     def _gather_reports(
         self, found: Sequence[Mapping[str, Array]]
     ) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Put together what the lanes of several tasks report, and say who reports each part of it.
+        """Combine the reports of lanes of several tasks; return them with masks of the lanes that have each part.
 
-        Where one reports more numbers than another, and where one reports nothing, NaN stands for what is missing.
+        NaN stands for missing numbers.
         """
         xp, values, present = self.task.xp, {}, {}
         counts = [part.count for (part,) in self.fleet.parts()]
@@ -276,34 +276,34 @@ class EnvBase:
         if self._rewards_only and watch is None:
             return self.fleet.step_reward(action, self.reward_kind)
         infos: list[dict[str, Array]] = []
-        answers = []
+        results = []
         for part, own in self.fleet.parts(action):
             infos.append({})
-            answers.append(self._step_part(part, own, infos[-1], watch))
+            results.append(self._step_part(part, own, infos[-1], watch))
         if self.privileged:
-            self._scaled_errors = self.fleet.gather([scaled for _, scaled in answers])
+            self._scaled_errors = self.fleet.gather([scaled for _, scaled in results])
         info.update(self._gather_reports(infos)[0])
-        return self.fleet.gather([reward for reward, _ in answers])
+        return self.fleet.gather([reward for reward, _ in results])
 
     def _step_part(
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
     ) -> tuple[Array, Array]:
-        """Step lanes of one task; returns rewards, and errors in sigmas where observations are privileged."""
+        """Step lanes of one task; return rewards, and errors in sigmas for privileged observations."""
         task, count = lanes.task, lanes.count
-        asked = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
-        answers = lanes.decide(action, asked)
+        report = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
+        results = lanes.decide(action, report)
         if watch is not None:
-            for own, _ in answers:
+            for own, _ in results:
                 watch(own.episode)
-        last = answers[-1][0]
+        last = results[-1][0]
         for name, values in (last.details or {}).items():
             info[name] = task.xp.moveaxis(values[..., :count], -1, 0)
-        rewards = [own.reward if other is None else own.reward - other.reward for own, other in answers]
+        rewards = [own.reward if other is None else own.reward - other.reward for own, other in results]
         scaled = in_sigmas(last.error, last.covariance, count, task.xp) if self.privileged else None
         return mean_of(rewards)[:count], scaled
 
     def _forget_errors(self, lanes: Sequence[int]) -> None:
-        """Episodes that begin have no estimate yet that could be wrong."""
+        """Set the errors of lanes to zero, since new episodes have no estimate after an action."""
         if self.privileged:
             keep = numpy.ones((self.fleet.count, 1))
             keep[list(lanes)] = 0.0

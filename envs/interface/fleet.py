@@ -1,14 +1,13 @@
 """The fleet of an environment: its lanes, of one task or of several side by side.
 
-A task has one set of parameters. As long as all episodes are of one, the fleet is that task's
-:class:`~.lanes.Lanes`, and every call goes straight to them. Where scenarios are mixed, or a reset names another
+A task has one set of parameters. While all episodes are of one task, the fleet is that task's
+:class:`~.lanes.Lanes`, and every call goes directly to them. Where scenarios are mixed, or a reset names another
 scenario or other parameters, every distinct set has a task and lanes of its own. A lane's next episode gets a free
 place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. An unused place is
-stepped all the same: a step costs as much as the largest number of environments of each task that ever flew it at once.
+stepped too: the time of a step grows with the largest number of environments that ever ran each task at once.
 
-What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the identity
-of the episode, see :mod:`.episode_noise`. So sub-environment i of N equals the single environment with the same seed,
-here too.
+A lane's generator gives first, in a mixture only, the uniform number that chooses the task, then the identity of the
+episode, see :mod:`.episode_noise`. So sub-environment i of N equals the single environment with the same seed.
 """
 
 import copy
@@ -32,17 +31,17 @@ class EpisodeDistribution(NamedTuple):
     """Distribution of the coming episodes of a lane."""
 
     scenario: Any
-    """As it was asked for."""
+    """Choice of the user."""
     parameters: Mapping[str, Any]
-    """Beside those that the environment was made with."""
+    """Parameters beside those of the environment."""
     models: tuple[Model, ...]
     names: tuple[str, ...]
-    """Of their scenarios."""
+    """Names of the scenarios."""
     weights: tuple[float, ...]
-    """Which sum to one."""
+    """Their weights, which sum to one."""
 
     def is_of(self, scenario: Any, parameters: Mapping[str, Any]) -> bool:
-        """Return whether it was made of these."""
+        """Return whether the distribution is of this scenario and these parameters."""
         if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long for a message
             alike = scenario is self.scenario
         else:
@@ -61,15 +60,15 @@ def check_alike(model: Model, other: Model, name: str) -> None:
     """Raise ValueError if episodes of another task would not fit the spaces of a task.
 
     Args:
-        model: whose spaces there are.
-        other: that is to be flown too.
-        name: of its scenario, in errors.
+        model: model with the spaces of the environment.
+        other: model of the other task.
+        name: name of its scenario, for errors.
     """
     properties: dict[str, Callable[[Model], Any]] = {
         "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
         "the action space": lambda t: t.action_space,
         "decision_interval": lambda t: t.task.decision_interval,
-        "what is estimated": lambda t: t.task.components,
+        "the components of the estimate": lambda t: t.task.components,
     }
     for what, of in properties.items():
         if of(model) != of(other):
@@ -84,8 +83,8 @@ class Fleet:
 
     Args:
         count: number of lanes.
-        distribution: of the episodes of all of them, until :meth:`send` names others.
-        kind: of reward, which may need a reference that runs beside every episode.
+        distribution: of the episodes of all lanes, until :meth:`send` sets another.
+        kind: kind of reward, which may need a baseline beside every episode.
         longest: decisions after which an episode ends at the latest; default: its task's horizon.
     """
 
@@ -97,27 +96,27 @@ class Fleet:
         self._distributions = [distribution] * count
         self._kind, self._longest = kind, longest
         self._part = numpy.full(count, -1)
-        """Which of ``_parts`` each lane flies in; -1 before its first episode."""
+        """Index in ``_parts`` of each lane's task; -1 before its first episode."""
         self._place = numpy.arange(count)
-        """Where in it."""
+        """Index of each lane in its part."""
         self._names = [distribution.names[0]] * count
         self._parts: list[Lanes] = []
         self.whole: Lanes | None = None
-        """The lanes of the one task that all episodes are of, each in its own place; None where there are several."""
+        """Lanes of the only task, each in its own place; None for several tasks."""
         self._sent = False
-        """Whether lanes have courses that their episodes were not drawn from."""
+        """Whether lanes have new distributions, from which their current episodes were not drawn."""
         if len(distribution.models) == 1:
             self._parts, self._part[:] = [self._make_lanes(distribution.models[0], count)], 0
         self._arrange()
 
-    # --- who flies where
+    # --- places of the lanes
 
     @property
     def only(self) -> Lanes:
-        """The lanes, where all episodes are of one task.
+        """The lanes of the only task.
 
         Raises:
-            ValueError: where they are of several.
+            ValueError: for several tasks.
         """
         if self.whole is not None:
             return self.whole
@@ -131,11 +130,11 @@ class Fleet:
         return len({id(model) for distribution in self._distributions for model in distribution.models}) > 1
 
     def distributions(self) -> list[EpisodeDistribution]:
-        """Return the different courses that lanes have."""
+        """Return the different distributions of the lanes."""
         return list({id(distribution): distribution for distribution in self._distributions}.values())
 
     def course_of(self, lane: int) -> EpisodeDistribution:
-        """Return what the coming episodes of a lane are drawn from."""
+        """Return the distribution of the coming episodes of a lane."""
         return self._distributions[lane]
 
     def send(self, lane: int, distribution: EpisodeDistribution) -> None:
@@ -158,7 +157,7 @@ class Fleet:
 
     @property
     def decisions_per_episode(self) -> int:
-        """Decisions of the longest episode that there may be."""
+        """Decisions of the longest possible episode."""
         models = {
             id(model): model for distribution in self.distributions() for model in distribution.models
         }.values()
@@ -170,7 +169,7 @@ class Fleet:
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
-        """Return the lanes of a task, made when they are first asked for."""
+        """Return the lanes of a task, made on first use."""
         for part in self._parts:
             if part.model is model or part.model.task.parameters == model.task.parameters:
                 return part
@@ -195,12 +194,12 @@ class Fleet:
         self._part = numpy.array([renumbered[int(part)] for part in self._part])
         self._parts = [self._parts[i] for i in kept]
         self._flying = [i for i in range(len(self._parts)) if (self._part == i).any()]
-        # Arrays of all places of those that fly are put side by side: there each lane finds its own.
+        # The arrays of all used places are side by side; each lane has an index into them.
         self._where, self._sources, first = self._place.copy(), [], 0
         for i in self._flying:
             own = numpy.flatnonzero(self._part == i)
             self._where[own] += first
-            # An unused place takes the action of the first environment.
+            # An unused place has the action of the first environment.
             source = numpy.full(self._parts[i].count, own[0])
             source[self._place[own]] = own
             self._sources.append(source)
@@ -218,7 +217,7 @@ class Fleet:
             self.whole.seed(lane, generator)
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
-        """Start new episodes in some lanes (default: all), each of a task that is drawn for it."""
+        """Start new episodes in some lanes (default: all), each of a task drawn from its distribution."""
         if self.whole is not None and not self._sent:
             self.whole.restart(lanes)
             return
@@ -249,24 +248,24 @@ class Fleet:
         self._arrange()
 
     def _leave(self, whole: Lanes) -> None:
-        """Make room for lanes of other tasks."""
+        """Prepare for lanes of other tasks."""
         self.whole = None
         if whole.has_episodes:
             whole.grow(whole.width)
         else:
             self._parts, self._part[:] = [], -1
 
-    # --- what lanes do
+    # --- steps of the lanes
 
     def parts(self, *values: Array) -> list[tuple[Any, ...]]:
-        """Return the lanes of every task that is flown, each with what is meant for it of arrays ``(count, ...)``."""
+        """Return the lanes of every task in use, each with its entries of arrays ``(count, ...)``."""
         return [
             (self._parts[i], *(v[source] for v in values))
             for i, source in zip(self._flying, self._sources, strict=True)
         ]
 
     def gather(self, values: Sequence[Array]) -> Array:
-        """Put together what :meth:`parts` have returned, ``(places, ...)`` each: ``(count, ...)``, in a new array."""
+        """Combine results of the :meth:`parts`, ``(places, ...)`` each, in a new array ``(count, ...)``."""
         if isinstance(values[0], numpy.ndarray):
             return (
                 numpy.array(values[0]) if self.whole is not None else numpy.concatenate(values)[self._where]
@@ -300,7 +299,7 @@ class Fleet:
         return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Shorten the episodes that have just begun in some lanes by so many decisions, to one at least."""
+        """Shorten the episodes that have just begun in some lanes by numbers of decisions, to at least one."""
         for lane, by in zip(lanes, decisions, strict=True):
             self._parts[self._part[lane]].shorten([int(self._place[lane])], by)
 
@@ -310,12 +309,12 @@ class Fleet:
         return self.whole.has_episodes if self.whole is not None else bool((self._part >= 0).all())
 
     def detach(self) -> None:
-        """Cut the gradient (torch only)."""
+        """Detach the episodes from the graph of the gradient (torch only)."""
         for (part,) in self.parts():
             part.detach()
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
+        """Return the complete state of the coming steps; :meth:`restore` returns to it any number of times."""
         kept = {name: copy.deepcopy(getattr(self, name)) for name in _STATE_ATTRIBUTES}
         return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
 

@@ -1,6 +1,6 @@
-"""Picture of an episode that is flown again on request.
+"""Picture of an episode that is computed again on request.
 
-This module imports matplotlib; the environment imports it only when a render mode is asked for.
+This module imports matplotlib; the environment imports it only for a render mode.
 """
 
 import numpy
@@ -13,14 +13,14 @@ from ..engine.lanes import Lanes
 
 
 class LatePicture:
-    """Picture of one episode, which is flown again on request.
+    """Picture of one episode, which is computed again on request.
 
-    Libraries ask for a render mode of environments that are not shown (Stable-Baselines3's ``make_vec_env`` always),
-    and keeping what is drawn takes far longer than a step. So only the actions are kept: they and its identity fix an
-    episode.
+    Libraries set a render mode for environments that are not shown (Stable-Baselines3's ``make_vec_env`` always), and
+    recording the values of a picture takes far longer than a step. So only the actions are stored: they and the
+    identity determine an episode.
 
     Args:
-        picture: that is brought up to date.
+        picture: picture to update.
     """
 
     def __init__(self, picture: EpisodePicture) -> None:
@@ -28,16 +28,16 @@ class LatePicture:
         self._picture = picture
         self._lanes = Lanes(picture.model, 1)
         self._identity: numpy.ndarray | None = None
-        """Of an episode that has not begun here."""
+        """Identity of an episode that has not begun in the picture."""
         self._actions: list[numpy.ndarray] = []
-        """Those not applied here."""
+        """Actions not yet applied in the picture."""
 
     def begin(self, identity: numpy.ndarray) -> None:
-        """Note a new episode by its identity, ``(2, 1)``."""
+        """Store the identity of a new episode, ``(2, 1)``."""
         self._identity, self._actions = identity, []
 
     def keep(self, action: Array) -> None:
-        """Note an action, ``(A,)`` or a scalar."""
+        """Store an action, ``(A,)`` or a scalar."""
         self._actions.append(numpy.array(host_array(action)))
 
     @property
@@ -67,5 +67,5 @@ class LatePicture:
         self.picture.show(self._lanes.state)
 
     def close(self) -> None:
-        """Close the window and forget the figure."""
+        """Close the window and delete the figure."""
         self._picture.close()

@@ -1,7 +1,7 @@
-"""Privileged information for critics in training: the episode's context, and how wrong the estimate is.
+"""Privileged information for critics in training: the episode's context, and the error of the estimate.
 
-A critic may be given more than the policy that it judges (asymmetric actor and critic; Pinto et al., 2018): it is
-needed in training only. The environment keeps the two apart and declares in its metadata that it is privileged.
+A critic may observe more than the policy that it evaluates (asymmetric actor and critic; Pinto et al., 2018): it is
+needed in training only. The environment separates the two and declares in its metadata that it is privileged.
 """
 
 from typing import Any
@@ -12,7 +12,7 @@ from ..contract.task import Task
 
 
 def in_sigmas(error: Array, covariance: Array, count: int, xp: Any) -> Array:
-    """Return the errors of the first lanes in units of their reported standard deviations, zero where that is,
+    """Return the errors of the first lanes in units of their reported standard deviations, zero where those are,
     ``(count, C)``.
 
     Args:

@@ -16,11 +16,11 @@ from ..engine.catalogue import nearest
 DTYPES = ("float64", "float32")
 """Types of observations and rewards; inside everything is float64."""
 OBSERVATIONS = ("measured", "asymmetric")
-"""What an observation holds: what can be known; or beside it, for critics in training, what cannot."""
+"""Kinds of observation: measured values; or with privileged values beside them, for critics in training."""
 
 
 def check_seed(seed: Any) -> int | None:
-    """Return the seed of a reset, or raise ValueError where it is none."""
+    """Return the seed of a reset, or raise ValueError for an invalid one."""
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, int | numpy.integer) or seed < 0:
@@ -29,7 +29,7 @@ def check_seed(seed: Any) -> int | None:
 
 
 def check_options(options: Any, known: Iterable[str]) -> Mapping[str, Any]:
-    """Return the options of a reset, or raise ValueError for what is none, and for a name that is not known."""
+    """Return the options of a reset, or raise ValueError for another type or an unknown name."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):
@@ -41,19 +41,19 @@ def check_options(options: Any, known: Iterable[str]) -> Mapping[str, Any]:
 
 
 FEW = 16
-"""Numbers that are looked at one by one sooner than by NumPy."""
+"""Count of numbers up to which a check one by one is faster than NumPy."""
 
 
 def _all_finite(values: Array) -> bool:
     if isinstance(values, numpy.ndarray) and values.size <= FEW:
         return all(map(math.isfinite, values.ravel().tolist()))
-    # The sum is finite unless an entry is not, and costs a third of asking for every entry. It may overflow.
+    # The sum is finite unless an entry is not, and costs a third of a check of every entry. It may overflow.
     with numpy.errstate(over="ignore", invalid="ignore"):
         return math.isfinite(values.sum()) or all(map(math.isfinite, values.reshape(-1).tolist()))
 
 
 def check_action(space: gymnasium.Space[Any], action: Any, count: int | None) -> Array:
-    """Return the action as an array, or as the tensor that it is, or say what arrived and what was expected."""
+    """Return the action as an array or tensor, or raise an error with the received and the expected action."""
     if is_tensor(action):
         array, values = action, action.detach()
         floating, real = (
@@ -86,7 +86,7 @@ class EnvOptions:
     """Options of both environments beside the task and its parameters; see :class:`.TaskEnv`.
 
     Raises:
-        ValueError: for a value that is none of the choices.
+        ValueError: for a value that is not allowed.
     """
 
     reward: str | None
@@ -106,5 +106,5 @@ class EnvOptions:
 
     @property
     def privileged(self) -> bool:
-        """Whether observations hold what no policy can know."""
+        """Whether observations contain privileged values."""
         return self.observation == "asymmetric"

@@ -12,13 +12,13 @@ from ..data.scenario_data import ScenarioData
 
 
 def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
-    """Return a spec that knows how long an episode is, and whose keywords go through JSON.
+    """Return a spec with the length of an episode, and with keywords that JSON can store.
 
     Gymnasium registers one length for an id; here it follows from scenario and parameters. It is computed on request:
-    no ``TimeLimit`` is put around the environment, which truncates by itself.
+    the environment truncates by itself, without a ``TimeLimit`` wrapper.
 
     Args:
-        spec: as Gymnasium made it.
+        spec: spec by Gymnasium.
         decisions: in an episode.
     """
     kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
@@ -26,7 +26,7 @@ def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold in place of a keyword's value; it makes the same environment."""
+    """Return a keyword's value in a form that JSON can store and that makes the same environment."""
     if isinstance(value, ScenarioData):
         return {name: plain(item) for name, item in value.fields().items()}
     if isinstance(value, enum.Enum):

@@ -13,26 +13,26 @@ class StepReport(NamedTuple):
     """Requested quantities, lanes last; the others are None."""
 
     reward: Array
-    """``(N,)``; of a relative reward before the reference's is taken away."""
+    """Reward, ``(N,)``; a relative one before that of the baseline is subtracted."""
     error: Array = None
     """Estimate minus truth, ``(C, N)``."""
     covariance: Array = None
-    """Reported for it, ``(C, C, N)``."""
+    """Reported covariance of the error, ``(C, C, N)``."""
     details: dict[str, Array] | None = None
-    """What ``info`` holds with ``detailed_info``."""
+    """Content of ``info`` with ``detailed_info``."""
     episode: Any = None
-    """The state itself."""
+    """Episodes after the action."""
 
 
 @functools.cache
 def step_report(kind: str, errors: bool = False, details: bool = False, episode: bool = False) -> Report:
-    """Return the function that makes a :class:`StepReport`, always the same one.
+    """Return the function that makes a :class:`StepReport`, the same one for the same arguments.
 
     Args:
         kind: of reward, one of :data:`.reward.OWN_REWARDS`.
-        errors: whether error and covariance are asked about.
-        details: whether ``info`` holds the details of the measurement.
-        episode: whether ``info`` holds the statistics of the episode.
+        errors: whether error and covariance are reported.
+        details: whether ``info`` contains the details of the measurement.
+        episode: whether ``info`` contains the statistics of the episode.
     """
     reward = OWN_REWARDS[kind]
 

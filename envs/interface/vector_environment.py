@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 
 class _OneThread:
-    """Lets one thread at a time into a block and refuses others; of a list, since a lock can be neither copied nor
-    pickled with an environment.
+    """Guard that admits one thread at a time to a block. It uses a list, since a lock can be neither copied nor pickled
+    with an environment.
     """
 
     def __init__(self) -> None:
@@ -50,8 +50,8 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
     Args:
         task: environment id.
         num_envs: number of sub-environments; sub-environment i equals the single environment with the same
-            seed, whatever the number.
-        control: what the action steers.
+            seed, for every number.
+        control: name of a control; default: the first of the environment.
         scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
             mixture, ``{"random": 0.8, "paper": 0.2}``.
         reward: "cost", "log-likelihood", "cost-and-likelihood", "relative" or "log-relative"; default: the
@@ -63,22 +63,22 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             observations back to actions that require them, over all steps since the last reset; pass detached
             actions where none are wanted.
         device: where the torch backend computes, such as "cpu" (default) or "cuda".
-        threads: how many share the sub-environments, of the compiled backend; the numbers stay the same.
+        threads: number of threads of the compiled backend; results do not depend on it.
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
         max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on); None or -1: do not.
-        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
-            cost and what else an evaluation records.
-        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
-            given out.
-        context: whether ``info["context"]`` holds what was drawn for the episode and what of it holds now
-            (:meth:`.Task.context`), at resets and steps.
+        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Model.track`), error,
+            cost and the further records of an evaluation.
+        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
+            return.
+        context: whether ``info["context"]`` contains the random draws of the episode and those in force now
+            (:meth:`.World.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
-            and of what is "privileged", the context and the error after the last action in units of its reported
-            standard deviation (zero at a reset). No policy may be shown that where it is judged.
+            and of "privileged" values, the context and the error after the last action in units of its reported
+            standard deviation (zero at a reset). No policy may observe them where it is evaluated.
         **keywords: parameters of the task.
 
     Raises:
-        ValueError: for an unknown name, a value out of its limits, or a device that is not there; an unknown keyword is
+        ValueError: for an unknown name, a value out of its limits, or a missing device; an unknown keyword is
             a TypeError too.
         ImportError: for a backend whose library is not installed.
     """
@@ -89,7 +89,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
     }
     reset_options: ClassVar[tuple[str, ...]] = ("reset_mask", "shortened_by", "scenario", "parameters")
     pictures: "EpisodePictures | None" = None
-    """What keeps and draws the first few episodes; None without a render mode."""
+    """History and pictures of the first few episodes; None without a render mode."""
 
     def __init__(
         self,
@@ -175,11 +175,11 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         early (later ones are whole again), so that episodes of one horizon need not all end together.
 
         ``options["scenario"]`` and ``options["parameters"]``: as of the single environment, of the sub-environments
-        that are reset; each holds for their coming episodes, also after an autoreset, until a reset names another.
+        that are reset; each applies to their coming episodes, also after an autoreset, until a reset names another.
 
         Raises:
             ValueError: for other options, an unknown name or a value out of its limits in them, a scenario or
-                parameters that would change the spaces, and for seeds that are none.
+                parameters that would change the spaces, and for invalid seeds.
             gymnasium.error.ResetNeeded: for a mask before the first reset.
         """
         with self._in_use:
@@ -193,7 +193,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         mask = wanted.get("reset_mask")
         if self.pictures is not None and {"scenario", "parameters"} & wanted.keys():
             raise ValueError(
-                "a vector of environments that is drawn flies one scenario: leave out render_mode, or scenario and "
+                "a vector environment with a render_mode has one scenario: omit render_mode, or scenario and "
                 "parameters in the options of a reset"
             )
         if mask is None:
@@ -260,10 +260,10 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.pictures.begin(self.fleet.only.state, lanes)
 
     def step(self, actions: Any) -> tuple[Any, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
-        """Apply the actions to the measurements just shown, then show the next ones.
+        """Apply the actions to the last measurements, then observe the next ones.
 
         Raises:
-            gymnasium.error.ResetNeeded: before the first reset, and where an episode has ended and none begins anew.
+            gymnasium.error.ResetNeeded: before the first reset, and where an episode has ended without a reset.
             gymnasium.error.Error: where another thread steps or resets the same environments.
         """
         with self._in_use:
@@ -305,7 +305,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return shown, reward, self._mask(self._never), self._mask(finished), info
 
     def _watch(self, action: Array) -> Callable[[Any], None] | None:
-        """Return what keeps the states of this step for the pictures; None without a render mode."""
+        """Return the function that adds the states of this step to the pictures; None without a render mode."""
         if self.pictures is None:
             return None
         pictures, actions, shown = self.pictures, host_array(action), host_array(self.fleet.observe())
@@ -331,12 +331,12 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self.pictures.frames(self.fleet.only.state)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Forget the figures."""
+        """Delete the figures."""
         if self.pictures is not None:
             self.pictures.close()
 
     def _with_masks(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
-        """Return Gymnasium's form of what some sub-environments report: a mask beside every key."""
+        """Return the reports of some sub-environments in Gymnasium's form: a mask beside every key."""
         if not mask.any():
             return {}
         masked = {}
@@ -351,13 +351,13 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return tensor_on(array, self.device)
 
     def _mask(self, lanes: numpy.ndarray) -> Array:
-        """Return booleans of the lanes for the caller to keep: a copy, on the device of the backend."""
+        """Return a copy of booleans of the lanes, on the device of the backend."""
         return lanes.copy() if self.backend != "torch" else tensor_on(lanes, self.device)
 
     def _final_observations(self, last: Any, done: numpy.ndarray) -> Array:
-        """Return Gymnasium's form: an object for each finished sub-environment, None elsewhere.
+        """Return last observations in Gymnasium's form: an object for each finished sub-environment, None elsewhere.
 
-        With the torch backend one tensor, the last observation of every lane: taking it apart would cost a
+        With the torch backend one tensor, the last observation of every lane: splitting it would need a
         transfer for each lane.
         """
         if self.backend == "torch":

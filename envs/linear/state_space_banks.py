@@ -104,7 +104,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
                 "average_nis",
                 lambda f, _: f.average,
                 "average of log(1 + nis) of a number of the measurement",
-                shown=AVERAGE_OF_LOG1P,
+                compression=AVERAGE_OF_LOG1P,
             ),
             availability_block(parts=parts),
             last_action_block(self.answers),

@@ -174,11 +174,13 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
                 "reported_noise",
                 lambda _, measurement: xp.log(measurement.reported_deviation / nominal),
                 "the reported over the nominal variance of a measurement",
-                shown=KEPT_AS_DEVIATION_LOG,
+                compression=KEPT_AS_DEVIATION_LOG,
             ),
             availability_block("1 with a measurement, 0 without", over_interval="mean"),
             self.last_action(),
-            Block("time", time, "t / (t + tau), t since the start, tau the correlation time", shown=SHARE),
+            Block(
+                "time", time, "t / (t + tau), t since the start, tau the correlation time", compression=SHARE
+            ),
         )
 
     @property
@@ -275,7 +277,7 @@ class NoiseBank(KalmanBucyBank):
                 "predicted_deviation",
                 lambda f, _: self.xp.log(f.deviation / nominal),
                 "the predicted standard deviation of the position over the nominal one of a measurement",
-                shown=KEPT_AS_LOG,
+                compression=KEPT_AS_LOG,
             ),
         )
 

@@ -167,7 +167,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
                 "scan",
                 lambda state, measurement: xp.clip(measurement.scan * (1.0 / SCANS_SHOWN), None, 1.0),
                 f"scans since the start over {SCANS_SHOWN}, saturating at 1",
-                shown=SHARE,
+                compression=SHARE,
             ),
             availability_block("1 if the scan saw the target, 0 if not: no action has an effect then"),
             Block(
@@ -176,7 +176,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
                 "the time since the last measurement over sampling_interval, within {:g} and {:g}".format(
                     *PERIODS_SHOWN
                 ),
-                shown=KEPT_AS_LOG,
+                compression=KEPT_AS_LOG,
             ),
         )
 
@@ -205,7 +205,7 @@ class GainBank(RadarBank):
                 "xy",
                 SHARE,
             ),
-            Block("last_alpha", lambda f, _: f.alpha, "position gain used last", shown=SHARE),
+            Block("last_alpha", lambda f, _: f.alpha, "position gain used last", compression=SHARE),
             *self.surroundings(),
         )
 

@@ -81,7 +81,7 @@ class HypothesesBank(SettingsBank, RadarBank):
             innovation_block(
                 FRAME,
                 text="the innovation of all hypotheses together over its predicted sigma",
-                shown=BOUNDED_LOG,
+                compression=BOUNDED_LOG,
             ),
             expected_nis_block(xp, lambda measurement: measurement.available > 0.0),
             log_density_block(

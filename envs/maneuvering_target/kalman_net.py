@@ -130,7 +130,7 @@ def clock_blocks(bank: Any) -> Sequence[Block]:
             "speed",
             lambda f, _: xp.log(speed_of(f.mean[2:], LEAST_SPEED) * 0.01),
             "the predicted speed over 100 m/s",
-            shown=KEPT_AS_LOG,
+            compression=KEPT_AS_LOG,
         ),
         Block(
             "scan",
@@ -142,7 +142,7 @@ def clock_blocks(bank: Any) -> Sequence[Block]:
             "interval",
             lambda _, measurement: xp.log(measurement.interval * (1.0 / p.sampling_interval)),
             "the time since the scan before over sampling_interval",
-            shown=KEPT_AS_LOG,
+            compression=KEPT_AS_LOG,
         ),
     )
 

@@ -106,7 +106,7 @@ def decision_blocks(task: RadarEsmProblem) -> tuple[Block, Block]:
         Block(
             "bearing_difference", lambda f, measurement: measurement.bearing_difference,
             "radar minus ESM bearing over the gate", over_interval="mean",
-            shown=linear_scale(1.0 / bearing_gate(task.parameters), limits=(-180.0, 180.0)),
+            compression=linear_scale(1.0 / bearing_gate(task.parameters), limits=(-180.0, 180.0)),
         ),
     )  # fmt: skip
 
@@ -117,7 +117,7 @@ def clock_block(task: RadarEsmProblem) -> Block:
     return Block(
         "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * factor,
         f"time since the start of the track over {TIME_UNIT:g} s",
-        shown=within(0.0, (task.parameters.horizon + 1) * factor),
+        compression=within(0.0, (task.parameters.horizon + 1) * factor),
     )  # fmt: skip
 
 
@@ -191,7 +191,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
             Block(
                 "decision_refused",
                 lambda f, measurement: xp.astype((measurement.decision < none) & ~f.used, xp.float64),
-                "1 where the bearing gate refuses the decision", shown=SHARE, over_interval="mean",
+                "1 where the bearing gate refuses the decision", compression=SHARE, over_interval="mean",
             ),
             Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_UNIT), f"used {count}", types, counted),
             Block(

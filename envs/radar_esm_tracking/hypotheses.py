@@ -98,7 +98,7 @@ class HypothesesBank(SettingsBank):
                 "second_emitter",
                 lambda f, _: xp.clip(f.second_emitter, 0.0, 1.0),
                 "probability then of a second emitter if the class has not changed",
-                shown=SHARE,
+                compression=SHARE,
             ),
             entropy_block(xp),
             *decision_blocks(self.task),

@@ -137,7 +137,7 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
                 f"the short average of the same, over {p.averaging_measurements:g} measurements", each,
                 BOUNDED_LOG,
             ),
-            relative_likelihood_block(xp, self.hypotheses, shown=BOUNDED_LOG),
+            relative_likelihood_block(xp, self.hypotheses, compression=BOUNDED_LOG),
             log_predicted_block(self.hypotheses),
             Block(
                 "accelerometer", lambda f, y: y.readings[forces.readings] / p.gravity, "specific force",
@@ -145,7 +145,7 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
             ),
             Block(
                 "accelerometers_repeat", lambda f, y: f.repeated,
-                "1 where the accelerometers repeat their last readings exactly, as noise never does", shown=SHARE,
+                "1 where the accelerometers repeat their last readings exactly, as noise never does", compression=SHARE,
                 over_interval="mean",
             ),
             innovation("pseudorange", ranges),

@@ -93,12 +93,12 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
                 xp, slots, "probability then that the rate is noisier than nominal", "noisy_rate", lambda f: f.noisy,
             ),
             Block(
-                "between_houses", lambda f, y: f.between, "1 where a C/N0 is not that of an open sky", shown=SHARE,
-                over_interval="mean",
+                "between_houses", lambda f, y: f.between, "1 where a C/N0 is not that of an open sky",
+                compression=SHARE, over_interval="mean",
             ),
             Block(
                 "position_sigma", lambda f, y: 0.5 * xp.log(ordered_sum(f.own.covariance[i, i] for i in range(3))),
-                "the sigma of the position after the last action, m", shown=KEPT_AS_LOG,
+                "the sigma of the position after the last action, m", compression=KEPT_AS_LOG,
             ),
         )  # fmt: skip
 

@@ -105,20 +105,20 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
                 "log_nis",
                 lambda f, _: f.nis,
                 "the normalised innovation squared per available reading",
-                shown=FLOORED_LOG,
+                compression=FLOORED_LOG,
             ),
-            Block("log_mean_nis", lambda f, _: f.mean_nis, "its short average", shown=FLOORED_LOG),
+            Block("log_mean_nis", lambda f, _: f.mean_nis, "its short average", compression=FLOORED_LOG),
             Block(
                 "command",
                 lambda _, measurement: unit * measurement.command,
                 "the command over the output sensor's sigma",
-                shown=SIGNED_LOG,
+                compression=SIGNED_LOG,
             ),
             Block(
                 "control",
                 lambda _, measurement: unit * measurement.control,
                 "the control in force over the output sensor's sigma",
-                shown=SIGNED_LOG,
+                compression=SIGNED_LOG,
             ),
             Block(
                 "reading",
@@ -131,7 +131,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
                 "log_trace",
                 lambda f, _: self.log_trace(f),
                 "the mean of the variances over those of the settled filter",
-                shown=KEPT_AS_LOG,
+                compression=KEPT_AS_LOG,
             ),
             availability_block(
                 "1 where the sensor answered, 0 in a dropout", parts=sensors, over_interval="mean"

@@ -191,7 +191,7 @@ class LogText(FilterText):
             rows: how they are.
             interval: between rows that a user has set, s.
         """
-        names = [self.log_columns.get(name.lower(), name).lower() for name in (*rows.received, *rows.held)]
+        names = [self.log_columns.get(name.lower(), name).lower() for name in (*rows.received, *rows.inputs)]
         follow = PLAIN_ROWS.format(
             own=self.name,
             interval=literal(0.0 if rows.interval is None else interval or rows.interval),

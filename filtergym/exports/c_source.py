@@ -142,7 +142,7 @@ class Writer(LogText):
             return [*self.columns("initial"), *self.columns("measurement")]
         own = [name for name in self.columns("measurement") if self.source_of(name) == ("other", 0)]
         timed = ["interval"] * (rows.interval is None)
-        return [*map(identifier, ["recording", *timed, *rows.received, *rows.held]), *own]
+        return [*map(identifier, ["recording", *timed, *rows.received, *rows.inputs]), *own]
 
     def _layout(self) -> str:
         """Return the functions of main.c that locate the values in a row."""
@@ -150,7 +150,7 @@ class Writer(LogText):
         if rows is None:
             return INITIAL_IN_ROW.format()
         first = 1 + (rows.interval is None)
-        count, held = first + len(rows.received), first + len(rows.received) + len(rows.held)
+        count, held = first + len(rows.received), first + len(rows.received) + len(rows.inputs)
         others = [f"row[{place}]" for place in range(held, len(self.table_columns()))]
         hold = [
             f"if (row[{place}] == row[{place}]) last[{place - count}] = row[{place}];"
