@@ -173,7 +173,7 @@ def test_an_unknown_algorithm_is_named(sb3, tmp_path):
     env = sb3.env("mode", lambda env: ActionMasker(env, lambda _: np.ones(env.action_space.n, dtype=bool)))
     file = save(sb3.model("MaskablePPO", env=env), tmp_path, statistics=None)
     with pytest.raises(
-        ValueError, match=r"its policy, MaskableActorCriticPolicy, is of none of .* TQC, CrossQ, DQN"
+        ValueError, match=r"its policy, MaskableActorCriticPolicy, belongs to none of .* TQC, CrossQ, DQN"
     ):
         competitor(ID, file, trust=True)
 
