@@ -238,7 +238,7 @@ def test_yaml_is_counted_with_its_aliases(tmp_path):
     lines = ["a: &a [x,x,x,x,x,x,x,x,x,x]"]
     lines += [f"{chr(98 + i)}: &{chr(98 + i)} [{','.join(['*' + chr(97 + i)] * 10)}]" for i in range(9)]
     path.write_text("\n".join([*lines, "env: {scenario: *j}"]))
-    with pytest.raises(ValueError, match="it says more than 100,000 values, aliases resolved: write fewer"):
+    with pytest.raises(ValueError, match="it holds more than 100,000 values, aliases resolved: write fewer"):
         read_config(path, TARGET)
     path.write_text("a: &a [*a]\n")
     with pytest.raises(ValueError, match="cannot read settings from"):

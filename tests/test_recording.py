@@ -484,7 +484,7 @@ WRONG = [
     (ESM, {**ECHO, "decision": [0, None, None]}, "a decision needs radar_bearing and esm_bearing"),
     (ESM, ECHO | BEARINGS, "row 1 has a decision and lacks a bearing"),
     (TIGHT, LOG, "reads recordings from NetCDF only"),
-    (UAV, LOG, "is a closed loop, in which the estimate decides"),
+    (UAV, LOG, "is a closed loop, in which the estimate changes the next"),
     (TARGET, changed(x=[1e6] * 5), "a plot lies 1,000 km from the radar"),
     (ESM, PLOTS, "reads time and range, range_rate"),
 ]
