@@ -91,7 +91,7 @@ def test_rows_that_are_missing_are_counted_and_tracks_that_end_are_lost(files):
     np.testing.assert_allclose(estimate[0, 2], whole["estimate"].values[0, 0, 1], rtol=1e-12)
     np.testing.assert_allclose(estimate[2], np.tile(estimate[2, :1], (K, 1)), rtol=1e-12)
     (note,) = notes_of(found)
-    assert "2 of 6 episodes lost: the file holds no more estimates of the track in episode 2" in note
+    assert "2 of 6 episodes lost: the file contains no more estimates of the track in episode 2" in note
 
 
 def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
