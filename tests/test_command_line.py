@@ -94,7 +94,7 @@ REFUSED = {
         (("imm", "--out", "new"), "unknown paper"),
     ],
     "advise": [(("missing.csv", "--out", "new/mine.filter.json"), "missing.csv")],
-    "animate": [((ENV, "--policy", "known-input-bound", "--out", "new"), "it estimates nothing")],
+    "animate": [((ENV, "--policy", "known-input-bound", "--out", "new"), "it has no estimates")],
     "train": [
         ((ENV, *words, "--out", "new/run"), "must be an integer of at least 1")
         for words in (("--steps", 0), ("--envs", 0), ("--validate-every", 0), ("--set", "algo.n_envs=1.5"))

@@ -91,7 +91,7 @@ def test_rows_that_are_missing_are_counted_and_tracks_that_end_are_lost(files):
     np.testing.assert_allclose(estimate[0, 2], whole["estimate"].values[0, 0, 1], rtol=1e-12)
     np.testing.assert_allclose(estimate[2], np.tile(estimate[2, :1], (K, 1)), rtol=1e-12)
     (note,) = notes_of(found)
-    assert "2 of 6 episodes lost: the file holds no more estimates of the track in episode 2" in note
+    assert "2 of 6 episodes lost: the file contains no more estimates of the track in episode 2" in note
 
 
 def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
@@ -121,10 +121,10 @@ def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
         ("a,b\n1,2\n", "contains no estimate of position_x"),
         ("track,seconds,position_x,position_y\nfoo,1,2,3\n", "tracks foo, and those of the evaluation are 0, 1"),
         ("seconds,position_x,position_y\n1,2,3\n", "names no tracks"),
-        ("track,seconds,velocity_x\n0,1,2\n", "holds no position_x, position_y, velocity_y, without which"),
+        ("track,seconds,velocity_x\n0,1,2\n", "lacks position_x, position_y, velocity_y, which the cost of"),
         ("track,position_x,position_y\n0,2,3\n", "needs a column seconds"),
         ("track,seconds,position_x,position_y\n0,1,x,3\n", "position_x has 'x' in row 0"),
-        ("track,time,position_x,position_y\n0,2024-05-01T00:00:00,1,3\n", "are dates, and those of a simulation"),
+        ("track,time,position_x,position_y\n0,2024-05-01T00:00:00,1,3\n", "are dates, but those of a simulation"),
         ("policy,track,seconds,position_x\na,0,1,2\nb,0,2,2\n", "several competitors, a, b"),
         (None, "there is no such file"),
     ],

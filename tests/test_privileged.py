@@ -190,7 +190,7 @@ def test_policies_are_not_shown_what_is_privileged():
         observation_space = gymnasium.make(ID, observation="asymmetric").observation_space
         predict = None
 
-    with pytest.raises(ValueError, match=r"privileged observations.*no evaluation shows"):
+    with pytest.raises(ValueError, match=r"privileged observations.*no evaluation provides"):
         evaluate(ID, {"cheat": Cheat()}, episodes=2)
 
 

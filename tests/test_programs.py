@@ -238,7 +238,7 @@ def test_what_needs_groups_of_processes_is_refused_in_one_sentence_without(name,
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lone_module.py").write_text("class Missing: ...")
     with pytest.raises(
-        ValueError, match=r"^exec: and --isolated .* needs Linux or macOS: on Windows take WSL$"
+        ValueError, match=r"^exec: and --isolated .* needs Linux or macOS: on Windows use WSL$"
     ):
         find_competitors(problem_of("filtergym/ManeuveringTarget-v0"), [name])
 

@@ -240,7 +240,7 @@ def test_animation_is_a_small_looping_file(tmp_path):
         assert image.n_frames == 6
         assert image.size == (960, 608)
         assert image.info["loop"] == 0
-    with pytest.raises(ValueError, match="it estimates nothing"):
+    with pytest.raises(ValueError, match="it has no estimates"):
         episode_frames(task_class(ID), "known-input-bound", competitor(ID, "known-input-bound"))
 
 

@@ -524,8 +524,8 @@ def test_a_name_in_a_file_imports_and_opens_nothing(change, trap, edited, comman
 @pytest.mark.parametrize(
     ("further", "sentence"),
     [
-        ("Mine.kind = 'reference'\n", "only an estimator"),
-        ("Mine.task_keywords = {'range_sigma': 1.0}\n", "in the environment as it is"),
+        ("Mine.kind = 'reference'\n", "runs only estimators"),
+        ("Mine.task_keywords = {'range_sigma': 1.0}\n", "without task_keywords"),
         ("del Mine\n", "'Mine' is no estimator"),
         ("from filtergym import record\n", "'source of edited.json' takes no part: ImportError"),
         ("import filtergym.envs\n", "'source of edited.json' takes no part: ModuleNotFoundError"),

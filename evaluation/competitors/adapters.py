@@ -163,7 +163,6 @@ class SingleTrackEstimator(ABC):
         return numpy.stack(means, axis=-1), numpy.stack(covariances, axis=-1), tracks
 
     def _components(self, track: Any) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the mean and covariance of the task's components."""
         mean, covariance = (numpy.asarray(part, dtype=float) for part in self.estimate(track))
         n = len(self.state)
         if mean.size != n or covariance.shape != (n, n):

@@ -157,7 +157,6 @@ def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
 
 
 def _span(times: Sequence[numpy.ndarray], clock: str) -> str:
-    """Return the first and last time, in words."""
     return " to ".join(
         describe_time(clock, time) for time in (min(t.min() for t in times), max(t.max() for t in times))
     )

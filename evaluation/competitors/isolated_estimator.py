@@ -364,7 +364,7 @@ def load(request: dict[str, Any]) -> Any:
     if not callable(getattr(found, "update", None)) or not callable(getattr(found, "start", None)):
         raise TypeError(f"{request['name']!r} is no estimator: it must have the methods start and update")
     if getattr(found, "kind", "estimator") != "estimator" or getattr(found, "task_keywords", None):
-        raise TypeError("isolated: runs estimators only, without task_keywords of their own")
+        raise TypeError("a process of its own runs only estimators, without task_keywords of their own")
     return found
 
 

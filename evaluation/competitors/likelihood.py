@@ -201,7 +201,6 @@ class WindowLikelihood:
         self._take(windows)
 
     def _take(self, windows: Windows) -> None:
-        """Set the windows."""
         self._counts = windows.counts
         self.windows = windows
         known = numpy.concatenate([~numpy.isnan(found[:, :, 0]) for found in self._stretches(self._start)])

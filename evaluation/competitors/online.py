@@ -157,7 +157,6 @@ class OnlineFilter:
         self._set_state(begun if tracks is None else self._merge(begun, tracks))
 
     def _begin(self, initial: Any, memory: Any) -> OnlineState:
-        """Return the state at the start of all tracks."""
         own = self._policy
         policy = self._update.blank_policy if own is None else own.begin(range(self.tracks))
         state = self.model.start_filter(self._padded(initial))
@@ -449,7 +448,6 @@ class OnlineFilter:
             self.input.check_names(own.values, self.input.values)
 
     def _check_input(self, memory: Any) -> None:
-        """Raise an error for an invalid memory of the input."""
         self._times(memory["time"])
         for name, values in memory.items():
             if self.tracks > 1 and numpy.ndim(values) and numpy.shape(values)[-1] != self.tracks:
@@ -543,7 +541,6 @@ class OnlineFilter:
         )
 
     def _check_covariance(self, initial: Any) -> None:
-        """Raise ValueError for an invalid initial covariance."""
         covariance = getattr(initial, "covariance", None)
         if covariance is None:
             return
@@ -565,7 +562,6 @@ class OnlineFilter:
         return map_arrays(lambda array: numpy.ascontiguousarray(array[..., self._pad]), part)
 
     def _check_restart(self) -> None:
-        """Raise ValueError where single tracks cannot restart."""
         self._running()
         if self._interval > 1 or self.model.filter.in_python:
             raise ValueError(
@@ -604,7 +600,6 @@ class OnlineFilter:
 
 
 def _shapes(part: Any) -> list[tuple[int, ...]]:
-    """Return the shapes of nested tuples of arrays."""
     return [numpy.shape(array) for array in leaves(part)]
 
 
@@ -626,7 +621,6 @@ def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
 
 
 def _any(condition: Any) -> bool:
-    """Return whether a condition holds for at least one track."""
     return condition if condition.__class__ is bool else bool(numpy.count_nonzero(condition))
 
 

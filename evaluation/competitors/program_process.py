@@ -259,7 +259,6 @@ class ProgramProcess:
 
 
 def _widen(pipe: int) -> None:
-    """Enlarge a pipe, where the system can."""
     if sys.platform == "linux":
         import fcntl
 

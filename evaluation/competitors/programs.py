@@ -313,7 +313,6 @@ class ProgramEstimator:
 
     @property
     def _answer_size(self) -> int:
-        """Return the number of numbers of a track in a response."""
         C = len(self.task.components)
         return C + C * C + (0 if self._feedback_field is None else _count([self._feedback_field]))
 
@@ -381,7 +380,7 @@ class ProgramEstimator:
 
 
 def _count(fields: Sequence[ArrayField]) -> int:
-    """Return the numbers of a track."""
+    """Return the number of numbers of a track."""
     return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 
 

@@ -98,7 +98,6 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
 
 
 def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
-    """Return the measurements and memories of a smoother that is stepped."""
 
     def memory_in(episode: Any) -> Any:
         return looped.filter.own.memory if looped.filter.in_python else episode.filter.own

@@ -62,7 +62,6 @@ def episode_frames(
 
 
 def _policy_frames(world: TaskEnv, name: str, policy: Any, seed: int, every: int) -> list[Image.Image]:
-    """Draw an episode by the environment's renderer, and close the environment."""
     assert world.picture is not None
     world.picture.caption = f"policy {name}"
     actor = SteppingPolicy(world.model, make_competitor(policy, world.model))

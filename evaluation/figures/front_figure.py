@@ -361,7 +361,6 @@ def _origin(point: Point, panel: FrontPanel) -> str:
 
 
 def _colour(point: Point, panel: FrontPanel) -> str:
-    """Return the colour of a name."""
     return {"paper's algorithm": PAPER, "learned": LEARNED, "yours": OWN}.get(_origin(point, panel), "black")
 
 

@@ -210,7 +210,6 @@ def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarra
 
 
 def _peak(means: numpy.ndarray) -> numpy.ndarray:
-    """Return the largest root over time."""
     found: numpy.ndarray = numpy.fmax.reduce(numpy.sqrt(means), axis=1)
     return found
 

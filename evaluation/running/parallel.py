@@ -172,7 +172,6 @@ class Workers:
 
     @property
     def _cores(self) -> int:
-        """Return the number of processes of a new cluster."""
         if self.jobs not in (1, -1):
             return self.jobs
         import joblib

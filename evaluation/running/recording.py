@@ -144,7 +144,6 @@ def _record(
 
 
 def _measured(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return the measurement and the truth."""
     return {**dict(named_arrays(episode.measurement)), "truth": model.task.world.state(episode.truth)}
 
 

@@ -27,14 +27,14 @@ FAULTS = (
     "the covariance is not finite",
     "the covariance is not positive definite",
     "the covariance is not symmetric",
-    "the estimate is not finite after a missed measurement (what is not received is NaN: predict without it)",
+    "the estimate is not finite after a missed measurement (missing measurements are NaN: predict without it)",
     "the program ended",
     "the program did not answer in time",
-    "the program answered with what is no estimate",
-    "the file holds no more estimates of the track",
+    "the program wrote no valid estimate",
+    "the file contains no more estimates of the track",
 )
 """Reasons why an estimator loses an episode; ``lost`` contains their numbers from 1 on, and 0 where none is lost."""
-NO_ROW = 1.0 + FAULTS.index("the file holds no more estimates of the track")
+NO_ROW = 1.0 + FAULTS.index("the file contains no more estimates of the track")
 """Number of the reason that a file has no more estimates."""
 
 
@@ -54,7 +54,8 @@ class Losses(NamedTuple):
         """Return a sentence on the number of lost episodes, and the reason of the first."""
         return (
             f"{name}: {self.number} of {episodes} episode{'s' if episodes > 1 else ''} lost: {FAULTS[self.fault - 1]} "
-            f"in episode {self.episode} at measurement {self.measurement}; the last valid answer is held from there on"
+            f"in episode {self.episode} at measurement {self.measurement}; the last valid estimate "
+            "is repeated from there on"
         )
 
 

@@ -141,7 +141,6 @@ def _several(names: Sequence[str]) -> ValueError:
 
 
 def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> EstimateTable:
-    """Return the columns of a file as arrays."""
     import pandas
 
     if "policy" in columns and len(names := sorted({*map(str, columns["policy"])})) > 1:

@@ -228,7 +228,6 @@ def _open_locked(partial: Path, name: str, until: float) -> int:
 
 @contextmanager
 def _hold(path: Path) -> Iterator[Path]:
-    """Open a file with its lock."""
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         _lock(handle)

@@ -125,7 +125,6 @@ def _encode(value: Any) -> Any:
 
 
 def _decode(kind: type, value: Any) -> Any:
-    """Decode a value of :func:`_encode`."""
     if kind is numpy.ndarray:
         dtype, shape, content = value
         return numpy.frombuffer(content, dtype).reshape(shape).copy()

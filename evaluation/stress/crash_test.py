@@ -181,7 +181,6 @@ class CrashTest:
             }
 
     def _record(self, seeds: Sequence[int], length: int, chunk: int) -> Iterator[Stream]:
-        """Return streams of episodes of the simulation, as long as required."""
         task, keywords = self.experiment.task, dict(self.experiment.keywords)
         usual = self.experiment.make_task()
         interval = usual.decision_interval
@@ -215,13 +214,11 @@ class CrashTest:
     # --- running
 
     def _errors(self, filter: StreamFilter, stream: Stream) -> numpy.ndarray:
-        """Return the errors of the mean, ``(K, C, N)``."""
         filter.begin(stream.initial)
         means = numpy.stack([filter.take(stream.at(k))["mean"] for k in range(len(stream))])
         return _subtract(stream, means)
 
     def _run(self, filter: StreamFilter, stream: Stream, begin: bool = True) -> Run:
-        """Run a filter on a stream; an error ends the run."""
         found: list[dict[str, numpy.ndarray]] = []
         spent: list[float] = []
         error = ""
@@ -430,7 +427,6 @@ class CrashTest:
         return self._kept
 
     def _long_run(self, name: str, maker: Any) -> Finding:
-        """Run a filter over many measurements."""
         filter = self.filter_of(name, maker, LONG_EPISODES)
         first: Run | None = None
         run: Run | None = None

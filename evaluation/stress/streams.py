@@ -178,7 +178,6 @@ def record_streams(model: Model, seeds: Sequence[int], length: int, chunk: int) 
 
 
 def _stack(parts: Sequence[Any]) -> Any:
-    """Stack nested tuples of arrays along a new first axis."""
     first = parts[0]
     if isinstance(first, tuple):
         columns = (_stack([part[i] for part in parts]) for i in range(len(first)))
