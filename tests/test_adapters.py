@@ -228,7 +228,7 @@ def test_a_state_that_does_not_fit_is_a_sentence():
             self.reading(measurement)
 
     with pytest.raises(
-        ValueError, match=r"RadarEsmTracking-v0 measures scan, radar, .*: Elsewhere must say by a"
+        ValueError, match=r"RadarEsmTracking-v0 measures scan, radar, .*: Elsewhere must define a"
     ):
         filtergym.evaluate("RadarEsmTracking", {"mine": Elsewhere}, episodes=1, horizon=4)
 

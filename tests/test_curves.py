@@ -228,5 +228,5 @@ def test_names_that_an_evaluation_keeps_are_refused(monkeypatch):
     cls = task_class(TARGET)
     report = LoopRecords(lambda model, episode, kept: {"action": episode.truth[0]})
     monkeypatch.setattr(cls, "companions", (report, *cls.companions))
-    with pytest.raises(ValueError, match="records something under the name 'action'"):
+    with pytest.raises(ValueError, match="records a value named 'action'"):
         evaluate(TARGET, "imm", "paper", 2, horizon=3, backend="numpy")

@@ -277,7 +277,7 @@ def test_a_parser_starts_without_the_package(tmp_path, monkeypatch):
 
 def test_values_of_fitted_filters_keep_their_limits(tmp_path):
     path, problem = tmp_path / "a.filter.json", problem_of(TARGET)
-    said = r"log10_acceleration must be from -15\.5 to 13\.5|no fitted filter"
+    said = r"log10_acceleration must be from -15\.5 to 13\.5|not the file of an advised filter"
     for value in (float("nan"), float("inf"), 100, -300, 10**400, "1", None, True):
         values = {"log10_acceleration": value}
         path.write_text(json.dumps({"environment": TARGET, "filter": "constant-velocity", "values": values}))

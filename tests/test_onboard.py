@@ -10,7 +10,7 @@ import pytest
 
 from filtergym import read_recording
 from filtergym.baselines.advice import FittedLog
-from filtergym.baselines.onboard import ONBOARD, _without, judge_onboard
+from filtergym.baselines.onboard import ONBOARD, _withhold, judge_onboard
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.logs.onboard import ARDUPILOT_RADIUS, PX4_RADIUS, _px4_track, read_onboard
 from filtergym.filters.geodesy import PlaneOrigin
@@ -136,7 +136,7 @@ def test_a_withheld_fix_is_a_missed_measurement(log):
     recording = read_recording(log, TARGET)
     withheld = np.zeros(recording.seconds.shape, dtype=bool)
     withheld[0, 4] = True
-    found = _without(recording, withheld).measurements
+    found = _withhold(recording, withheld).measurements
     assert (found["available"][0, 3:6] == [1.0, 0.0, 1.0]).all()
     assert (found["position"][0, 4] == 0.0).all()
     assert found["elapsed"][0, 5] == pytest.approx(recording.seconds[0, 5] - recording.seconds[0, 3])

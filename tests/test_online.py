@@ -486,7 +486,7 @@ def test_what_is_older_than_the_buffer_is_counted_and_refused(lag, kept):
         filter.predict(110.0)
     filter.start(STATE, COVARIANCE)
     assert filter.too_late == 0
-    with pytest.raises(ValueError, match=r"until 0.0 s is settled"):
+    with pytest.raises(ValueError, match=r"until 0.0 s are final"):
         filter.update(0.0, x=0.0, y=0.0)
 
 

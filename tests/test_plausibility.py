@@ -175,7 +175,7 @@ def test_what_is_noteworthy_goes_with_an_evaluation(tmp_path):
     recording = read_recording(table(tmp_path / "log.csv", **plots(x=outlier)), TARGET)
     *notes, of_intervals = notes_of(evaluate(TARGET, ["random"], recording))
     assert notes == list(recording.notes)
-    assert of_intervals.startswith("This one episode has no intervals: it holds ")
+    assert of_intervals.startswith("This one episode has no intervals: it contains ")
 
 
 def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):

@@ -650,7 +650,7 @@ def test_record_and_evaluate_on_the_command_line(command, tmp_path):
     [
         (["evaluate"], "name an environment, or a recording, which names its own"),
         (["evaluate", TARGET, "--recording", "plots.csv", "--scenario", "paper"], "takes the place of --scenario"),
-        (["evaluate", TARGET, "--recording", "plots.csv", "--policy", "known-turn"], "'known-turn' is told what"),
+        (["evaluate", TARGET, "--recording", "plots.csv", "--policy", "known-turn"], "'known-turn' needs truth that"),
         (["evaluate", TARGET, "--recording", "plots.csv", "--site", "1,2"], "--site is for flights from files"),
         (["evaluate", TARGET, "--scenario", "paper", "--site", "1,2"], "--site is for flights from files, and 'paper'"),
         (["record", TARGET, "--out", "plots.csv"], "a recording is a NetCDF file, whose name ends in .nc"),
