@@ -182,7 +182,9 @@ def test_a_lost_episode_keeps_its_last_valid_answer_to_the_end(env_id, short, st
         assert np.isfinite(losing[name]).all()
     (note,) = notes_of(dataset)
     assert note.startswith("losing: 3 of 12 episodes lost: the ")
-    assert note.endswith(f" in episode 9 at measurement {step}; the last valid estimate is repeated from there on")
+    assert note.endswith(
+        f" in episode 9 at measurement {step}; the last valid estimate is repeated from there on"
+    )
 
 
 LOSING = """import numpy
