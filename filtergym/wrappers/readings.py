@@ -161,7 +161,7 @@ class Readings:
         self._is_linear = all(one.matrix is not None and not numpy.any(one.offset) for one in self._functions)
         self._is_linear &= not any(isinstance(root, VectorFunction) for root in self._noises)
         if self._is_linear:
-            rows = numpy.concatenate([one.matrix for one in self._functions])
+            rows = numpy.concatenate([numpy.asarray(one.matrix) for one in self._functions])
             root = numpy.zeros((m, m))
             for channel, own in zip(self.channels, self._noises, strict=True):
                 root[channel.places, channel.places] = own
