@@ -284,7 +284,7 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
 
 
 def _reward_to_descend(run: TrainingRun) -> str:
-    """Return the reward to differentiate; the difference to the paper's algorithm has the gradient of the cost."""
+    """Return the name of the reward to differentiate: of ``relative`` that is ``cost``, which has the same gradient."""
     kind = run.hyperparameters.get("env_kwargs", {}).get("reward", "cost")
     return "cost" if kind == "relative" else kind
 

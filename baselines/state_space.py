@@ -107,7 +107,7 @@ class Buffered(NamedTuple):
 
     @property
     def covariance(self) -> Array:
-        """Covariance of its error."""
+        """Covariance of the error of :attr:`mean`, ``(n, n, N)``."""
         covariance: Array = self.now.covariance
         return covariance
 

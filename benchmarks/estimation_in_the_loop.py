@@ -160,11 +160,24 @@ def fly(name: str, way: str, level: str) -> list[float]:
     return returns
 
 
+def show_directions(env: Any, name: str) -> Any:
+    """Replace readings that are angles by cosine and sine, so that networks on readings meet no jump at half a turn."""
+    model, _, sensor, _, _ = PROBLEMS[name]
+    named = [sensor["h"]] if isinstance(sensor["h"], str) else sensor["h"]
+    if not any(one in CLASSIC_CONTROL[model].angles for one in named):
+        return env
+    space = gymnasium.spaces.Box(-1.0, 1.0, (2 * len(named),), env.observation_space.dtype)
+    transform = lambda angles: numpy.concatenate([numpy.cos(angles), numpy.sin(angles)])  # noqa: E731
+    return gymnasium.wrappers.TransformObservation(env, transform, space)
+
+
 def make(name: str, way: str, level: str) -> Any:
     """Return an environment as an agent in training observes it."""
     env: Any = gymnasium.make(name)
     if way != "truth":
         env = NoisyObservation(env, sensors_of(name, level))
+    if way in ("raw", "stack"):
+        env = show_directions(env, name)
     if way in ("estimate", "steered"):
         env = EstimatedObservation(env, control="noise" if way == "steered" else None)
     elif way == "stack":
@@ -256,21 +269,39 @@ def print_fixed(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
         print(f"| {name}, {truth.mean():.0f} | {deviation:g} | " + " | ".join(row) + " |")
 
 
+def steps_to_level(curve: list[float], level: float, steps: int) -> float:
+    """Return the steps after which the mean return in training reaches a level; NaN where it never does."""
+    reached = numpy.flatnonzero(numpy.array(curve) >= level)
+    return (reached[0] + 1) * steps / len(curve) if len(reached) else math.nan
+
+
 def print_trained(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
-    """Print the returns of trained agents, and their gain by estimates."""
+    """Print the returns of trained agents, and those of estimates against stacks, seed by seed."""
     ways = ("raw", "stack", "estimate")
-    print("\n| PPO, mean return (seeds) | noise | truth | " + " | ".join(ways) + " | estimate less stack |")
-    print("|---|---|" + "---|" * (len(ways) + 2))
+    print("\n| PPO, mean return (seeds) | noise | truth | " + " | ".join(ways), end=" | ")
+    print("estimate less stack, lowest and highest seed | steps until the stack's last return |")
+    print("|---|---|" + "---|" * (len(ways) + 3))
     for name, level in itertools.product(only, LEVELS):
         runs = {key: value for key, value in found.items() if key[:2] == ("trained", name)}
         of = {way: mean_returns(runs, way, level) for way in ways}
         each = [mean_returns(runs, "truth", ""), *of.values()]
         row = [f"{numpy.mean([*one.values()]):.1f} ({len(one)})" if one else "" for one in each]
-        both = sorted({*of["estimate"]} & {*of["stack"]})
-        pairs = numpy.array([of["estimate"][seed] - of["stack"][seed] for seed in both])
-        row.append("{:+.1f} [{:+.1f}, {:+.1f}]".format(*interval(pairs)) if len(pairs) else "")
+        both, total = sorted({*of["estimate"]} & {*of["stack"]}), TRAINING[name]["steps"]
+        if both:
+            pairs = [of["estimate"][seed] - of["stack"][seed] for seed in both]
+            row.append(f"{numpy.mean(pairs):+.1f} ({min(pairs):+.1f}, {max(pairs):+.1f})")
+            curves = [
+                [runs["trained", name, way, level, seed]["curve"] for way in ("estimate", "stack")]
+                for seed in both
+            ]
+            needed = [steps_to_level(own, float(numpy.nanmean(other[-2:])), total) for own, other in curves]
+            row.append(
+                f"{numpy.median(needed):,.0f} of {total:,}"
+                if numpy.isfinite(needed).all()
+                else "not all seeds"
+            )
         deviation = PROBLEMS[name][4][LEVELS.index(level)]
-        print(f"| {name}, {TRAINING[name]['steps']:,} steps | {deviation:g} | " + " | ".join(row) + " |")
+        print(f"| {name} | {deviation:g} | " + " | ".join(row) + " |")
 
 
 def draw_episode(file: Path) -> None:

@@ -277,7 +277,7 @@ class Graph:
         known: Sequence[numpy.ndarray],
         numbers: Sequence[Any],
     ) -> Any:
-        """Return which members :meth:`_simpler` may simplify beyond the rules in :meth:`nodes`."""
+        """Return a mask of the array elements that :meth:`_simpler` may simplify beyond the rules in :meth:`nodes`."""
         if name in ("maximum", "minimum"):
             return numpy.logical_or.reduce(
                 [there & (number != number) for there, number in zip(known, numbers, strict=True)]

@@ -103,7 +103,7 @@ class Ungated(_Posterior):
     """
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability from prior, radar, and all decisions."""
+        """Return the log-probability of the classes from prior, radar, and all ESM decisions, also the refused ones."""
         return self.log_prior + self.radar(observation) + self.log_esm @ self.counts(observation, 1.0)
 
 

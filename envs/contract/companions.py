@@ -98,7 +98,9 @@ def trained_banks(task: Any) -> Mapping[str, type]:
 
 
 def action_reach(task: Any, control: str) -> tuple[str, ...]:
-    """Return the parameters that fix the range of an action of a control, see :class:`Actions`."""
+    """Return the names of the parameters that fix the range or duration of an action of a control, see
+    :class:`Actions`.
+    """
     found = find_companion(task, Actions)
     return () if found is None else found.reach.get(control, ())
 

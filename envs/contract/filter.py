@@ -132,7 +132,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     @abstractmethod
     def start(self, initial: Any) -> State:
-        """Return the state at the start of the track, of the task's :class:`Initial`."""
+        """Return the state at the start of the track from the initial estimate, an :class:`Initial` of the task."""
 
     def initialise(self, given: FilterInput) -> State:
         """Return the state at the start of the track from the whole input; its measurement is the initial estimate."""

@@ -323,22 +323,22 @@ def innovation_block(
     compression: Compression = SIGNED_LOG,
     over_interval: Interval = "last",
 ) -> Block:
-    """Return the innovation over a deviation; by default the ``innovation`` of the state."""
+    """Return the block of the innovation over a deviation; by default the ``innovation`` of the state."""
     return Block(name, value, text, parts, compression, over_interval=over_interval)
 
 
 def average_block(name: str, value: Value, text: str, parts: Sequence[str] = ()) -> Block:
-    """Return the average over the last measurements of a signed value, such as an innovation."""
+    """Return the block of the average over the last measurements of a signed value, such as an innovation."""
     return Block(name, value, text, parts, SIGNED_LOG)
 
 
 def nis_block(parts: Sequence[str] = ()) -> Block:
-    """Return the normalised innovation squared, ``nis`` of the state."""
+    """Return the block of the normalised innovation squared, ``nis`` of the state."""
     return Block("nis", lambda f, _: f.nis, "normalised innovation squared", parts, LOG1P)
 
 
 def log_squared_block(parts: Sequence[str] = ()) -> Block:
-    """Return the normalised innovation squared, of which the state has the logarithm ``log_squared``."""
+    """Return the block of log(1 + x), x the normalised innovation squared; the state has it as ``log_squared``."""
     return Block(
         "log_squared_innovation",
         lambda f, _: f.log_squared,
@@ -349,7 +349,7 @@ def log_squared_block(parts: Sequence[str] = ()) -> Block:
 
 
 def average_log_squared_block(average: str, parts: Sequence[str] = ()) -> Block:
-    """Return the average of :func:`log_squared_block`, ``average_log_squared`` of the state.
+    """Return the block of the average of :func:`log_squared_block`, ``average_log_squared`` of the state.
 
     Args:
         average: over which measurements, in words.
@@ -370,7 +370,8 @@ def expected_nis_block(
     text: str = "the hypotheses' mean normalised innovation squared",
     over_interval: Interval = "last",
 ) -> Block:
-    """Return the normalised innovation squared that a bank of hypotheses expects; zero where nothing was received.
+    """Return the block of the normalised innovation squared that a bank of hypotheses expects; zero where nothing was
+    received.
 
     Args:
         xp: array namespace.
@@ -395,26 +396,28 @@ def relative_likelihood_block(
     name: str = "log_likelihood",
     value: Callable[[Any], Array] = lambda f: f.log_likelihood,
 ) -> Block:
-    """Return the log-likelihoods of the hypotheses, less the largest; by default ``log_likelihood`` of the state."""
+    """Return the block of the log-likelihoods of the hypotheses, less the largest; by default ``log_likelihood`` of
+    the state.
+    """
     return Block(name, lambda f, _: value(f) - xp.max(value(f), axis=0), text, parts, compression)
 
 
 def log_density_block(
     value: Value, text: str, name: str = "log_likelihood", over_interval: Interval = "last"
 ) -> Block:
-    """Return the log-density of a measurement in its usual units."""
+    """Return the block of the log-density of a measurement in its usual units."""
     return Block(name, value, text, compression=BOUNDED_LOG, over_interval=over_interval)
 
 
 def log_predicted_block(
     parts: Sequence[str], text: str = "the logarithm of the predicted probability"
 ) -> Block:
-    """Return the logarithms of the predicted probabilities, ``log_predicted`` of the state."""
+    """Return the block of the logarithms of the predicted probabilities, ``log_predicted`` of the state."""
     return Block("log_predicted", lambda f, _: f.log_predicted, text, parts, SIGNED_LOG)
 
 
 def predicted_block(parts: Sequence[str], measurement: str = "measurement", of: str = "") -> Block:
-    """Return the logarithms of the probabilities ``predicted`` by a bank of hypotheses.
+    """Return the block of the logarithms of the probabilities ``predicted`` by a bank of hypotheses.
 
     Args:
         parts: suffixes of the rows.
@@ -437,14 +440,14 @@ def probability_block(
     name: str = "probability",
     value: Callable[[Any], Array] = lambda f: f.probabilities,
 ) -> Block:
-    """Return the probabilities of hypotheses, by default ``probabilities`` of the state; rounding may not leave 0
-    to 1.
+    """Return the block of the probabilities of hypotheses, by default ``probabilities`` of the state; rounding may not
+    leave 0 to 1.
     """
     return Block(name, lambda f, _: xp.clip(value(f), 0.0, 1.0), text, parts, SHARE)
 
 
 def entropy_block(xp: ModuleType) -> Block:
-    """Return the entropy of the hypotheses, ``entropy`` of the state."""
+    """Return the block of the entropy of the hypotheses, ``entropy`` of the state."""
     return Block(
         "entropy",
         lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
@@ -458,14 +461,16 @@ def prior_block(
     text: str = "the sigma of the predicted position over that of the measurement",
     value: Value = lambda f, _: f.prior,
 ) -> Block:
-    """Return the deviation of the prediction over that of the measurement; the state has the logarithm ``prior``."""
+    """Return the block of the deviation of the prediction over that of the measurement; the state has the logarithm
+    ``prior``.
+    """
     return Block("prior", value, text, parts, KEPT_AS_LOG)
 
 
 def last_action_block(
     parts: Sequence[str] = (), name: str = "last_action", compression: Compression = ACTION
 ) -> Block:
-    """Return the action that was applied before, ``action`` of the state."""
+    """Return the block of the action that was applied before, ``action`` of the state."""
     return Block(name, lambda f, _: f.action, "action applied before", parts, compression)
 
 
@@ -474,14 +479,16 @@ def last_weight_block(
     value: Callable[[Any], Array] = lambda f: f.probabilities,
     text: str = "weight in force before this scan",
 ) -> Block:
-    """Return the weights of the hypotheses that were in force before; by default ``probabilities`` of the state."""
+    """Return the block of the weights of the hypotheses that were in force before; by default ``probabilities`` of
+    the state.
+    """
     return Block("last_weight", lambda f, _: value(f), text, parts, SHARE)
 
 
 def availability_block(
     text: str = "1 where a value was received", parts: Sequence[str] = (), over_interval: Interval = "last"
 ) -> Block:
-    """Return whether a measurement was received, its ``available``."""
+    """Return the block that shows whether a measurement was received, its ``available``."""
     return Block(
         "available",
         lambda _, measurement: measurement.available,
@@ -493,7 +500,7 @@ def availability_block(
 
 
 def clock_block(xp: ModuleType, horizon: int, unit: str = "1") -> Block:
-    """Return the share of the horizon that has passed, from the ``number`` of a measurement."""
+    """Return the block of the share of the horizon that has passed, from the ``number`` of a measurement."""
     return Block(
         "time",
         lambda _, measurement: xp.astype(measurement.number, xp.float64) / horizon,

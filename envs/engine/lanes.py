@@ -174,7 +174,7 @@ class ModelStepper:
         return start
 
     def episode(self) -> Episode:
-        """Return the episodes."""
+        """Return the present episodes of all lanes."""
         return self._episode
 
     def take(self, action: Array) -> None:

@@ -151,7 +151,7 @@ class Rollout:
         self._flown = 0
 
     def forward(self) -> None:
-        """Run one measurement."""
+        """Apply the action of the present measurement in all lanes, and simulate to the next one."""
         here = self._flown
         self._forward.table[self._addresses] = self._places[here]
         self._forward(0, self._width)

@@ -93,7 +93,8 @@ class Flights(FlightData):
         return {"trajectories": flown, "name": self.name, "fewest_scans": self.fewest_scans}
 
     def flyable(self, interval: float, farthest: float) -> tuple[list[Trajectory], list[str]]:
-        """Return the pieces that can be flown, and a note on every source, one line each.
+        """Return the pieces in range that are long enough to fly, and a line for each source that was cut or lost
+        pieces.
 
         Args:
             interval: sampling interval, s.

@@ -168,7 +168,7 @@ class RadarEsmTrackingPicture(Picture):
         bottom.legend(ncols=3, **legend)
 
     def arrange(self) -> None:
-        """Set the limits for this episode's class."""
+        """Set the limits of the acceleration axis to the accelerations of this episode's classes."""
         self.acceleration.set_ylim(-self.height, self.height)
 
     def draw(self, history: History, state: Episode) -> None:

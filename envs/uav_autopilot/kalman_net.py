@@ -85,7 +85,9 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return a box for the parts of the process noise, the sensors, and their factors in the gain alone."""
+        """Return a box: a factor for each part of the process noise and each sensor, then one more of each for the
+        gain.
+        """
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 
     @property

@@ -181,7 +181,9 @@ def _track_name(value: Any) -> str:
 def _covariance(
     columns: Mapping[str, Any], components: Sequence[str], rows: int
 ) -> tuple[tuple[bool, ...], numpy.ndarray]:
-    """Return which components have a variance, and the covariances ``(C, C, R)``, NaN for the others."""
+    """Read the columns ``covariance_A_B`` and ``sigma_A``: components with a variance, and covariances ``(C, C,
+    R)``.
+    """
     count = len(components)
     found = numpy.full((count, count, rows), numpy.nan)
     for i, a in enumerate(components):
