@@ -16,8 +16,8 @@ The clock of every task:
 ====  ==============================================================  =========================
  1    the truth advances; the sensors measure it                      :meth:`World.advance`
  2    the filter predicts to that time; innovations and likelihoods   :meth:`Filter.predict`
- 3    the agent observes them                                        :meth:`.Model.observe`
- 4    the filter updates with *that same* measurement and the action :meth:`Filter.update`
+ 3    the agent observes them                                         :meth:`.Model.observe`
+ 4    the filter updates with *that* measurement and the action       :meth:`Filter.update`
  5    the estimate is compared with the truth                         :meth:`World.cost`
 ====  ==============================================================  =========================
 
