@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -45,6 +46,8 @@ def build_twice(tools: Path, folder: Path) -> str:
     sums = []
     for name, umask in (("first", 0o022), ("second", 0o077)):
         clone, output, before = folder / name, folder / f"{name}-distributions", os.umask(umask)
+        for left in (clone, output):  # of the last run
+            shutil.rmtree(left, ignore_errors=True)
         try:
             run(["git", "clone", "--quiet", ROOT, clone])
             if name == "second":
