@@ -66,6 +66,7 @@ def build_twice(tools: Path, folder: Path) -> str:
 
 def check_types(folder: Path) -> str:
     """Return the share of public names whose type is known, of the wheel beside this environment's libraries."""
+    shutil.rmtree(folder / "typed", ignore_errors=True)  # pip leaves what is in a target
     venv.create(folder / "typed", with_pip=False, symlinks=True)
     site = next((folder / "typed" / "lib").glob("python*")) / "site-packages"
     wheel = next((folder / "first-distributions").glob("*.whl"))
