@@ -352,10 +352,18 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
     if "eph" in data:
         sigma = data["eph"].astype(float) / math.sqrt(2.0)
         columns |= {"sigma_x": sigma, "sigma_y": sigma}
-    notes = [f"positions are of {log['topic']}, times seconds since the start of the autopilot"]
-    if not fixed.all():
-        notes.append(f"{count_of(int((~fixed).sum()), 'row')} without a fix")
-    return ReceiverLog(columns, tuple(notes))
+    return ReceiverLog(columns, _autopilot_notes(log["topic"], fixed))
+
+
+def _autopilot_notes(topic: str, fixed: numpy.ndarray) -> tuple[str, ...]:
+    """Return the notes on positions in the log of an autopilot, of which some have a fix, booleans ``(rows,)``."""
+    source = f"positions are of {topic}, times seconds since the start of the autopilot"
+    return (source, *_missing_fixes(fixed, "row"))
+
+
+def _missing_fixes(fixed: numpy.ndarray, noun: str) -> tuple[str, ...]:
+    """Return a note on how many rows or messages have no fix; none if all have one."""
+    return () if fixed.all() else (f"{count_of(int((~fixed).sum()), noun)} without a fix",)
 
 
 # --- ArduPilot
@@ -386,10 +394,7 @@ def read_dataflash(file: Path, most_rows: int) -> ReceiverLog:
     if len(stated):
         at = numpy.maximum(numpy.searchsorted(stated, time, side="right") - 1, 0)
         columns |= dict.fromkeys(("sigma_x", "sigma_y"), accuracy[at] / math.sqrt(2.0))
-    notes = ["positions are of GPS, times seconds since the start of the autopilot"]
-    if not fixed.all():
-        notes.append(f"{count_of(int((~fixed).sum()), 'row')} without a fix")
-    return ReceiverLog(columns, tuple(notes))
+    return ReceiverLog(columns, _autopilot_notes("GPS", fixed))
 
 
 # --- ROS
@@ -430,9 +435,7 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
     else:
         columns["sigma_x"] = numpy.sqrt(numpy.maximum(east, 0.0))
         columns["sigma_y"] = numpy.sqrt(numpy.maximum(north, 0.0))
-    if not fixed.all():
-        notes.append(f"{count_of(int((~fixed).sum()), 'message')} without a fix")
-    return ReceiverLog(columns, tuple(notes))
+    return ReceiverLog(columns, (*notes, *_missing_fixes(fixed, "message")))
 
 
 def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:

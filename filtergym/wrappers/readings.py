@@ -83,8 +83,7 @@ def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) ->
                     "and others do not: give one sensor to each kind"
                 )
             wraps = values.get("wraps") or turning.pop()
-            R = values["R"] if callable(values["R"]) else numpy.asarray(values["R"], dtype=float)
-            R = numpy.diag(numpy.broadcast_to(R, len(places))) if not callable(R) and R.ndim == 0 else R
+            R = values["R"] if callable(values["R"]) else _noise_matrix(values["R"], len(places))
             values = {**values, "wraps": wraps, "h": numpy.eye(len(names))[places], "R": R}
         found[str(name)] = EnvironmentSensor(**values)
     return found
@@ -93,9 +92,8 @@ def read_sensors(given: Any, names: Sequence[str], angles: Mapping[str, str]) ->
 def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | None:
     """Return the places of components that are named, numbered or chosen by a matrix; None for any other h."""
     if not callable(h) and numpy.shape(h)[1:] == (len(names),):
-        rows = numpy.asarray(h, dtype=float)
-        is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
-        return rows.argmax(axis=1).tolist() if is_choice and len(rows) else None
+        chosen = _chosen_columns(numpy.asarray(h, dtype=float))
+        return chosen.tolist() if chosen is not None and len(chosen) else None
     kinds = (str, int, numpy.integer)
     listed: Any = [h] if isinstance(h, kinds) else h
     if not isinstance(listed, Sequence) or not all(isinstance(one, kinds) for one in listed):
@@ -109,6 +107,18 @@ def _component_places(sensor: str, h: Any, names: Sequence[str]) -> list[int] | 
             )
         places.append(names.index(one) if isinstance(one, str) else int(one))
     return places
+
+
+def _chosen_columns(rows: Array) -> Array | None:
+    """Return the column that each row of a matrix chooses; None where a row is not one 1 among zeros."""
+    is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
+    return rows.argmax(axis=1) if is_choice else None
+
+
+def _noise_matrix(R: Any, count: int) -> Array:
+    """Return R as an array; a single number is the variance of each of the numbers that a sensor measures."""
+    given = numpy.asarray(R, dtype=float)
+    return numpy.diag(numpy.broadcast_to(given, count)) if given.ndim == 0 else given
 
 
 class Reading(NamedTuple):
@@ -165,8 +175,7 @@ class Readings:
             root = numpy.zeros((m, m))
             for channel, own in zip(self.channels, self._noises, strict=True):
                 root[channel.places, channel.places] = own
-            is_choice = ((rows == 0.0) | (rows == 1.0)).all() and (rows.sum(axis=1) == 1.0).all()
-            self._chosen = rows.argmax(axis=1) if is_choice else None
+            self._chosen = _chosen_columns(rows)
             self._diagonal = numpy.diag(root) if not numpy.tril(root, -1).any() else None
             self._rows, self._root = rows, root
         self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self.channels)
@@ -197,8 +206,7 @@ class Readings:
             return VectorFunction(
                 lambda x: [number for row in numpy.reshape(one.R(x), (count, count)) for number in row], size
             )
-        R = numpy.asarray(one.R, dtype=float)
-        R = numpy.diag(numpy.broadcast_to(R, count)) if R.ndim == 0 else R
+        R = _noise_matrix(one.R, count)
         try:
             if R.shape != (count, count) or not numpy.isfinite(R).all():
                 raise numpy.linalg.LinAlgError
