@@ -7,7 +7,8 @@
     differences, from a moving average of four, and from the estimates of filters; 100 episodes of equal seeds.
 ``trained``
     PPO of Stable-Baselines3 on the full observation, on readings, on a stack of four readings and on estimates,
-    with its mean return over 50 fresh episodes.
+    with its mean return over 50 fresh episodes; of two environments at the medium noise also on estimates with
+    deviation, NIS and innovation, and the same with actions that steer the filter's noise, too.
 
 Results are appended to FILE, one line of JSON for each cell, and an existing cell is not computed again. Tables
 are printed at the end: mean returns, and differences with 95 % intervals, paired by episode or by training seed.
@@ -94,6 +95,9 @@ TRAINING: dict[str, dict[str, Any]] = {
 MountainCarContinuous were chosen on two seeds under the truth, which the Zoo's did not solve."""
 LANES = 8
 FILTERS = ("extended", "unscented")
+STEERING = {"uncertainty": None, "steered": "noise"}
+"""Agents that observe deviation, NIS and innovation, too, and the control of their filter."""
+STEERED = ("Pendulum-v1", "CartPole-v1")
 
 
 def sensors_of(name: str, level: str) -> dict[str, Any]:
@@ -171,6 +175,17 @@ def show_directions(env: Any, name: str) -> Any:
     return gymnasium.wrappers.TransformObservation(env, transform, space)
 
 
+def choose_steering(env: Any) -> Any:
+    """Let an agent of discrete actions choose each action of the filter among three: its lowest, zero and highest."""
+    if not isinstance(env.action_space, gymnasium.spaces.Tuple):
+        return env
+    discrete, own = env.action_space
+    space = gymnasium.spaces.MultiDiscrete([discrete.n, *[3] * own.shape[0]])
+    levels = numpy.array([own.low, numpy.zeros(own.shape), own.high])
+    each = numpy.arange(own.shape[0])
+    return gymnasium.wrappers.TransformAction(env, lambda a: (a[0], levels[a[1:], each]), space)
+
+
 def make(name: str, way: str, level: str) -> Any:
     """Return an environment as an agent in training observes it."""
     env: Any = gymnasium.make(name)
@@ -178,8 +193,12 @@ def make(name: str, way: str, level: str) -> Any:
         env = NoisyObservation(env, sensors_of(name, level))
     if way in ("raw", "stack"):
         env = show_directions(env, name)
-    if way in ("estimate", "steered"):
-        env = EstimatedObservation(env, control="noise" if way == "steered" else None)
+    if way == "estimate":
+        env = EstimatedObservation(env)
+    elif way in STEERING:
+        form = "mean" if CLASSIC_CONTROL[PROBLEMS[name][0]].observation is None else "observation"
+        show = (form, "deviation", "nis", "innovation")
+        env = choose_steering(EstimatedObservation(env, show=show, control=STEERING[way]))
     elif way == "stack":
         env = gymnasium.wrappers.FlattenObservation(gymnasium.wrappers.FrameStackObservation(env, STACK))
     return env
@@ -238,6 +257,8 @@ def cells(stages: list[str], only: list[str], seeds: int) -> Iterator[tuple[str,
             for level in ("", "medium", "high", "low"):
                 for way in ("truth",) if not level else ("estimate", "stack", "raw"):
                     yield from (("trained", name, way, level, str(seed)) for name in only)
+            steered = [name for name in only if name in STEERED]
+            yield from (("trained", name, way, "medium", str(seed)) for name in steered for way in STEERING)
 
 
 def interval(values: numpy.ndarray) -> tuple[float, float, float]:
