@@ -75,13 +75,21 @@ def _key(value: Any) -> Any:
 
 
 def report_estimate(model: Any, episode: Any) -> dict[str, Any]:
-    """Report mean, variances and normalised innovation squared of a filter."""
-    covariance = model.filter.covariance(episode.filter)
-    xp = model.task.xp
-    mean = model.filter.mean(episode.filter)
+    """Report a filter in one array: its mean, the same without whole turns, deviations, NIS, and whether it is lost."""
+    xp, covariance = model.task.xp, model.filter.covariance(episode.filter)
+    mean, available = model.filter.mean(episode.filter), episode.measurement.available
     nis = model.filter.records(episode.filter, episode.measurement).get("nis", 0.0 * mean[0])
-    variance = xp.stack([covariance[i, i] for i in range(mean.shape[0])])
-    return {"mean": mean, "variance": variance, "nis": nis}
+    received, held = available[0] > 0.0, abs(mean[0]) < LARGEST
+    for one in available[1:]:
+        received = received | (one > 0.0)
+    deviations, turned = [], []
+    for i in range(mean.shape[0]):
+        held = held & (abs(mean[i]) < LARGEST) & (covariance[i, i] < LARGEST)
+        deviations.append(xp.sqrt(covariance[i, i]))
+        period = model.task.periods.get(i)
+        turned.append(mean[i] - (0.0 if period is None else period * xp.round(mean[i] / period)))
+    nis, lost = xp.where(received, nis, 0.0), xp.where(held, 0.0, 1.0)
+    return {"estimate": xp.stack([*(one for one in mean), *turned, *deviations, nis, lost])}
 
 
 class Estimates:
@@ -151,44 +159,42 @@ class Estimates:
         self._h = own.task.definition.filters[0].h
         numbers = [one for one, channel in zip(sensors.values(), own.task.definition.channels, strict=True)
                    for _ in channel.numbers]  # fmt: skip
-        delays = numpy.array([one.delay for one in numbers])
-        self._behind, self._held = int(delays.max()), int(delays.max()) - delays
-        """Steps for which each number waits for the slowest."""
-        self.periods: Array = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in numbers])
-        self.turns: list[tuple[int, float]] = [
-            (i, PERIODS[model.angles[one]]) for i, one in enumerate(model.names) if one in model.angles
-        ]
-        m, p = len(numbers), len(model.inputs)
-        depth = self._behind + 1
-        self._values = numpy.zeros((depth, lanes, m))
-        self._available = numpy.zeros((depth, lanes, m), dtype=bool)
-        self._inputs = numpy.zeros((depth + 1, lanes, p))
-        self._steps = numpy.zeros(lanes, dtype=numpy.int64)
-        self.mean: Array = numpy.zeros((lanes, len(model.names)))
-        self.deviation: Array = numpy.zeros_like(self.mean)
+        self._behind = max(one.delay for one in numbers)
+        periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in numbers])
+        self._turning, self._periods = numpy.isfinite(periods), numpy.where(periods < numpy.inf, periods, 1.0)
+        n, m, p = len(model.names), len(numbers), len(model.inputs)
+        self._inputs = numpy.zeros((self._behind + 2, lanes, p))
+        """Inputs of the last steps, by the clock modulo their number."""
+        self._clock = 0
+        self._starts = numpy.zeros(lanes, dtype=numpy.int64)
+        """Clock at the start of each lane's episode."""
+        self.mean: Array = numpy.zeros((lanes, n))
+        self.deviation: Array = numpy.zeros((lanes, n))
         self.nis: Array = numpy.zeros(lanes)
         self.innovation: Array = numpy.zeros((lanes, m))
-        self._filtered = self.mean.T
-        """Means of the filters, ``(n, N)``."""
-        self._each, self._no_inputs = numpy.arange(lanes), numpy.zeros((lanes, p))
-        self._intervals, self._needs_innovation = numpy.full(lanes, model.interval), "innovation" in show
+        self._filtered = numpy.zeros((n, lanes))
+        """Means of the filters."""
+        self._no_inputs, self._no_interval = numpy.zeros((lanes, p)), numpy.zeros(lanes)
+        self._intervals = numpy.full(lanes, model.interval)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return arguments, arrays and the state of the filters; their code is made anew."""
-        arrays = {name: value for name, value in vars(self).items() if isinstance(value, numpy.ndarray)}
-        return {"arguments": self._arguments, "arrays": arrays, "filters": self._update.state}
+        kinds = (numpy.ndarray, int)
+        values = {name: value for name, value in vars(self).items() if isinstance(value, kinds)}
+        return {"arguments": self._arguments, "values": values, "filters": self._update.state}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(*state["arguments"])  # type: ignore[misc]
-        vars(self).update(state["arrays"])
+        vars(self).update(state["values"])
         if state["filters"] is not None:
             self._update.resume(state["filters"], ())
 
     def begin(self, lanes: Array, reading: Reading) -> None:
         """Begin episodes of some lanes with their first readings; the others stay as they are."""
         self._restart(lanes)
-        self._steps[lanes] = 0
-        self._take(lanes, reading, self._no_inputs, None)
+        self._starts[lanes] = self._clock
+        self._inputs[self._clock % len(self._inputs), lanes] = 0.0
+        self._take(lanes, self._no_interval, self._no_inputs, reading, None)
 
     def _restart(self, lanes: Array) -> None:
         model, N = self.model, self._width
@@ -210,101 +216,71 @@ class Estimates:
         Args:
             lanes: which step, booleans ``(N,)``; None: all.
             inputs: that acted in the step, ``(N, p)``.
-            reading: of all lanes.
+            reading: of these lanes, of one time: :attr:`.Readings.complete`.
             action: of the control, ``(N, ...)``.
         """
-        self._steps += 1 if lanes is None else lanes
-        self._take(lanes, reading, inputs, action)
-
-    def _take(self, lanes: Array | None, reading: Reading, inputs: Array, action: Array | None) -> None:
-        values, available, acted, moves = reading.values, reading.available, inputs, lanes
+        self._clock += 1
+        moves, interval = lanes, self._intervals
         if self._behind:
-            values, available, acted = self._align(lanes, reading, inputs)
-            moves = self._steps > self._behind if lanes is None else lanes & (self._steps > self._behind)
-        elif lanes is not None:
-            available = available & lanes[:, None]
-            moves = lanes & (self._steps > 0)
-        interval = self._intervals if moves is None else numpy.where(moves, self.model.interval, 0.0)
-        self._send(values.T, available.T, interval, acted.T)
+            self._inputs[self._clock % len(self._inputs)] = inputs
+            inputs = self._inputs[(self._clock - self._behind) % len(self._inputs)]
+            late = self._clock - self._starts > self._behind
+            moves = late if lanes is None else lanes & late
+        if moves is not None:
+            interval = numpy.where(moves, interval, 0.0)
+        if action is not None:
+            action = numpy.asarray(action, dtype=float)[self._pad]
+            action = action if moves is None else numpy.where(moves[self._pad][:, None], action, 0.0)
+        self._take(lanes, interval, inputs, reading, action)
+
+    def _take(
+        self, lanes: Array | None, interval: Array, inputs: Array, reading: Reading, action: Array | None
+    ) -> None:
+        """Give a measurement to the filters, and keep what they report of some lanes."""
+        sent = [part[0] if self._lanes == 1 else part.T for part in (*reading, interval, inputs)]
+        self._update.receive(StateSpaceMeasurement(*sent[: 3 + bool(self.model.inputs)]))
         if self._is_asked:
-            self._update.act(self._no_action if action is None else self._actions(action, moves))
-        found = self._update.report()
-        mean, variance = found["mean"].reshape(-1, self._lanes), found["variance"].reshape(-1, self._lanes)
-        if self._needs_innovation:
-            self._find_innovation(lanes, values, available, interval, acted.T)
-        self._filtered, present = mean, mean
-        for back in range(self._behind - 1, -1, -1):
-            going = numpy.where(self._steps > back, self.model.interval, 0.0)
-            u = self._inputs[(self._steps - back) % (self._behind + 2), self._each].T
-            present = self._motion_of(present, going, u)
-        nis = (
-            found["nis"].reshape(self._lanes)
-            if available.all()
-            else numpy.where(available.any(axis=1), found["nis"], 0.0)
-        )
-        shown: tuple[Array, ...] = present.T.copy(), numpy.sqrt(variance.T), nis
-        for i, period in self.turns:
-            angle = shown[0][:, i]
-            angle -= period * numpy.rint(angle / period)
-        if lanes is not None:
-            old = self.mean, self.deviation, self.nis
-            shown = tuple(
-                numpy.where(lanes if new.ndim == 1 else lanes[:, None], new, before)
-                for new, before in zip(shown, old, strict=True)
-            )
-        self.mean, self.deviation, self.nis = shown
-        if not abs(mean.sum()) + variance.sum() < LARGEST:
-            lost = ~((abs(mean) < LARGEST).all(axis=0) & (variance < LARGEST).all(axis=0))
+            self._update.act(self._no_action if action is None else action)
+        n, N = len(self.model.names), self._lanes
+        found = self._update.report()["estimate"].reshape(-1, N)
+        if "innovation" in self._show:
+            self._find_innovation(lanes, reading, interval, inputs.T)
+        self._filtered, shown = found[:n], found[n : 2 * n]
+        if self._behind:
+            shown = self._present()
+        new = shown.T, found[2 * n : 3 * n].T, found[3 * n]
+        if lanes is None:
+            self.mean, self.deviation, self.nis = new
+        else:
+            old = zip(new, (self.mean, self.deviation, self.nis), strict=True)
+            self.mean, self.deviation, self.nis = (numpy.where(lanes, one.T, other.T).T for one, other in old)
+        if found[-1].any():
+            lost = found[-1] > 0.0
             self._restart(lost)
             deviation = numpy.sqrt(numpy.diag(self.model.matrix("covariance")))
             self.mean[lost], self.deviation[lost], self.nis[lost] = self.model.mean, deviation, 0.0
 
-    def _align(self, lanes: Array | None, reading: Reading, inputs: Array) -> tuple[Array, Array, Array]:
-        """Return the readings of the time for which the slowest sensor has come, and the inputs until then."""
-        depth, step, each = self._behind + 1, self._steps, self._each
-        which = each if lanes is None else numpy.flatnonzero(lanes)
-        self._values[step[which] % depth, which] = reading.values[which]
-        self._available[step[which] % depth, which] = reading.available[which]
-        self._inputs[step[which] % (depth + 1), which] = inputs[which]
-        place, columns = (step[:, None] - self._held) % depth, numpy.arange(self._values.shape[2])
-        ready = (step >= self._behind)[:, None]
-        ready = ready if lanes is None else ready & lanes[:, None]
-        values = self._values[place, each[:, None], columns]
-        available = self._available[place, each[:, None], columns] & ready
-        return values, available, self._inputs[(step - self._behind) % (depth + 1), each]
+    def _present(self) -> Array:
+        """Return the means of the filters carried to the present, without whole turns, ``(n, N)``."""
+        mean = self._filtered
+        for back in range(self._behind - 1, -1, -1):
+            going = numpy.where(self._clock - self._starts > back, self.model.interval, 0.0)
+            mean = self._motion_of(mean, going, self._inputs[(self._clock - back) % len(self._inputs)].T)
+        for i, period in self._own.task.periods.items():
+            mean[i] -= period * numpy.rint(mean[i] / period)
+        return mean
 
     def _find_innovation(
-        self, lanes: Array | None, values: Array, available: Array, interval: Array, acted: Array
+        self, lanes: Array | None, reading: Reading, interval: Array, inputs: Array
     ) -> None:
         """Compare readings with those predicted at the last estimate."""
-        predicted = self._motion_of(self._filtered, interval, acted)
-        innovation = values - numpy.asarray(self._h.value(predicted, numpy)).T
-        turning = numpy.isfinite(self.periods)
-        periods = numpy.where(turning, self.periods, 1.0)
-        innovation -= numpy.where(turning, numpy.rint(innovation / periods) * periods, 0.0)
-        innovation = numpy.where(available, innovation, 0.0)
-        self.innovation = (
-            innovation if lanes is None else numpy.where(lanes[:, None], innovation, self.innovation)
-        )
-
-    def _send(self, values: Array, available: Array, interval: Array, inputs: Array) -> None:
-        """Give a measurement to the filters; arrays ``(..., N)``, without this axis where there is one lane."""
-        parts: tuple[Any, ...] = (
-            values,
-            available,
-            interval,
-            inputs if self.model.inputs else None,
-            None,
-            None,
-        )
-        if self._lanes == 1:
-            parts = tuple(None if part is None else part[..., 0] for part in parts)
-        self._update.receive(StateSpaceMeasurement(*parts))
-
-    def _actions(self, action: Array, moves: Array | None) -> Array:
-        """Return actions of the whole width; zero in lanes whose filter stands still."""
-        padded = numpy.asarray(action, dtype=float)[self._pad]
-        return padded if moves is None else numpy.where(moves[self._pad][:, None], padded, 0.0)
+        predicted = self._motion_of(self._filtered, interval, inputs)
+        innovation = reading.values - numpy.asarray(self._h.value(predicted, numpy)).T
+        turns = numpy.rint(innovation / self._periods) * self._periods
+        innovation -= numpy.where(self._turning, turns, 0.0)
+        innovation = numpy.where(reading.available, innovation, 0.0)
+        kept = innovation if lanes is None else numpy.where(lanes[:, None], innovation, self.innovation)
+        self.innovation = kept
 
     def _motion_of(self, mean: Array, interval: Array, inputs: Array) -> Array:
         """Return states ``(n, N)`` an interval later."""

@@ -133,6 +133,8 @@ class Reading(NamedTuple):
 class Readings:
     """Sensors of N lanes.
 
+    All lanes step together, and a row of a block holds the noise of each one's own step.
+
     Args:
         sensors: of :func:`read_sensors`.
         size: n, components of the state.
@@ -140,204 +142,192 @@ class Readings:
         lanes: N.
 
     Attributes:
-        channels: places of the sensors among the m numbers.
         limit: of each number, half a turn of an angle but for rounding, else infinity, ``(m,)``.
+        complete: readings of the last time of which those of all sensors, the slowest too, have been received.
     """
 
     def __init__(
         self, sensors: Mapping[str, EnvironmentSensor], size: int, interval: float, lanes: int
     ) -> None:
-        self.sensors: Mapping[str, EnvironmentSensor] = sensors
-        self.interval: float = interval
-        self._lanes = lanes
+        self._interval, self._lanes = interval, lanes
         self._functions = [
             trace_measurement(f"h of the sensor {name!r}", one.h, size, 0) for name, one in sensors.items()
         ]
         counts = [function.size for function in self._functions]
-        self.channels: tuple[Channel, ...] = find_channels(sensors, counts, interval)
-        self._noises = [self._noise(*each, size) for each in zip(sensors.items(), counts, strict=True)]
-        m = sum(counts)
-        of_each = [one for one, count in zip(sensors.values(), counts, strict=True) for _ in range(count)]
-        self.bias: Array
-        self.quantum: Array
-        self.delays: Array
-        self.bias, self.quantum, self.delays = (
-            numpy.array([getattr(one, name) for one in of_each]) for name in ("bias", "quantum", "delay")
+        self._channels: tuple[Channel, ...] = find_channels(sensors, counts, interval)
+        m = self._size = sum(counts)
+        self._root, self._varying = numpy.eye(m), {}
+        for channel, (name, one) in zip(self._channels, sensors.items(), strict=True):
+            if callable(one.R):
+                self._varying[channel] = _noise_function(one.R, channel.size, size)
+            else:
+                self._root[channel.places, channel.places] = _noise_root(name, one.R, channel.size)
+        self._rows, self._chosen = None, None
+        if not self._varying and all(f.matrix is not None and not numpy.any(f.offset) for f in self._functions):
+            self._rows = numpy.concatenate([numpy.asarray(one.matrix) for one in self._functions])
+            self._chosen = _chosen_columns(self._rows)
+        each = [one for one, count in zip(sensors.values(), counts, strict=True) for _ in range(count)]
+        self._bias, self._quantum, self._delays = (
+            numpy.array([getattr(one, name) for one in each]) for name in ("bias", "quantum", "delay")
         )
-        self.periods: Array = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in of_each])
-        self.limit: Array = numpy.nextafter(0.5 * self.periods, numpy.inf)
-        self._turning, self._rounded = numpy.isfinite(self.periods), self.quantum > 0.0
-        self._size = m
-        self._is_linear = all(one.matrix is not None and not numpy.any(one.offset) for one in self._functions)
-        self._is_linear &= not any(isinstance(root, VectorFunction) for root in self._noises)
-        if self._is_linear:
-            rows = numpy.concatenate([numpy.asarray(one.matrix) for one in self._functions])
-            root = numpy.zeros((m, m))
-            for channel, own in zip(self.channels, self._noises, strict=True):
-                root[channel.places, channel.places] = own
-            self._chosen = _chosen_columns(rows)
-            self._diagonal = numpy.diag(root) if not numpy.tril(root, -1).any() else None
-            self._rows, self._root = rows, root
-        self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self.channels)
-        self._turn = numpy.where(self._turning, self.periods, 1.0)
-        self._is_exact = not (self._turning.any() or self._rounded.any())
-        self._each, self._all_made = numpy.arange(lanes), numpy.ones((lanes, m), dtype=bool)
+        periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in each])
+        self.limit: Array = numpy.nextafter(0.5 * periods, numpy.inf)
+        self._turning, self._turn = numpy.isfinite(periods), numpy.where(periods < numpy.inf, periods, 1.0)
+        self._turns, self._all_turn = bool(self._turning.any()), bool(self._turning.all())
+        self._rounded, self._rounds = self._quantum > 0.0, bool(self._quantum.any())
+        self._is_biased, self._is_on_time = bool(self._bias.any()), not self._delays.any()
+        self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
+        self._all_made = numpy.ones((lanes, m), dtype=bool)
         self._identities = numpy.zeros((2, lanes), dtype=numpy.uint64)
         self._is_seeded = numpy.zeros(lanes, dtype=bool)
-        self.steps: Array = numpy.zeros(lanes, dtype=numpy.int64)
-        """Since the start of each lane's episode."""
-        self._block = numpy.zeros((BLOCK, 2 * m + len(sensors), lanes))
-        self._filled = numpy.zeros(lanes, dtype=numpy.int64)
-        """First step of each lane's block."""
-        self._offset = numpy.zeros((lanes, m))
-        self._last = numpy.zeros((lanes, m))
-        self._waiting = numpy.zeros((int(self.delays.max()) + 1, 2, lanes, m))
-        """Readings that are under way and whether they were made, by the step modulo the longest delay plus one."""
+        self._clock = 0
+        """Steps of all lanes."""
+        self._starts = numpy.zeros(lanes, dtype=numpy.int64)
+        """Clock at the start of each lane's episode."""
+        self._noise = numpy.zeros((BLOCK, lanes, m))
+        self._uniforms = numpy.zeros((BLOCK, len(sensors), lanes))
+        self._offset, self._last = numpy.zeros((lanes, m)), numpy.zeros((lanes, m))
+        self._waiting = numpy.zeros((int(self._delays.max()) + 1, 2, lanes, m))
+        """Readings that are under way and whether they were made, by the clock modulo the longest delay plus one."""
+        self.complete: Reading = Reading(self._last, self._all_made)
 
-    @staticmethod
-    def _noise(item: tuple[str, EnvironmentSensor], count: int, size: int) -> Any:
-        """Return the root of a sensor's R, or its function of the state.
-
-        Raises:
-            ValueError: where R is no covariance.
-        """
-        name, one = item
-        if callable(one.R):
-            return VectorFunction(
-                lambda x: [number for row in numpy.reshape(one.R(x), (count, count)) for number in row], size
-            )
-        R = _noise_matrix(one.R, count)
-        try:
-            if R.shape != (count, count) or not numpy.isfinite(R).all():
-                raise numpy.linalg.LinAlgError
-            return numpy.linalg.cholesky(R)
-        except numpy.linalg.LinAlgError:
-            raise ValueError(
-                f"R of the sensor {name!r} must be a positive definite covariance of its {count} numbers, got "
-                f"{numpy.asarray(one.R).tolist()}"
-            ) from None
-
-    def begin(self, lanes: Array, state: Array, seeds: Sequence[int | None] | None) -> Reading:
+    def begin(
+        self, lanes: Array, state: Array, seeds: Sequence[int | None] | None, received: Any = False
+    ) -> Reading:
         """Begin episodes of some lanes, and return the first readings; they are received at once, but for the delay.
 
         Args:
             lanes: which begin, booleans ``(N,)``.
             state: of all lanes, ``(N, n)``.
             seeds: of all lanes; None, of all or of one: it goes on with its next episode, at first of a random seed.
+            received: whether the others have received theirs.
         """
         given: Sequence[int | None] = [None] * self._lanes if seeds is None else seeds
-        goes_on = lanes & self._is_seeded & (seeds is None)
-        self._identities[1, goes_on] += numpy.uint64(1)
-        for lane in numpy.flatnonzero(lanes & ~goes_on).tolist():
+        for lane in numpy.flatnonzero(lanes).tolist():
             seed = given[lane]
-            if seed is None and not self._is_seeded[lane]:
-                seed = int(numpy.random.SeedSequence().generate_state(1)[0])
-            if seed is None:
+            if seed is None and self._is_seeded[lane]:
                 self._identities[1, lane] += numpy.uint64(1)
-            else:
-                self._identities[:, lane] = int(seed) ^ STREAM << 32, 0
-                self._is_seeded[lane] = True
-        self.steps[lanes] = 0
+                continue
+            if seed is None:
+                seed = int(numpy.random.SeedSequence().generate_state(1)[0])
+            self._identities[:, lane], self._is_seeded[lane] = (int(seed) ^ STREAM << 32, 0), True
+        self._starts[lanes] = self._clock
         self._fill(lanes)
-        row = self._row()
-        self._offset[lanes] = (self.bias * row[self._size : 2 * self._size].T)[lanes]
-        values = self._measure(state, row)
-        self._waiting[:, 0, lanes], self._waiting[:, 1, lanes] = values[lanes], 0.0
-        self._waiting[0, 1, lanes] = 1.0
-        self._last = numpy.where(lanes[:, None], values, self._last)
-        available = numpy.zeros((self._lanes, self._size), dtype=bool)
-        available[lanes] = self.delays == 0
-        return Reading(self._last, available)
+        if self._is_biased:
+            first = numpy.zeros(numpy.count_nonzero(lanes), dtype=numpy.int64)
+            normals = numbers(self._identities[:, lanes], first, 2 * self._size, 0)
+            self._offset[lanes] = self._bias * normals[self._size :].T
+        values = self._measure(state)
+        self._waiting[:, :, lanes] = 0.0
+        self._waiting[self._clock % len(self._waiting)][:, lanes] = values[lanes], self._all_made[lanes]
+        values = self._last = numpy.where(lanes[:, None], values, self._last)
+        found = Reading(values, numpy.where(lanes[:, None], self._delays == 0, received))
+        self.complete = self._complete(found, lanes)
+        return found
 
     def advance(self, lanes: Array | None, state: Array) -> Reading:
-        """Return the readings one step later of some lanes; others keep their last ones.
+        """Return the readings one step later of some lanes; others keep their last ones, and wait for their beginning.
 
         Args:
             lanes: which step, booleans ``(N,)``; None: all.
             state: of all lanes, ``(N, n)``.
         """
-        self.steps += 1 if lanes is None else lanes
-        late = self.steps - self._filled >= BLOCK
-        if late[0] if self._lanes == 1 else late.any():
-            self._fill(late)
-        row = self._row()
-        made = self._all_made if self._is_steady else self._made(row[2 * self._size :])
-        values = self._measure(state, row)
-        if len(self._waiting) > 1:
-            number, depth, each = self.steps, len(self._waiting), self._each
-            self._waiting[number % depth, 0, each], self._waiting[number % depth, 1, each] = values, made
-            sent = (number[:, None] - self.delays) % depth
-            values, made = (
-                self._waiting[sent, part, each[:, None], numpy.arange(self._size)] for part in (0, 1)
-            )
-            made = (made > 0.0) & (number[:, None] >= self.delays)
+        self._clock += 1
+        if self._clock % BLOCK == 0:
+            self._fill(numpy.ones(self._lanes, dtype=bool))
+        made = self._all_made if self._is_steady else self._made()
+        values = self._measure(state)
+        if not self._is_on_time:
+            depth, each = len(self._waiting), numpy.arange(self._size)
+            self._waiting[self._clock % depth] = values, made
+            sent = (self._clock - self._delays) % depth
+            values, made = self._waiting[sent, 0, :, each].T, self._waiting[sent, 1, :, each].T > 0.0
         if lanes is not None:
             made = made & lanes[:, None]
         if made is not self._all_made:
             values = numpy.where(made, values, self._last)
         self._last = values
-        return Reading(values, made)
+        found = Reading(values, made)
+        self.complete = found if self._is_on_time else self._complete(found, lanes)
+        return found
 
-    def _made(self, uniforms: Array) -> Array:
-        """Return whether each number is measured at this step, ``(N, m)``; uniforms ``(sensors, N)``."""
+    def _complete(self, found: Reading, lanes: Array | None) -> Reading:
+        if not self._is_on_time:
+            values, made = self._waiting[(self._clock + 1) % len(self._waiting)]
+            found = Reading(values.copy(), made > 0.0)
+        return found if lanes is None else Reading(found.values, found.available & lanes[:, None])
+
+    def _made(self) -> Array:
+        """Return whether each number is measured at this step, ``(N, m)``."""
         made = numpy.empty((self._lanes, self._size), dtype=bool)
-        for channel, uniform in zip(self.channels, uniforms, strict=True):
+        for channel, uniform in zip(self._channels, self._uniforms[self._clock % BLOCK], strict=True):
             due = uniform < channel.availability
             if channel.interval is not None:
-                share = self.interval / channel.interval
-                count = numpy.floor(self.steps * share + EARLY)
-                due &= count > numpy.floor((self.steps - 1) * share + EARLY)
+                share, step = self._interval / channel.interval, self._clock - self._starts
+                count = numpy.floor(step * share + EARLY)
+                due &= count > numpy.floor((step - 1) * share + EARLY)
             made[:, channel.places] = due[:, None]
         return made
 
     def _fill(self, lanes: Array) -> None:
-        """Make the noise of the coming steps of some lanes."""
-        t = self.steps[lanes] + numpy.arange(BLOCK)[:, None]
-        self._filled[lanes] = self.steps[lanes]
-        self._block[:, :, lanes] = numbers(self._identities[:, lanes], t, 2 * self._size, len(self.channels))
+        """Make the noise of some lanes until the end of the block."""
+        row, m = self._clock % BLOCK, self._size
+        t = self._clock - self._starts[lanes] + numpy.arange(BLOCK - row)[:, None]
+        found = numbers(self._identities[:, lanes], t, m, 0 if self._is_steady else len(self._channels))
+        self._noise[row:, lanes] = _product(found[:, :m].swapaxes(1, 2), self._root)
+        if not self._is_steady:
+            self._uniforms[row:, :, lanes] = found[:, m:]
 
-    def _row(self) -> Array:
-        """Return the noise of this step of every lane, ``(2 m + sensors, N)``."""
-        if self._lanes == 1:
-            return self._block[self.steps[0] - self._filled[0]]
-        return self._block[self.steps - self._filled, :, self._each].T
-
-    def _measure(self, state: Array, row: Array) -> Array:
+    def _measure(self, state: Array) -> Array:
         """Return what all sensors measure now, ``(N, m)``."""
-        if self._is_linear:
-            normals = row[: self._size].T
-            measured = _product(state, self._rows) if self._chosen is None else state[:, self._chosen]
-            noise = _product(normals, self._root) if self._diagonal is None else normals * self._diagonal
-            return self.finish(measured + noise + self._offset)
-        x = state.T
-        values = numpy.empty((self._lanes, self._size))
-        for channel, h, root in zip(self.channels, self._functions, self._noises, strict=True):
-            normals = row[channel.places]
-            if isinstance(root, VectorFunction):
-                count = channel.size
-                root = numpy.linalg.cholesky(root.value(x, numpy).T.reshape(-1, count, count))
-                noise = sum((root[:, :, k] * normals[k][:, None] for k in range(count)), numpy.zeros(()))
-            else:
-                noise = _product(normals.T, root)
-            values[:, channel.places] = h.value(x, numpy).T + noise
-        return self.finish(values + self._offset)
+        noise = self._noise[self._clock % BLOCK]
+        if self._chosen is not None:
+            values = state.take(self._chosen, axis=1)
+        elif self._rows is not None:
+            values = _product(state, self._rows)
+        else:
+            values = numpy.concatenate([h.value(state.T, numpy) for h in self._functions]).T
+        for channel, R in self._varying.items():
+            root = numpy.linalg.cholesky(R.value(state.T, numpy).T.reshape(-1, channel.size, channel.size))
+            own = noise[:, channel.places]
+            noise = noise.copy()
+            noise[:, channel.places] = sum(root[:, :, k] * own[:, k, None] for k in range(channel.size))
+        values = values + noise
+        return self._finish(values + self._offset if self._is_biased else values)
 
-    def finish(self, values: Array) -> Array:
+    def _finish(self, values: Array) -> Array:
         """Round readings to whole quanta, and wrap angles."""
-        if self._is_exact:
-            return values
-        if self._rounded.any():
-            quantum = numpy.where(self._rounded, self.quantum, 1.0)
+        if self._rounds:
+            quantum = numpy.where(self._rounded, self._quantum, 1.0)
             values = numpy.where(self._rounded, numpy.round(values / quantum) * quantum, values)
-        if self._turning.any():
+        if self._turns:
             turned = values - numpy.rint(values / self._turn) * self._turn
-            values = turned if self._turning.all() else numpy.where(self._turning, turned, values)
+            values = turned if self._all_turn else numpy.where(self._turning, turned, values)
         return values
+
+
+def _noise_function(R: Any, count: int, size: int) -> VectorFunction:
+    """Return the numbers of R, row by row, as a function of the state."""
+    return VectorFunction(lambda x: [one for row in numpy.reshape(R(x), (count, count)) for one in row], size)
+
+
+def _noise_root(sensor: str, given: Any, count: int) -> Array:
+    """Return the root of a sensor's R, or raise ValueError where it is no covariance."""
+    R = _noise_matrix(given, count)
+    try:
+        if R.shape != (count, count) or not numpy.isfinite(R).all():
+            raise numpy.linalg.LinAlgError
+        return numpy.linalg.cholesky(R)
+    except numpy.linalg.LinAlgError:
+        raise ValueError(
+            f"R of the sensor {sensor!r} must be a positive definite covariance of its {count} numbers, got "
+            f"{numpy.asarray(given).tolist()}"
+        ) from None
 
 
 def _product(vectors: Array, matrix: Array) -> Array:
     """Return ``vectors @ matrix.T``, summed in one order for any number of lanes, as BLAS does not."""
-    return sum((vectors[:, k, None] * column for k, column in enumerate(matrix.T)), numpy.zeros(()))
+    return sum((vectors[..., k, None] * column for k, column in enumerate(matrix.T)), numpy.zeros(()))
 
 
 def sensors_of(
