@@ -13,7 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ..compiler.counter_code import bind_numbers
 from ..compiler.counter_numbers import numbers
+from ..compiler.functions import Call
+from ..compiler.native import AVAILABLE
 from ..compiler.vector_functions import VectorFunction
 from ..envs.linear.sensors import EARLY, Channel, Sensor
 from ..filters.angles import PERIODS
@@ -184,12 +187,21 @@ class Readings:
         """Steps of all lanes."""
         self._starts = numpy.zeros(lanes, dtype=numpy.int64)
         """Clock at the start of each lane's episode."""
+        self._normals = m * (1 + self._is_biased)
+        self._names, self._times = numpy.zeros((2, lanes, BLOCK), dtype=numpy.uint64), numpy.zeros((lanes, BLOCK), dtype=numpy.int64)
+        self._numbers = numpy.zeros((self._normals + len(sensors) * (not self._is_steady), lanes, BLOCK))
+        """Normal and uniform numbers of the steps of a block."""
+        self._draw: Call | None = None
+        """The native call that makes them."""
         self._noise = numpy.zeros((BLOCK, lanes, m))
-        self._uniforms = numpy.zeros((BLOCK, len(sensors), lanes))
         self._offset, self._last = numpy.zeros((lanes, m)), numpy.zeros((lanes, m))
         self._waiting = numpy.zeros((int(self._delays.max()) + 1, 2, lanes, m))
         """Readings that are under way and whether they were made, by the clock modulo the longest delay plus one."""
         self.complete: Reading = Reading(self._last, self._all_made)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without native code."""
+        return {**vars(self), "_draw": None}
 
     def begin(
         self, lanes: Array, state: Array, seeds: Sequence[int | None] | None, received: Any = False
@@ -214,9 +226,8 @@ class Readings:
         self._starts[lanes] = self._clock
         self._fill(lanes)
         if self._is_biased:
-            first = numpy.zeros(numpy.count_nonzero(lanes), dtype=numpy.int64)
-            normals = numbers(self._identities[:, lanes], first, 2 * self._size, 0)
-            self._offset[lanes] = self._bias * normals[self._size :].T
+            drawn = self._numbers[self._size : self._normals, :, self._clock % BLOCK].T
+            self._offset[lanes] = (self._bias * drawn)[lanes]
         values = self._measure(state)
         self._waiting[:, :, lanes] = 0.0
         self._waiting[self._clock % len(self._waiting)][:, lanes] = values[lanes], self._all_made[lanes]
@@ -260,7 +271,8 @@ class Readings:
     def _made(self) -> Array:
         """Return whether each number is measured at this step, ``(N, m)``."""
         made = numpy.empty((self._lanes, self._size), dtype=bool)
-        for channel, uniform in zip(self._channels, self._uniforms[self._clock % BLOCK], strict=True):
+        uniforms = self._numbers[self._normals :, :, self._clock % BLOCK]
+        for channel, uniform in zip(self._channels, uniforms, strict=True):
             due = uniform < channel.availability
             if channel.interval is not None:
                 share, step = self._interval / channel.interval, self._clock - self._starts
@@ -270,13 +282,19 @@ class Readings:
         return made
 
     def _fill(self, lanes: Array) -> None:
-        """Make the noise of some lanes until the end of the block."""
-        row, m = self._clock % BLOCK, self._size
-        t = self._clock - self._starts[lanes] + numpy.arange(BLOCK - row)[:, None]
-        found = numbers(self._identities[:, lanes], t, m, 0 if self._is_steady else len(self._channels))
-        self._noise[row:, lanes] = _product(found[:, :m].swapaxes(1, 2), self._root)
-        if not self._is_steady:
-            self._uniforms[row:, :, lanes] = found[:, m:]
+        """Make the numbers of a block of steps of some lanes."""
+        t = (self._clock - self._starts[lanes])[:, None] + numpy.arange(BLOCK) - self._clock % BLOCK
+        if AVAILABLE:
+            if self._draw is None:
+                flat = [one.reshape(*one.shape[:-2], -1) for one in (self._names, self._times, self._numbers)]
+                self._draw = bind_numbers(*flat, self._normals)
+            self._names[:, lanes], self._times[lanes] = self._identities[:, lanes, None], t - 1
+            for lane in numpy.flatnonzero(lanes).tolist():
+                self._draw(lane * BLOCK, lane * BLOCK + BLOCK)
+        else:
+            counts = self._normals, len(self._numbers) - self._normals
+            self._numbers[:, lanes] = numbers(self._identities[:, lanes], t.T, *counts).transpose(1, 2, 0)
+        self._noise[:, lanes] = _product(self._numbers[: self._size, lanes].T, self._root)
 
     def _measure(self, state: Array) -> Array:
         """Return what all sensors measure now, ``(N, m)``."""
