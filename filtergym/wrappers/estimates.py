@@ -175,7 +175,7 @@ class Estimates:
         self._filtered = numpy.zeros((n, lanes))
         """Means of the filters."""
         self._no_inputs, self._no_interval = numpy.zeros((lanes, p)), numpy.zeros(lanes)
-        self._intervals = numpy.full(lanes, model.interval)
+        self._intervals, self._needs_innovation = numpy.full(lanes, model.interval), "innovation" in show
 
     def __getstate__(self) -> dict[str, Any]:
         """Return arguments, arrays and the state of the filters; their code is made anew."""
@@ -237,24 +237,26 @@ class Estimates:
         self, lanes: Array | None, interval: Array, inputs: Array, reading: Reading, action: Array | None
     ) -> None:
         """Give a measurement to the filters, and keep what they report of some lanes."""
-        sent = [part[0] if self._lanes == 1 else part.T for part in (*reading, interval, inputs)]
-        self._update.receive(StateSpaceMeasurement(*sent[: 3 + bool(self.model.inputs)]))
+        values, available = reading
+        if self._lanes == 1:
+            sent = StateSpaceMeasurement(values[0], available[0], interval[0], inputs[0])
+        else:
+            sent = StateSpaceMeasurement(values.T, available.T, interval, inputs.T)
+        self._update.receive(sent if self.model.inputs else sent[:3])
         if self._is_asked:
             self._update.act(self._no_action if action is None else action)
         n, N = len(self.model.names), self._lanes
         found = self._update.report()["estimate"].reshape(-1, N)
-        if "innovation" in self._show:
+        if self._needs_innovation:
             self._find_innovation(lanes, reading, interval, inputs.T)
         self._filtered, shown = found[:n], found[n : 2 * n]
         if self._behind:
             shown = self._present()
-        new = shown.T, found[2 * n : 3 * n].T, found[3 * n]
-        if lanes is None:
-            self.mean, self.deviation, self.nis = new
-        else:
-            old = zip(new, (self.mean, self.deviation, self.nis), strict=True)
-            self.mean, self.deviation, self.nis = (numpy.where(lanes, one.T, other.T).T for one, other in old)
-        if found[-1].any():
+        new, old = (shown.T, found[2 * n : 3 * n].T, found[3 * n]), (self.mean, self.deviation, self.nis)
+        if lanes is not None:
+            new = tuple(numpy.where(lanes, one.T, other.T).T for one, other in zip(new, old, strict=True))
+        self.mean, self.deviation, self.nis = new
+        if numpy.count_nonzero(found[-1]):
             lost = found[-1] > 0.0
             self._restart(lost)
             deviation = numpy.sqrt(numpy.diag(self.model.matrix("covariance")))

@@ -1,7 +1,7 @@
 """What the wrappers of one environment and of many share: an environment is one lane, a vector environment has N."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy
@@ -10,17 +10,6 @@ from gymnasium.vector import AutoresetMode
 from .estimates import PARTS, Estimates
 from .models import CLASSIC_CONTROL, EnvironmentModel, find_model
 from .readings import EnvironmentSensor, Reading, Readings, sensors_of
-
-
-class Event(NamedTuple):
-    """Readings that a filter takes in."""
-
-    begins: bool
-    """Whether lanes begin an episode, instead of a step."""
-    lanes: numpy.ndarray | None
-    """Which, booleans ``(N,)``; None: all."""
-    reading: Reading
-    """Those of one time, see :attr:`.Readings.complete`."""
 
 
 class SensorLanes:
@@ -33,8 +22,9 @@ class SensorLanes:
     sensors: dict[str, EnvironmentSensor]
     reading: Reading
     """The last readings of all lanes, not rounded to the type of the observation."""
-    events: list[Event]
-    """Readings of the last step or reset."""
+    events: list[tuple[bool, Any, Reading]]
+    """Readings of one time that a filter takes in at the last step or reset (:attr:`.Readings.complete`), after whether
+    lanes begin an episode or step and which lanes, booleans ``(N,)``; None: all."""
 
     def _place_sensors(
         self, env: Any, space: gymnasium.Space[Any], lanes: int, sensors: Any, model: Any
@@ -71,13 +61,13 @@ class SensorLanes:
     ) -> numpy.ndarray:
         """Begin episodes of some lanes, and return the readings of all."""
         self.reading = self._readings.begin(lanes, self._state(observations), seeds, received)
-        self.events = [*self.events, Event(True, lanes, self._readings.complete)]
+        self.events = [*self.events, (True, lanes, self._readings.complete)]
         return self.reading.values.astype(self._dtype)
 
     def _advance(self, lanes: numpy.ndarray | None, observations: Any) -> numpy.ndarray:
         """Return the readings after a step of some lanes; None: of all."""
         self.reading = self._readings.advance(lanes, self._state(observations))
-        self.events = [Event(False, lanes, self._readings.complete)]
+        self.events = [(False, lanes, self._readings.complete)]
         return self.reading.values.astype(self._dtype)
 
     def _state(self, observations: Any) -> numpy.ndarray:
@@ -132,7 +122,7 @@ class FilterLanes:
         for begins, lanes, reading in self._sensors.events:
             if begins:
                 last = None if actions is None else self._shown()
-                estimates.begin(lanes, reading)  # type: ignore[arg-type]
+                estimates.begin(lanes, reading)
             else:
                 estimates.advance(lanes, inputs_of(self.model, actions), reading, own)
         return last

@@ -175,8 +175,9 @@ class Readings:
         )
         periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in each])
         self.limit: Array = numpy.nextafter(0.5 * periods, numpy.inf)
-        self._turning, self._turn = numpy.isfinite(periods), numpy.where(periods < numpy.inf, periods, 1.0)
-        self._turns, self._all_turn = bool(self._turning.any()), bool(self._turning.all())
+        self._turning, self._turns = numpy.isfinite(periods), bool(numpy.isfinite(periods).any())
+        self._turn = numpy.tile(numpy.where(self._turning, periods, 1.0), (lanes, 1))
+        self._all_turn = bool(self._turning.all())
         self._rounded, self._rounds = self._quantum > 0.0, bool(self._quantum.any())
         self._is_biased, self._is_on_time = bool(self._bias.any()), not self._delays.any()
         self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
@@ -311,16 +312,18 @@ class Readings:
             noise = noise.copy()
             noise[:, channel.places] = sum(root[:, :, k] * own[:, k, None] for k in range(channel.size))
         values = values + noise
-        return self._finish(values + self._offset if self._is_biased else values)
-
-    def _finish(self, values: Array) -> Array:
-        """Round readings to whole quanta, and wrap angles."""
+        if self._is_biased:
+            values += self._offset
         if self._rounds:
             quantum = numpy.where(self._rounded, self._quantum, 1.0)
             values = numpy.where(self._rounded, numpy.round(values / quantum) * quantum, values)
         if self._turns:
-            turned = values - numpy.rint(values / self._turn) * self._turn
-            values = turned if self._all_turn else numpy.where(self._turning, turned, values)
+            turns = values / self._turn
+            numpy.rint(turns, turns)
+            turns *= self._turn
+            if not self._all_turn:
+                turns = numpy.where(self._turning, turns, 0.0)
+            values -= turns
         return values
 
 
