@@ -27,7 +27,7 @@ ONE = numpy.ones(1, dtype=bool)
 """The lane of a single environment."""
 
 
-class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Readings of sensors in place of the full observation.
 
     The observation is the readings of all sensors, one after the other, ``(m,)``; where a reading is not received it
@@ -46,13 +46,6 @@ class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any], gymna
         ValueError: for an observation that is no vector, and sensors that do not fit.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], sensors: Any, model: Any = None) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(
-            self, sensors=sensors, model=model, _disable_deepcopy=True
-        )
-        gymnasium.Wrapper.__init__(self, env)
-        self.observation_space: Any = self._place_sensors(env, env.observation_space, 1, sensors, model)
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
@@ -65,12 +58,12 @@ class NoisyObservation(SensorLanes, gymnasium.Wrapper[Any, Any, Any, Any], gymna
     def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
         """Step the environment, and read the sensors."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        values = self._advance(None, observation[None])[0]
+        values = self._advance(None, numpy.asarray(observation)[None])[0]
         info = {**info, "available": self.reading.available[0].copy()}
         return values, reward, terminated, truncated, info
 
 
-class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any]):
     """The estimate of a filter in place of readings.
 
     Args:
@@ -88,24 +81,6 @@ class EstimatedObservation(FilterLanes, gymnasium.Wrapper[Any, Any, Any, Any], g
     Raises:
         ValueError: where no sensors are below, or the model does not fit.
     """
-
-    def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        model: Any = None,
-        competitor: Any = "extended",
-        show: Any = None,
-        control: str | None = None,
-    ) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(
-            self, model=model, competitor=competitor, show=show, control=control, _disable_deepcopy=True
-        )
-        gymnasium.Wrapper.__init__(self, env)
-        self.observation_space: Any
-        self.action_space: Any
-        self.observation_space, self.action_space = self._place_filters(
-            env, 1, env.action_space, model, competitor, show, control
-        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -272,9 +272,7 @@ class Estimates:
             mean[i] -= period * numpy.rint(mean[i] / period)
         return mean
 
-    def _find_innovation(
-        self, lanes: Array | None, reading: Reading, interval: Array, inputs: Array
-    ) -> None:
+    def _find_innovation(self, lanes: Array | None, reading: Reading, interval: Array, inputs: Array) -> None:
         """Compare readings with those predicted at the last estimate."""
         predicted = self._motion_of(self._filtered, interval, inputs)
         innovation = reading.values - numpy.asarray(self._h.value(predicted, numpy)).T

@@ -1,63 +1,47 @@
 """What the wrappers of one environment and of many share: an environment is one lane, a vector environment has N."""
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
 from .estimates import PARTS, Estimates
 from .models import CLASSIC_CONTROL, EnvironmentModel, find_model
 from .readings import EnvironmentSensor, Reading, Readings, sensors_of
 
 
-class SensorLanes:
+class SensorLanes(gymnasium.utils.RecordConstructorArgs):
     """Sensors of the lanes of an environment."""
 
-    fields: int
-    """Of the full observation."""
-    model: EnvironmentModel | None
-    """Whose state the sensors read."""
-    sensors: dict[str, EnvironmentSensor]
     reading: Reading
     """The last readings of all lanes, not rounded to the type of the observation."""
     events: list[tuple[bool, Any, Reading]]
     """Readings of one time that a filter takes in at the last step or reset (:attr:`.Readings.complete`), after whether
     lanes begin an episode or step and which lanes, booleans ``(N,)``; None: all."""
 
-    def _place_sensors(
-        self, env: Any, space: gymnasium.Space[Any], lanes: int, sensors: Any, model: Any
-    ) -> gymnasium.spaces.Box:
-        """Make the sensors, and return the space of a lane's readings.
-
-        Raises:
-            ValueError: for sensors that do not fit, or observations that are no vector or of which the model makes no
-                state.
-        """
-        self.fields = check_observations(space, env.spec)
-        self.model = found = find_model(model, env.spec)
-        n = self.fields if found is None else len(found.names)
-        if found is not None:
-            try:
-                fits = found.state(numpy.zeros((1, self.fields))).shape == (1, n)
-            except IndexError:
-                fits = False
-            if not fits:
-                raise ValueError(
-                    f"the observation has {self.fields} fields, of which the model does not make its state of {n}, "
-                    f"{', '.join(found.names)}: let NoisyObservation stand below wrappers that change the "
-                    "observation, or give a model whose state= reads it"
-                )
-        self.sensors, interval = sensors_of(found, sensors, self.fields)
+    def __init__(self, env: Any, sensors: Any, model: Any = None) -> None:
+        super().__init__(sensors=sensors, model=model, _disable_deepcopy=True)
+        space, _, lanes = _wrap(self, env)
+        self.fields: int = check_observations(space, env.spec)
+        self.model: EnvironmentModel | None = find_model(model, env.spec)
+        n = self.fields if self.model is None else check_state(self.model, self.fields)
+        self.sensors: dict[str, EnvironmentSensor]
+        self.sensors, interval = sensors_of(self.model, sensors, self.fields)
         self._readings: Readings = Readings(self.sensors, n, interval, lanes)
-        dtype: Any = space.dtype if numpy.issubdtype(space.dtype, numpy.floating) else numpy.float32
-        self._dtype: Any = numpy.dtype(dtype)
+        is_real = numpy.issubdtype(space.dtype, numpy.floating)
+        self._dtype: Any = numpy.dtype(space.dtype if is_real else numpy.float32)
         limit = self._readings.limit.astype(self._dtype)
-        return gymnasium.spaces.Box(-limit, limit, dtype=self._dtype.type)
+        _set_space(self, "observation", gymnasium.spaces.Box(-limit, limit, dtype=self._dtype.type))
 
     def _begin(
-        self, lanes: numpy.ndarray, observations: Any, seeds: Sequence[int | None] | None, received: Any = False
+        self,
+        lanes: numpy.ndarray,
+        observations: Any,
+        seeds: Sequence[int | None] | None,
+        received: Any = False,
     ) -> numpy.ndarray:
         """Begin episodes of some lanes, and return the readings of all."""
         self.reading = self._readings.begin(lanes, self._state(observations), seeds, received)
@@ -75,27 +59,31 @@ class SensorLanes:
         return state if self.model is None else self.model.state(state)
 
 
-class FilterLanes:
+class FilterLanes(gymnasium.utils.RecordConstructorArgs):
     """Filters of the lanes of an environment."""
 
-    model: EnvironmentModel
-
-    def _place_filters(
-        self, env: Any, lanes: int, actions: gymnasium.Space[Any], model: Any, competitor: Any, show: Any, control: Any
-    ) -> tuple[gymnasium.spaces.Box, gymnasium.Space[Any]]:
-        """Make the filters, and return the spaces of a lane's observation and action.
-
-        Raises:
-            ValueError: where no sensors are below, or the model does not fit.
-        """
+    def __init__(
+        self,
+        env: Any,
+        model: Any = None,
+        competitor: Any = "extended",
+        show: Any = None,
+        control: str | None = None,
+    ) -> None:
+        given = {"model": model, "competitor": competitor, "show": show, "control": control}
+        super().__init__(**given, _disable_deepcopy=True)
+        _, actions, lanes = _wrap(self, env)
         self._sensors: SensorLanes = find_sensors(env)
         found = self._sensors.model if model is None else find_model(model, env.spec)
-        self.model = check_model(found, self._sensors, actions)
+        self.model: EnvironmentModel = check_model(found, self._sensors, actions)
         shown = check_shown(show, self.model)
-        self._estimates = Estimates(self.model, self._sensors.sensors, competitor, control, shown, lanes)
+        self._estimates: Estimates = Estimates(
+            self.model, self._sensors.sensors, competitor, control, shown, lanes
+        )
         joined = joint_space(actions, self._estimates.action_space)
         self._joins, self._own_actions = isinstance(joined, gymnasium.spaces.Box), actions
-        return self._estimates.space(self._sensors._dtype.type), joined
+        _set_space(self, "observation", self._estimates.space(self._sensors._dtype.type))
+        _set_space(self, "action", joined)
 
     @property
     def estimates(self) -> Estimates:
@@ -132,6 +120,23 @@ class FilterLanes:
         return self._estimates.show(self._sensors._dtype)
 
 
+def _wrap(wrapper: Any, env: Any) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any], int]:
+    """Make an object a wrapper of an environment; return a lane's observations and actions, and the number of lanes."""
+    if isinstance(wrapper, VectorWrapper):
+        VectorWrapper.__init__(wrapper, env)
+        return env.single_observation_space, env.single_action_space, env.num_envs
+    gymnasium.Wrapper.__init__(wrapper, env)
+    return env.observation_space, env.action_space, 1
+
+
+def _set_space(wrapper: Any, kind: str, space: gymnasium.Space[Any]) -> None:
+    """Set the space of a lane's observations or actions, and in a vector environment that of all lanes."""
+    if isinstance(wrapper, VectorWrapper):
+        setattr(wrapper, f"single_{kind}_space", space)
+        space = gymnasium.vector.utils.batch_space(space, wrapper.num_envs)
+    setattr(wrapper, f"{kind}_space", space)
+
+
 def autoreset_of(env: Any) -> AutoresetMode:
     """Return the autoreset mode of a vector environment, by default that of the next step."""
     mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
@@ -157,9 +162,22 @@ def check_observations(space: gymnasium.Space[Any], spec: Any) -> int:
     )
 
 
+def check_state(model: EnvironmentModel, fields: int) -> int:
+    """Return the number of components of a model, or raise ValueError where it makes no state of the observation."""
+    n = len(model.names)
+    with contextlib.suppress(IndexError):
+        if model.state(numpy.zeros((1, fields))).shape == (1, n):
+            return n
+    raise ValueError(
+        f"the observation has {fields} fields, of which the model does not make its state of {n}, "
+        f"{', '.join(model.names)}: let NoisyObservation stand below wrappers that change the observation, or give a "
+        "model whose state= reads it"
+    )
+
+
 def find_sensors(env: Any) -> SensorLanes:
     """Return the wrapper with sensors below a filter, or raise ValueError where there is none."""
-    inner, module = env, " of filtergym.wrappers.vector" if isinstance(env, gymnasium.vector.VectorEnv) else ""
+    inner, module = env, " of filtergym.wrappers.vector" if isinstance(env, VectorEnv) else ""
     while not isinstance(inner, SensorLanes):
         inner = getattr(inner, "env", None)
         if inner is None:

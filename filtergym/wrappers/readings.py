@@ -166,7 +166,9 @@ class Readings:
             else:
                 self._root[channel.places, channel.places] = _noise_root(name, one.R, channel.size)
         self._rows, self._chosen = None, None
-        if not self._varying and all(f.matrix is not None and not numpy.any(f.offset) for f in self._functions):
+        if not self._varying and all(
+            f.matrix is not None and not numpy.any(f.offset) for f in self._functions
+        ):
             self._rows = numpy.concatenate([numpy.asarray(one.matrix) for one in self._functions])
             self._chosen = _chosen_columns(self._rows)
         each = [one for one, count in zip(sensors.values(), counts, strict=True) for _ in range(count)]
@@ -189,7 +191,10 @@ class Readings:
         self._starts = numpy.zeros(lanes, dtype=numpy.int64)
         """Clock at the start of each lane's episode."""
         self._normals = m * (1 + self._is_biased)
-        self._names, self._times = numpy.zeros((2, lanes, BLOCK), dtype=numpy.uint64), numpy.zeros((lanes, BLOCK), dtype=numpy.int64)
+        self._names, self._times = (
+            numpy.zeros((2, lanes, BLOCK), dtype=numpy.uint64),
+            numpy.zeros((lanes, BLOCK), dtype=numpy.int64),
+        )
         self._numbers = numpy.zeros((self._normals + len(sensors) * (not self._is_steady), lanes, BLOCK))
         """Normal and uniform numbers of the steps of a block."""
         self._draw: Call | None = None

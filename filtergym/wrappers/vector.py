@@ -19,13 +19,7 @@ class NoisyObservation(SensorLanes, VectorWrapper[Any, Any, Any, Any, Any]):
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any], sensors: Any, model: Any = None) -> None:
-        VectorWrapper.__init__(self, env)
-        self.single_observation_space: gymnasium.spaces.Box = self._place_sensors(
-            env, env.single_observation_space, env.num_envs, sensors, model
-        )
-        self.observation_space = gymnasium.vector.utils.batch_space(
-            self.single_observation_space, env.num_envs
-        )
+        super().__init__(env, sensors, model)
         self._mode: AutoresetMode = autoreset_of(env)
         self._every = numpy.ones(env.num_envs, dtype=bool)
         self._ended = ~self._every
@@ -70,26 +64,6 @@ class EstimatedObservation(FilterLanes, VectorWrapper[Any, Any, Any, Any, Any]):
     ``infos["final_obs"]`` holds the last estimate of an episode.
     """
 
-    def __init__(
-        self,
-        env: VectorEnv[Any, Any, Any],
-        model: Any = None,
-        competitor: Any = "extended",
-        show: Any = None,
-        control: str | None = None,
-    ) -> None:
-        VectorWrapper.__init__(self, env)
-        spaces = self._place_filters(
-            env, env.num_envs, env.single_action_space, model, competitor, show, control
-        )
-        self.single_observation_space: gymnasium.spaces.Box
-        self.single_action_space: gymnasium.Space[Any]
-        self.single_observation_space, self.single_action_space = spaces
-        self.observation_space, self.action_space = (
-            gymnasium.vector.utils.batch_space(one, env.num_envs) for one in spaces
-        )
-        self._restarts: bool = autoreset_of(env) is AutoresetMode.SAME_STEP
-
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
@@ -103,6 +77,6 @@ class EstimatedObservation(FilterLanes, VectorWrapper[Any, Any, Any, Any, Any]):
         actions, own = self._split(actions)
         _, rewards, terminations, truncations, infos = self.env.step(actions)
         last = self._take(numpy.asarray(actions), own)
-        if self._restarts and last is not None:
+        if last is not None and autoreset_of(self.env) is AutoresetMode.SAME_STEP:
             infos = {**infos, "final_obs": rows_of(infos["_final_obs"], last)}
         return self._shown(), rewards, terminations, truncations, infos
