@@ -21,7 +21,6 @@ from ..envs.linear.sensors import Sensor
 from ..evaluation.competitors.filters import close_loop
 from ..evaluation.competitors.kinds import kind_of
 from ..evaluation.competitors.stepping import CompiledUpdate, ModelUpdate
-from ..filters.angles import PERIODS
 from ..filters.array_namespace import select_nested
 from ..own_models import state_space
 from .models import EnvironmentModel
@@ -44,34 +43,25 @@ def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSen
         ValueError: for a model that :func:`filtergym.state_space` refuses.
     """
     fields = [one.name for one in dataclasses.fields(Sensor) if one.name != "interval"]
-    key = (id(model), *((name, *(_key(getattr(one, f)) for f in fields)) for name, one in sensors.items()))
+    kept = {name: {field: getattr(one, field) for field in fields} for name, one in sensors.items()}
+    key = id(model), *((name, *map(_key, values.values())) for name, values in kept.items())
     if key not in _PROBLEMS:
         Q = model.matrix("noise")
         task = state_space(
-            f"wrapped/Model{len(_PROBLEMS) + 1}-v0",
-            f=model.f,
-            Q=lambda dt: [[number * dt for number in row] for row in Q.tolist()],
-            sensors={
-                name: Sensor(**{field: getattr(one, field) for field in fields})
-                for name, one in sensors.items()
-            },
-            mean=model.mean,
-            covariance=model.matrix("covariance"),
-            names=tuple(model.names),
-            angles=dict(model.angles),
-            inputs={one: Input() for one in model.inputs},
-            sampling_interval=model.interval,
-            registered=False,
-        )
+            f"wrapped/Model{len(_PROBLEMS) + 1}-v0", f=model.f, sensors={name: Sensor(**kept[name]) for name in kept},
+            Q=lambda dt: [[number * dt for number in row] for row in Q.tolist()], sampling_interval=model.interval,
+            mean=model.mean, covariance=model.matrix("covariance"), names=tuple(model.names),
+            angles=dict(model.angles), inputs={one: Input() for one in model.inputs}, registered=False,
+        )  # fmt: skip
         _PROBLEMS[key] = Problem(task, state_space_baselines(task)), (model, sensors)
     return _PROBLEMS[key][0]
 
 
 def _key(value: Any) -> Any:
-    """Return numbers and words as they are, and a function by its identity."""
-    if callable(value):
-        return id(value)
-    return value.tolist().__repr__() if isinstance(value, numpy.ndarray) else repr(value)
+    """Return numbers and words as text, and a function by its identity."""
+    return (
+        id(value) if callable(value) else repr(value.tolist() if isinstance(value, numpy.ndarray) else value)
+    )
 
 
 def report_estimate(model: Any, episode: Any) -> dict[str, Any]:
@@ -90,6 +80,20 @@ def report_estimate(model: Any, episode: Any) -> dict[str, Any]:
         turned.append(mean[i] - (0.0 if period is None else period * xp.round(mean[i] / period)))
     nis, lost = xp.where(received, nis, 0.0), xp.where(held, 0.0, 1.0)
     return {"estimate": xp.stack([*(one for one in mean), *turned, *deviations, nis, lost])}
+
+
+def _make_filter(problem: Problem, competitor: Any, control: str | None, lanes: int) -> Any:
+    """Return the model of a problem with the bank of a control, or with a competitor, in the loop."""
+    scenario = find_scenario(problem.task, None, {})
+    scenario = dataclasses.replace(scenario, flights=(), recording=Feed(False, False, (), None, None))
+    own = make_model(problem.task, control or problem.task.controls[0], scenario, backend="auto")
+    if control is not None:
+        return own
+    maker = problem.find(competitor) if isinstance(competitor, str) else competitor
+    if maker is None or kind_of(maker) != "estimator":
+        known = ", ".join(problem.baselines.estimators)
+        raise ValueError(f"competitor must be an estimator, one of {known}, got {competitor!r}")
+    return close_loop(own, maker, "estimator", str(competitor), lanes)
 
 
 class Estimates:
@@ -126,28 +130,15 @@ class Estimates:
         self._arguments = model, sensors, competitor, control, show, lanes
         self.model: EnvironmentModel = model
         self._lanes, self._show = lanes, show
-        problem = define_problem(model, sensors)
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
-        scenario = dataclasses.replace(
-            find_scenario(problem.task, None, {}), flights=(), recording=Feed(False, False, (), None, None)
-        )
-        own: Any = make_model(problem.task, control or problem.task.controls[0], scenario, backend="auto")
-        if control is None:
-            maker = problem.find(competitor) if isinstance(competitor, str) else competitor
-            known = [*problem.baselines.estimators]
-            if maker is None or kind_of(maker) != "estimator":
-                raise ValueError(
-                    f"competitor must be an estimator, one of {', '.join(known)}, got {competitor!r}"
-                )
-            own = close_loop(own, maker, "estimator", str(competitor), lanes)
+        self._own = own = _make_filter(define_problem(model, sensors), competitor, control, lanes)
         self.action_space: Any = None if control is None else own.action_space
-        self._own, world = own, own.task.world
-        self._is_compiled = can_step(own, report_estimate)
-        self._is_asked = not self._is_compiled or control is not None
+        is_compiled, world = can_step(own, report_estimate), own.task.world
+        self._acts: bool = not is_compiled or control is not None
         self._update: Any = (
-            CompiledUpdate(own, report_estimate, lanes, None, self._is_asked, None)
-            if self._is_compiled
+            CompiledUpdate(own, report_estimate, lanes, None, self._acts, None)
+            if is_compiled
             else ModelUpdate(own, report_estimate, lanes, world.measurement, None)
         )
         self._width = round_up_lanes(lanes)
@@ -155,19 +146,15 @@ class Estimates:
         self._no_action = numpy.zeros((self._width, *(own.action_space.shape or ())))
         self._begun: Any = None
         """Filters of all lanes at the start of an episode, made once."""
-        self._motion = own.task.definition.filters[0].f
-        self._h = own.task.definition.filters[0].h
-        numbers = [one for one, channel in zip(sensors.values(), own.task.definition.channels, strict=True)
-                   for _ in channel.numbers]  # fmt: skip
-        self._behind = max(one.delay for one in numbers)
-        periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in numbers])
-        self._turning, self._periods = numpy.isfinite(periods), numpy.where(periods < numpy.inf, periods, 1.0)
-        n, m, p = len(model.names), len(numbers), len(model.inputs)
+        self._motion, self._h = (getattr(own.task.definition.filters[0], name) for name in ("f", "h"))
+        channels = own.task.definition.channels
+        self._behind = max(one.delay for one in sensors.values())
+        self._periods = numpy.array([one.period or numpy.inf for one in channels for _ in one.numbers])
+        n, m, p = len(model.names), len(self._periods), len(model.inputs)
         self._inputs = numpy.zeros((self._behind + 2, lanes, p))
         """Inputs of the last steps, by the clock modulo their number."""
-        self._clock = 0
-        self._starts = numpy.zeros(lanes, dtype=numpy.int64)
-        """Clock at the start of each lane's episode."""
+        self._clock, self._starts = 0, numpy.zeros(lanes, dtype=numpy.int64)
+        """Steps of all lanes, and those at the start of each one's episode."""
         self.mean: Array = numpy.zeros((lanes, n))
         self.deviation: Array = numpy.zeros((lanes, n))
         self.nis: Array = numpy.zeros(lanes)
@@ -243,7 +230,7 @@ class Estimates:
         else:
             sent = StateSpaceMeasurement(values.T, available.T, interval, inputs.T)
         self._update.receive(sent if self.model.inputs else sent[:3])
-        if self._is_asked:
+        if self._acts:
             self._update.act(self._no_action if action is None else action)
         n, N = len(self.model.names), self._lanes
         found = self._update.report()["estimate"].reshape(-1, N)
@@ -276,8 +263,8 @@ class Estimates:
         """Compare readings with those predicted at the last estimate."""
         predicted = self._motion_of(self._filtered, interval, inputs)
         innovation = reading.values - numpy.asarray(self._h.value(predicted, numpy)).T
-        turns = numpy.rint(innovation / self._periods) * self._periods
-        innovation -= numpy.where(self._turning, turns, 0.0)
+        for i in numpy.flatnonzero(self._periods < numpy.inf):
+            innovation[:, i] -= numpy.rint(innovation[:, i] / self._periods[i]) * self._periods[i]
         innovation = numpy.where(reading.available, innovation, 0.0)
         kept = innovation if lanes is None else numpy.where(lanes[:, None], innovation, self.innovation)
         self.innovation = kept
@@ -288,12 +275,7 @@ class Estimates:
 
     def space(self, dtype: Any) -> gymnasium.spaces.Box:
         """Return the space of what is shown of one lane."""
-        size, n, show = 0, len(self.model.names), self._show
-        if "observation" in show:
-            size += self.model.observation(numpy.zeros((1, n))).shape[1]  # type: ignore[misc]
-        size += n * (("mean" in show) + ("deviation" in show)) + ("nis" in show)
-        size += self.innovation.shape[1] * ("innovation" in show)
-        return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), dtype)
+        return gymnasium.spaces.Box(-numpy.inf, numpy.inf, self.show(dtype).shape[1:], dtype)
 
     def show(self, dtype: Any) -> Array:
         """Return what is shown, ``(N, fields)``."""
@@ -302,6 +284,5 @@ class Estimates:
             if name == "observation":
                 parts.append(self.model.observation(self.mean))  # type: ignore[misc]
             else:
-                value = getattr(self, name)
-                parts.append(value[:, None] if value.ndim == 1 else value)
+                parts.append(self.nis[:, None] if name == "nis" else getattr(self, name))
         return (parts[0] if len(parts) == 1 else numpy.concatenate(parts, axis=1)).astype(dtype, order="C")

@@ -6,6 +6,7 @@ the Runge-Kutta method of order 4 of the book's equations (Sutton and Barto, Rei
 exact but for the 32 bits of the observations, so their process noise only allows for the filter's linearisation.
 """
 
+import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -111,53 +112,30 @@ def _acrobot(x: Any, dt: Any, u: Any) -> list[Any]:
 
 CLASSIC_CONTROL = {
     "CartPole": EnvironmentModel(
-        names=("position", "velocity", "angle", "rate"),
-        f=_cart_pole,
-        interval=0.02,
-        noise=(1e-6, 1e-3, 1e-6, 1e-3),
-        mean=(0.0,) * 4,
-        covariance=(0.1**2 / 12.0,) * 4,
-        inputs=("force",),
+        names=("position", "velocity", "angle", "rate"), f=_cart_pole, interval=0.02, noise=(1e-6, 1e-3, 1e-6, 1e-3),
+        mean=(0.0,) * 4, covariance=(0.1**2 / 12.0,) * 4, inputs=("force",),
         action=lambda action: numpy.where(action == 1, 10.0, -10.0)[:, None],
     ),
     "Pendulum": EnvironmentModel(
-        names=("angle", "rate"),
-        f=_pendulum,
-        interval=0.05,
-        noise=(1e-6, 1e-3),
-        mean=(0.0, 0.0),
-        covariance=(numpy.pi**2 / 3.0, 1.0 / 3.0),
-        inputs=("torque",),
-        angles={"angle": "rad"},
+        names=("angle", "rate"), f=_pendulum, interval=0.05, noise=(1e-6, 1e-3),
+        mean=(0.0, 0.0), covariance=(numpy.pi**2 / 3.0, 1.0 / 3.0), inputs=("torque",), angles={"angle": "rad"},
         state=lambda o: numpy.array([numpy.arctan2(o[:, 1], o[:, 0]), o[:, 2]]).T,
         observation=lambda x: numpy.array([numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), x[:, 1]]).T,
         action=lambda action: numpy.minimum(numpy.maximum(action, -2.0), 2.0),
     ),
     "MountainCarContinuous": EnvironmentModel(
-        names=("position", "velocity"),
-        f=_mountain_car,
-        interval=1.0,
-        noise=(1e-10, 1e-9),
-        mean=(-0.5, 0.0),
-        covariance=(0.2**2 / 12.0, 1e-10),
-        inputs=("force",),
+        names=("position", "velocity"), f=_mountain_car, interval=1.0, noise=(1e-10, 1e-9),
+        mean=(-0.5, 0.0), covariance=(0.2**2 / 12.0, 1e-10), inputs=("force",),
         action=lambda action: numpy.minimum(numpy.maximum(action, -1.0), 1.0),
     ),
     "Acrobot": EnvironmentModel(
-        names=("angle_1", "angle_2", "rate_1", "rate_2"),
-        f=_acrobot,
-        interval=0.2,
-        noise=(1e-5, 1e-5, 1e-3, 1e-3),
-        mean=(0.0,) * 4,
-        covariance=(0.2**2 / 12.0,) * 4,
-        inputs=("torque",),
+        names=("angle_1", "angle_2", "rate_1", "rate_2"), f=_acrobot, interval=0.2, noise=(1e-5, 1e-5, 1e-3, 1e-3),
+        mean=(0.0,) * 4, covariance=(0.2**2 / 12.0,) * 4, inputs=("torque",),
         angles={"angle_1": "rad", "angle_2": "rad"},
         state=lambda o: numpy.array(
-            [numpy.arctan2(o[:, 1], o[:, 0]), numpy.arctan2(o[:, 3], o[:, 2]), o[:, 4], o[:, 5]]
-        ).T,
+            [numpy.arctan2(o[:, 1], o[:, 0]), numpy.arctan2(o[:, 3], o[:, 2]), o[:, 4], o[:, 5]]).T,
         observation=lambda x: numpy.array(
-            [numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), numpy.cos(x[:, 1]), numpy.sin(x[:, 1]), x[:, 2], x[:, 3]]
-        ).T,
+            [numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), numpy.cos(x[:, 1]), numpy.sin(x[:, 1]), x[:, 2], x[:, 3]]).T,
         action=lambda action: numpy.asarray(action, dtype=float)[:, None] - 1.0,
     ),
 }  # fmt: skip
@@ -183,8 +161,6 @@ def find_model(model: Any, spec: Any) -> EnvironmentModel | None:
     if isinstance(name, str):
         module, colon, attribute = name.partition(":")
         if colon and model is not None:
-            import importlib
-
             found = getattr(importlib.import_module(module), attribute, None)
             if isinstance(found, EnvironmentModel):
                 return found

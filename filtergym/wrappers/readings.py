@@ -165,38 +165,33 @@ class Readings:
                 self._varying[channel] = _noise_function(one.R, channel.size, size)
             else:
                 self._root[channel.places, channel.places] = _noise_root(name, one.R, channel.size)
-        self._rows, self._chosen = None, None
-        if not self._varying and all(
-            f.matrix is not None and not numpy.any(f.offset) for f in self._functions
-        ):
-            self._rows = numpy.concatenate([numpy.asarray(one.matrix) for one in self._functions])
-            self._chosen = _chosen_columns(self._rows)
+        matrices = [
+            one.matrix for one in self._functions if one.matrix is not None and not numpy.any(one.offset)
+        ]
+        is_linear = len(matrices) == len(counts) and not self._varying
+        self._rows = numpy.concatenate(matrices) if is_linear else None
+        self._chosen = _chosen_columns(self._rows) if is_linear else None
         each = [one for one, count in zip(sensors.values(), counts, strict=True) for _ in range(count)]
         self._bias, self._quantum, self._delays = (
             numpy.array([getattr(one, name) for one in each]) for name in ("bias", "quantum", "delay")
         )
         periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in each])
         self.limit: Array = numpy.nextafter(0.5 * periods, numpy.inf)
-        self._turning, self._turns = numpy.isfinite(periods), bool(numpy.isfinite(periods).any())
-        self._turn = numpy.tile(numpy.where(self._turning, periods, 1.0), (lanes, 1))
-        self._all_turn = bool(self._turning.all())
-        self._rounded, self._rounds = self._quantum > 0.0, bool(self._quantum.any())
-        self._is_biased, self._is_on_time = bool(self._bias.any()), not self._delays.any()
+        turning = numpy.isfinite(periods)
+        self._divisors, self._periods = numpy.where(turning, periods, 1.0), numpy.where(turning, periods, 0.0)
+        self._turns, self._rounds = bool(turning.any()), bool(self._quantum.any())
+        self._is_biased, self._is_late = bool(self._bias.any()), bool(self._delays.any())
         self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
         self._all_made = numpy.ones((lanes, m), dtype=bool)
-        self._identities = numpy.zeros((2, lanes), dtype=numpy.uint64)
         self._is_seeded = numpy.zeros(lanes, dtype=bool)
-        self._clock = 0
-        """Steps of all lanes."""
-        self._starts = numpy.zeros(lanes, dtype=numpy.int64)
-        """Clock at the start of each lane's episode."""
+        self._clock, self._starts = 0, numpy.zeros(lanes, dtype=numpy.int64)
+        """Steps of all lanes, and those at the start of each one's episode."""
+        self._identities = numpy.zeros((2, lanes, BLOCK), dtype=numpy.uint64)
+        self._times = numpy.zeros((lanes, BLOCK), dtype=numpy.int64)
+        """Identities of the episodes and measurements of a block of steps, see :mod:`.counter_numbers`."""
         self._normals = m * (1 + self._is_biased)
-        self._names, self._times = (
-            numpy.zeros((2, lanes, BLOCK), dtype=numpy.uint64),
-            numpy.zeros((lanes, BLOCK), dtype=numpy.int64),
-        )
         self._numbers = numpy.zeros((self._normals + len(sensors) * (not self._is_steady), lanes, BLOCK))
-        """Normal and uniform numbers of the steps of a block."""
+        """Normal and uniform numbers of these."""
         self._draw: Call | None = None
         """The native call that makes them."""
         self._noise = numpy.zeros((BLOCK, lanes, m))
@@ -225,14 +220,13 @@ class Readings:
             seed = given[lane]
             if seed is None and self._is_seeded[lane]:
                 self._identities[1, lane] += numpy.uint64(1)
-                continue
-            if seed is None:
-                seed = int(numpy.random.SeedSequence().generate_state(1)[0])
-            self._identities[:, lane], self._is_seeded[lane] = (int(seed) ^ STREAM << 32, 0), True
+            else:
+                drawn = int(numpy.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
+                self._identities[:, lane], self._is_seeded[lane] = [[drawn ^ STREAM << 32], [0]], True
         self._starts[lanes] = self._clock
         self._fill(lanes)
+        drawn = self._numbers[self._size : self._normals, :, self._clock % BLOCK].T
         if self._is_biased:
-            drawn = self._numbers[self._size : self._normals, :, self._clock % BLOCK].T
             self._offset[lanes] = (self._bias * drawn)[lanes]
         values = self._measure(state)
         self._waiting[:, :, lanes] = 0.0
@@ -254,7 +248,7 @@ class Readings:
             self._fill(numpy.ones(self._lanes, dtype=bool))
         made = self._all_made if self._is_steady else self._made()
         values = self._measure(state)
-        if not self._is_on_time:
+        if self._is_late:
             depth, each = len(self._waiting), numpy.arange(self._size)
             self._waiting[self._clock % depth] = values, made
             sent = (self._clock - self._delays) % depth
@@ -265,11 +259,11 @@ class Readings:
             values = numpy.where(made, values, self._last)
         self._last = values
         found = Reading(values, made)
-        self.complete = found if self._is_on_time else self._complete(found, lanes)
+        self.complete = self._complete(found, lanes)
         return found
 
     def _complete(self, found: Reading, lanes: Array | None) -> Reading:
-        if not self._is_on_time:
+        if self._is_late:
             values, made = self._waiting[(self._clock + 1) % len(self._waiting)]
             found = Reading(values.copy(), made > 0.0)
         return found if lanes is None else Reading(found.values, found.available & lanes[:, None])
@@ -290,16 +284,17 @@ class Readings:
     def _fill(self, lanes: Array) -> None:
         """Make the numbers of a block of steps of some lanes."""
         t = (self._clock - self._starts[lanes])[:, None] + numpy.arange(BLOCK) - self._clock % BLOCK
-        if AVAILABLE:
-            if self._draw is None:
-                flat = [one.reshape(*one.shape[:-2], -1) for one in (self._names, self._times, self._numbers)]
-                self._draw = bind_numbers(*flat, self._normals)
-            self._names[:, lanes], self._times[lanes] = self._identities[:, lanes, None], t - 1
-            for lane in numpy.flatnonzero(lanes).tolist():
-                self._draw(lane * BLOCK, lane * BLOCK + BLOCK)
-        else:
+        if AVAILABLE and self._draw is None:
+            flat = (
+                one.reshape(*one.shape[:-2], -1) for one in (self._identities, self._times, self._numbers)
+            )
+            self._draw = bind_numbers(*flat, self._normals)
+        self._times[lanes] = t - 1  # the call adds one
+        for lane in numpy.flatnonzero(lanes).tolist() if AVAILABLE else ():
+            self._draw(lane * BLOCK, lane * BLOCK + BLOCK)
+        if not AVAILABLE:
             counts = self._normals, len(self._numbers) - self._normals
-            self._numbers[:, lanes] = numbers(self._identities[:, lanes], t.T, *counts).transpose(1, 2, 0)
+            self._numbers[:, lanes] = numbers(self._identities[:, lanes, 0], t.T, *counts).transpose(1, 2, 0)
         self._noise[:, lanes] = _product(self._numbers[: self._size, lanes].T, self._root)
 
     def _measure(self, state: Array) -> Array:
@@ -320,14 +315,12 @@ class Readings:
         if self._is_biased:
             values += self._offset
         if self._rounds:
-            quantum = numpy.where(self._rounded, self._quantum, 1.0)
-            values = numpy.where(self._rounded, numpy.round(values / quantum) * quantum, values)
+            quantum = numpy.where(self._quantum > 0.0, self._quantum, 1.0)
+            values = numpy.where(self._quantum > 0.0, numpy.round(values / quantum) * quantum, values)
         if self._turns:
-            turns = values / self._turn
+            turns = values / self._divisors
             numpy.rint(turns, turns)
-            turns *= self._turn
-            if not self._all_turn:
-                turns = numpy.where(self._turning, turns, 0.0)
+            turns *= self._periods
             values -= turns
         return values
 
