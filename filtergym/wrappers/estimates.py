@@ -239,9 +239,10 @@ class Estimates:
         self._filtered, shown = found[:n], found[n : 2 * n]
         if self._behind:
             shown = self._present()
-        new, old = (shown.T, found[2 * n : 3 * n].T, found[3 * n]), (self.mean, self.deviation, self.nis)
+        new: Any = (shown.T, found[2 * n : 3 * n].T, found[3 * n])
         if lanes is not None:
-            new = tuple(numpy.where(lanes, one.T, other.T).T for one, other in zip(new, old, strict=True))
+            old = zip(new, (self.mean, self.deviation, self.nis), strict=True)
+            new = (numpy.where(lanes, one.T, other.T).T for one, other in old)
         self.mean, self.deviation, self.nis = new
         if numpy.count_nonzero(found[-1]):
             lost = found[-1] > 0.0

@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy
 
+from .lanes import check_observations
 from .models import EnvironmentModel
 
 
@@ -44,9 +45,7 @@ def fit_model(
     space = env.action_space
     if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"fit_model takes actions of a box (p,), and the action space is {space}")
-    if not isinstance(env.observation_space, gymnasium.spaces.Box) or len(env.observation_space.shape) != 1:
-        raise ValueError(f"fit_model takes observations that are vectors, got {env.observation_space}")
-    n, p = env.observation_space.shape[0], space.shape[0]
+    n, p = check_observations(env.observation_space, env.spec), space.shape[0]
     names = tuple(names) or tuple(f"x{i + 1}" for i in range(n))
     features = 1 + n + p + (n + p) * (n + p + 1) // 2 * (degree == 2)
     if degree not in (1, 2) or steps < 10 * features:
@@ -81,30 +80,23 @@ def fit_model(
         ]
 
     return EnvironmentModel(
-        names=names,
-        f=f,
-        interval=interval,
-        noise=noise,
-        mean=starts.mean(axis=0),
+        names=names, f=f, interval=interval, noise=noise, mean=starts.mean(axis=0),
         covariance=numpy.atleast_2d(numpy.cov(starts.T)) + 1e-6 * numpy.diag(before.std(axis=0) ** 2 + 1e-9),
-        inputs=tuple(f"u{j + 1}" for j in range(p)),
-        angles=angles or {},
-    )
+        inputs=tuple(f"u{j + 1}" for j in range(p)), angles=angles or {},
+    )  # fmt: skip
 
 
 def _roll_out(env: Any, steps: int, policy: Any, seed: int) -> tuple[numpy.ndarray, ...]:
     """Return states before and after each step, actions, and states at the start of episodes."""
     env.action_space.seed(seed)
     observation, _ = env.reset(seed=seed)
-    before, after, actions, starts = [], [], [], [observation]
+    steps_made, starts = [], [observation]
     for _ in range(steps):
         action = env.action_space.sample() if policy is None else policy(observation)
         following, _, terminated, truncated, _ = env.step(action)
-        before.append(observation)
-        after.append(following)
-        actions.append(action)
+        steps_made.append((observation, following, action))
         observation = following
         if terminated or truncated:
             observation, _ = env.reset()
             starts.append(observation)
-    return tuple(numpy.array(each, dtype=float) for each in (before, after, actions, starts))
+    return tuple(numpy.array(each, dtype=float) for each in (*zip(*steps_made, strict=True), starts))

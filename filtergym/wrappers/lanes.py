@@ -76,10 +76,8 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
         self._sensors: SensorLanes = find_sensors(env)
         found = self._sensors.model if model is None else find_model(model, env.spec)
         self.model: EnvironmentModel = check_model(found, self._sensors, actions)
-        shown = check_shown(show, self.model)
-        self._estimates: Estimates = Estimates(
-            self.model, self._sensors.sensors, competitor, control, shown, lanes
-        )
+        kept = competitor, control, check_shown(show, self.model), lanes
+        self._estimates: Estimates = Estimates(self.model, self._sensors.sensors, *kept)
         joined = joint_space(actions, self._estimates.action_space)
         self._joins, self._own_actions = isinstance(joined, gymnasium.spaces.Box), actions
         _set_space(self, "observation", self._estimates.space(self._sensors._dtype.type))
@@ -187,49 +185,42 @@ def find_sensors(env: Any) -> SensorLanes:
     return inner
 
 
-def check_model(
-    model: EnvironmentModel | None, readings: Any, space: gymnasium.Space[Any]
-) -> EnvironmentModel:
+def check_model(model: EnvironmentModel | None, readings: Any, space: Any) -> EnvironmentModel:
     """Return the model of a filter, or raise ValueError where there is none or it does not fit the sensors."""
     if model is None:
         raise ValueError(
             f"no model is known of {getattr(readings.spec, 'id', 'this environment')}: give EstimatedObservation a "
             "model=EnvironmentModel(...), or one of filtergym.wrappers.fit_model"
         )
-    known = readings.model
-    names = None if known is None else tuple(known.names)
-    fields = readings.fields
-    if names is None and len(model.names) != fields:
+    names, known = tuple(model.names), readings.model
+    if known is None and len(names) != readings.fields:
         raise ValueError(
-            f"the model has {len(model.names)} components and the sensors read an observation of {fields}: give "
+            f"the model has {len(names)} components and the sensors read an observation of {readings.fields}: give "
             "NoisyObservation the same model"
         )
-    if names is not None and names != tuple(model.names):
+    if known is not None and names != tuple(known.names):
         raise ValueError(
-            f"the model has the components {', '.join(model.names)}, and the sensors those of a model of "
-            f"{', '.join(names)}: give both wrappers one model"
+            f"the model has the components {', '.join(names)}, and the sensors those of a model of "
+            f"{', '.join(known.names)}: give both wrappers one model"
         )
-    if model.inputs and model.action is None and not isinstance(space, gymnasium.spaces.Box):
+    is_box, inputs = isinstance(space, gymnasium.spaces.Box), ", ".join(model.inputs)
+    if inputs and model.action is None and not is_box:
         raise ValueError(
-            f"the action space is {space}, and the model takes {', '.join(model.inputs)}: give the model "
-            "action=, a function from actions to these inputs"
+            f"the action space is {space}, and the model takes {inputs}: give the model action=, a function from "
+            "actions to these inputs"
         )
-    bounded = isinstance(space, gymnasium.spaces.Box) and space.is_bounded()
-    if model in CLASSIC_CONTROL.values() and bounded:
-        largest = inputs_of(model, numpy.full((1, *space.shape), 1e9))  # type: ignore[misc]
-        if (largest != space.high).any():  # type: ignore[attr-defined]
-            raise ValueError(
-                f"the action space is {space}, and the model takes actions of the environment itself: let "
-                "EstimatedObservation stand below wrappers that change the action, or give a model with action="
-            )
-    if model.inputs:
-        example: Any = gymnasium.vector.utils.create_empty_array(space, 1, fn=numpy.zeros)
-        found = inputs_of(model, example)
-        if found.shape != (1, len(model.inputs)):
-            raise ValueError(
-                f"action of the model must return the {len(model.inputs)} inputs {', '.join(model.inputs)}, got the "
-                f"shape {found.shape[1:]}"
-            )
+    is_bounded = model in CLASSIC_CONTROL.values() and is_box and space.is_bounded()
+    if is_bounded and (inputs_of(model, numpy.full((1, *space.shape), 1e9)) != space.high).any():
+        raise ValueError(
+            f"the action space is {space}, and the model takes actions of the environment itself: let "
+            "EstimatedObservation stand below wrappers that change the action, or give a model with action="
+        )
+    example: Any = gymnasium.vector.utils.create_empty_array(space, 1, fn=numpy.zeros)
+    found = inputs_of(model, example)
+    if found.shape != (1, len(model.inputs)):
+        raise ValueError(
+            f"action of the model must return the {len(model.inputs)} inputs {inputs}, got the shape {found.shape[1:]}"
+        )
     return model
 
 
@@ -255,8 +246,11 @@ def joint_space(env: gymnasium.Space[Any], own: gymnasium.Space[Any] | None) -> 
     """Return the space of actions of the environment and of the filter: one box of both where they are boxes."""
     if own is None:
         return env
-    boxes = isinstance(env, gymnasium.spaces.Box) and isinstance(own, gymnasium.spaces.Box)
-    if boxes and len(env.shape) == 1:  # type: ignore[arg-type]
+    if (
+        isinstance(env, gymnasium.spaces.Box)
+        and isinstance(own, gymnasium.spaces.Box)
+        and len(env.shape) == 1
+    ):
         low, high = (numpy.concatenate([getattr(one, end) for one in (env, own)]) for end in ("low", "high"))
-        return gymnasium.spaces.Box(low.astype(env.dtype), high.astype(env.dtype), dtype=env.dtype)  # type: ignore[arg-type]
+        return gymnasium.spaces.Box(low.astype(env.dtype), high.astype(env.dtype), dtype=env.dtype.type)
     return gymnasium.spaces.Tuple((env, own))

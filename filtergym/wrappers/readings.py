@@ -6,6 +6,7 @@ Noise is a function of the seed, the number of the episode since that seed, the 
 and a lane of a vector environment meets that of a single one.
 """
 
+import contextlib
 import dataclasses
 import zlib
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,6 @@ import numpy
 
 from ..compiler.counter_code import bind_numbers
 from ..compiler.counter_numbers import numbers
-from ..compiler.functions import Call
 from ..compiler.native import AVAILABLE
 from ..compiler.vector_functions import VectorFunction
 from ..envs.linear.sensors import EARLY, Channel, Sensor
@@ -154,7 +154,7 @@ class Readings:
     ) -> None:
         self._interval, self._lanes = interval, lanes
         self._functions = [
-            trace_measurement(f"h of the sensor {name!r}", one.h, size, 0) for name, one in sensors.items()
+            trace_measurement(f"h of the sensor {key!r}", sensors[key].h, size, 0) for key in sensors
         ]
         counts = [function.size for function in self._functions]
         self._channels: tuple[Channel, ...] = find_channels(sensors, counts, interval)
@@ -169,8 +169,8 @@ class Readings:
             one.matrix for one in self._functions if one.matrix is not None and not numpy.any(one.offset)
         ]
         is_linear = len(matrices) == len(counts) and not self._varying
-        self._rows = numpy.concatenate(matrices) if is_linear else None
-        self._chosen = _chosen_columns(self._rows) if is_linear else None
+        self._rows: Any = numpy.concatenate(matrices) if is_linear else None
+        self._chosen = _chosen_columns(numpy.concatenate(matrices)) if is_linear else None
         each = [one for one, count in zip(sensors.values(), counts, strict=True) for _ in range(count)]
         self._bias, self._quantum, self._delays = (
             numpy.array([getattr(one, name) for one in each]) for name in ("bias", "quantum", "delay")
@@ -192,7 +192,7 @@ class Readings:
         self._normals = m * (1 + self._is_biased)
         self._numbers = numpy.zeros((self._normals + len(sensors) * (not self._is_steady), lanes, BLOCK))
         """Normal and uniform numbers of these."""
-        self._draw: Call | None = None
+        self._draw: Any = None
         """The native call that makes them."""
         self._noise = numpy.zeros((BLOCK, lanes, m))
         self._offset, self._last = numpy.zeros((lanes, m)), numpy.zeros((lanes, m))
@@ -225,9 +225,9 @@ class Readings:
                 self._identities[:, lane], self._is_seeded[lane] = [[drawn ^ STREAM << 32], [0]], True
         self._starts[lanes] = self._clock
         self._fill(lanes)
-        drawn = self._numbers[self._size : self._normals, :, self._clock % BLOCK].T
         if self._is_biased:
-            self._offset[lanes] = (self._bias * drawn)[lanes]
+            own = self._bias * self._numbers[self._size : self._normals, :, self._clock % BLOCK].T
+            self._offset[lanes] = own[lanes]
         values = self._measure(state)
         self._waiting[:, :, lanes] = 0.0
         self._waiting[self._clock % len(self._waiting)][:, lanes] = values[lanes], self._all_made[lanes]
@@ -285,10 +285,8 @@ class Readings:
         """Make the numbers of a block of steps of some lanes."""
         t = (self._clock - self._starts[lanes])[:, None] + numpy.arange(BLOCK) - self._clock % BLOCK
         if AVAILABLE and self._draw is None:
-            flat = (
-                one.reshape(*one.shape[:-2], -1) for one in (self._identities, self._times, self._numbers)
-            )
-            self._draw = bind_numbers(*flat, self._normals)
+            named, flat = self._identities.reshape(2, -1), self._numbers.reshape(len(self._numbers), -1)
+            self._draw = bind_numbers(named, self._times.reshape(-1), flat, self._normals)
         self._times[lanes] = t - 1  # the call adds one
         for lane in numpy.flatnonzero(lanes).tolist() if AVAILABLE else ():
             self._draw(lane * BLOCK, lane * BLOCK + BLOCK)
@@ -333,15 +331,13 @@ def _noise_function(R: Any, count: int, size: int) -> VectorFunction:
 def _noise_root(sensor: str, given: Any, count: int) -> Array:
     """Return the root of a sensor's R, or raise ValueError where it is no covariance."""
     R = _noise_matrix(given, count)
-    try:
-        if R.shape != (count, count) or not numpy.isfinite(R).all():
-            raise numpy.linalg.LinAlgError
-        return numpy.linalg.cholesky(R)
-    except numpy.linalg.LinAlgError:
-        raise ValueError(
-            f"R of the sensor {sensor!r} must be a positive definite covariance of its {count} numbers, got "
-            f"{numpy.asarray(given).tolist()}"
-        ) from None
+    if R.shape == (count, count) and numpy.isfinite(R).all():
+        with contextlib.suppress(numpy.linalg.LinAlgError):
+            return numpy.linalg.cholesky(R)
+    raise ValueError(
+        f"R of the sensor {sensor!r} must be a positive definite covariance of its {count} numbers, got "
+        f"{numpy.asarray(given).tolist()}"
+    )
 
 
 def _product(vectors: Array, matrix: Array) -> Array:

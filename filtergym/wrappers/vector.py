@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import gymnasium
 import numpy
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
