@@ -24,8 +24,8 @@ def printed(notebook):
     return "\n".join(one.text if "text" in one else one.data.get("text/plain", "") for one in outputs)
 
 
-def test_there_are_three():
-    assert sorted(FILES) == ["compare_my_filter", "log_to_c", "train_an_agent"]
+def test_there_are_four():
+    assert sorted(FILES) == ["compare_my_filter", "estimate_in_the_loop", "log_to_c", "train_an_agent"]
 
 
 @pytest.mark.parametrize("name", FILES)
