@@ -177,12 +177,12 @@ class Readings:
         )
         periods = numpy.array([PERIODS[one.wraps] if one.wraps else numpy.inf for one in each])
         self.limit: Array = numpy.nextafter(0.5 * periods, numpy.inf)
-        turning = numpy.isfinite(periods)
+        turning, self._quanta = numpy.isfinite(periods), numpy.where(self._quantum > 0.0, self._quantum, 1.0)
         self._divisors, self._periods = numpy.where(turning, periods, 1.0), numpy.where(turning, periods, 0.0)
         self._turns, self._rounds = bool(turning.any()), bool(self._quantum.any())
         self._is_biased, self._is_late = bool(self._bias.any()), bool(self._delays.any())
         self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self._channels)
-        self._all_made = numpy.ones((lanes, m), dtype=bool)
+        self._all_made, self._each = numpy.ones((lanes, m), dtype=bool), numpy.arange(m)
         self._is_seeded = numpy.zeros(lanes, dtype=bool)
         self._clock, self._starts = 0, numpy.zeros(lanes, dtype=numpy.int64)
         """Steps of all lanes, and those at the start of each one's episode."""
@@ -194,7 +194,7 @@ class Readings:
         """Normal and uniform numbers of these."""
         self._draw: Any = None
         """The native call that makes them."""
-        self._noise = numpy.zeros((BLOCK, lanes, m))
+        self._noise, self._made = numpy.zeros((BLOCK, lanes, m)), numpy.zeros((BLOCK, lanes, m), dtype=bool)
         self._offset, self._last = numpy.zeros((lanes, m)), numpy.zeros((lanes, m))
         self._waiting = numpy.zeros((int(self._delays.max()) + 1, 2, lanes, m))
         """Readings that are under way and whether they were made, by the clock modulo the longest delay plus one."""
@@ -246,10 +246,10 @@ class Readings:
         self._clock += 1
         if self._clock % BLOCK == 0:
             self._fill(numpy.ones(self._lanes, dtype=bool))
-        made = self._all_made if self._is_steady else self._made()
+        made = self._all_made if self._is_steady else self._made[self._clock % BLOCK].copy()
         values = self._measure(state)
         if self._is_late:
-            depth, each = len(self._waiting), numpy.arange(self._size)
+            depth, each = len(self._waiting), self._each
             self._waiting[self._clock % depth] = values, made
             sent = (self._clock - self._delays) % depth
             values, made = self._waiting[sent, 0, :, each].T, self._waiting[sent, 1, :, each].T > 0.0
@@ -268,19 +268,6 @@ class Readings:
             found = Reading(values.copy(), made > 0.0)
         return found if lanes is None else Reading(found.values, found.available & lanes[:, None])
 
-    def _made(self) -> Array:
-        """Return whether each number is measured at this step, ``(N, m)``."""
-        made = numpy.empty((self._lanes, self._size), dtype=bool)
-        uniforms = self._numbers[self._normals :, :, self._clock % BLOCK]
-        for channel, uniform in zip(self._channels, uniforms, strict=True):
-            due = uniform < channel.availability
-            if channel.interval is not None:
-                share, step = self._interval / channel.interval, self._clock - self._starts
-                count = numpy.floor(step * share + EARLY)
-                due &= count > numpy.floor((step - 1) * share + EARLY)
-            made[:, channel.places] = due[:, None]
-        return made
-
     def _fill(self, lanes: Array) -> None:
         """Make the numbers of a block of steps of some lanes."""
         t = (self._clock - self._starts[lanes])[:, None] + numpy.arange(BLOCK) - self._clock % BLOCK
@@ -294,6 +281,12 @@ class Readings:
             counts = self._normals, len(self._numbers) - self._normals
             self._numbers[:, lanes] = numbers(self._identities[:, lanes, 0], t.T, *counts).transpose(1, 2, 0)
         self._noise[:, lanes] = _product(self._numbers[: self._size, lanes].T, self._root)
+        for channel, uniform in zip(self._channels, self._numbers[self._normals :, lanes], strict=False):
+            due = uniform < channel.availability
+            if channel.interval is not None:
+                share = self._interval / channel.interval
+                due &= numpy.floor(t * share + EARLY) > numpy.floor((t - 1) * share + EARLY)
+            self._made[:, lanes, channel.places] = due.T[:, :, None]
 
     def _measure(self, state: Array) -> Array:
         """Return what all sensors measure now, ``(N, m)``."""
@@ -313,8 +306,8 @@ class Readings:
         if self._is_biased:
             values += self._offset
         if self._rounds:
-            quantum = numpy.where(self._quantum > 0.0, self._quantum, 1.0)
-            values = numpy.where(self._quantum > 0.0, numpy.round(values / quantum) * quantum, values)
+            quantum = self._quantum
+            values = numpy.where(quantum > 0.0, numpy.rint(values / self._quanta) * quantum, values)
         if self._turns:
             turns = values / self._divisors
             numpy.rint(turns, turns)
