@@ -325,6 +325,24 @@ def print_trained(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
         print(f"| {name} | {deviation:g} | " + " | ".join(row) + " |")
 
 
+def print_steered(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
+    """Print the returns of agents that observe the filter's uncertainty, and of those that steer the filter, too."""
+    ways = ("estimate", *STEERING)
+    print("\n| PPO, mean return (seeds) | noise | estimate | and its uncertainty | and steering", end=" | ")
+    print("steering less none, lowest and highest seed |\n" + "|---" * 6 + "|")
+    for name in (one for one in STEERED if one in only):
+        runs = {key: value for key, value in found.items() if key[:2] == ("trained", name)}
+        of = {way: mean_returns(runs, way, "medium") for way in ways}
+        row = [f"{numpy.mean([*one.values()]):.1f} ({len(one)})" if one else "" for one in of.values()]
+        pairs = [
+            value - of["uncertainty"][seed]
+            for seed, value in of["steered"].items()
+            if seed in of["uncertainty"]
+        ]
+        row.append(f"{numpy.mean(pairs):+.1f} ({min(pairs):+.1f}, {max(pairs):+.1f})" if pairs else "")
+        print(f"| {name} | {PROBLEMS[name][4][1]:g} | " + " | ".join(row) + " |")
+
+
 def draw_episode(file: Path) -> None:
     """Draw the angle of the pendulum, its readings, and the estimate with its 95 % band."""
     from matplotlib.figure import Figure
@@ -397,6 +415,7 @@ def main() -> None:
             file.write(json.dumps({"cell": cell, "found": result}) + "\n")
     print_fixed(found, given.only)
     print_trained(found, given.only)
+    print_steered(found, given.only)
 
 
 if __name__ == "__main__":

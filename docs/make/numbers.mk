@@ -184,7 +184,7 @@ $(DONE)/own_logs:
 
 $(DONE)/loop:
 	$(BIN)/python benchmarks/estimation_in_the_loop.py fixed trained > build/loop.txt
-	$(table) build/loop.txt --name loop_fixed --name loop_trained --command "python benchmarks/estimation_in_the_loop.py fixed trained"
+	$(table) build/loop.txt --name loop_fixed --name loop_trained --name loop_steered --command "python benchmarks/estimation_in_the_loop.py fixed trained"
 	$(finish)
 
 $(DONE)/sensing:
