@@ -1,6 +1,6 @@
 """Loss of an agent by noisy sensors, and gain by a filter: returns under truth, readings and estimates.
 
-    python benchmarks/estimation_in_the_loop.py [fixed trained] [--only ENVIRONMENT ...] [--seeds N] [--out FILE]
+    python benchmarks/estimation_in_the_loop.py [fixed trained time] [--only ENVIRONMENT ...] [--seeds N] [--out FILE]
 
 ``fixed``
     One good controller of each environment, which takes the state: from the truth, from raw readings and their
@@ -9,6 +9,9 @@
     PPO of Stable-Baselines3 on the full observation, on readings, on a stack of four readings and on estimates,
     with its mean return over 50 fresh episodes; of two environments at the medium noise also on estimates with
     deviation, NIS and innovation, and the same with actions that steer the filter's noise, too.
+
+``time``
+    Processor time of a step of Pendulum, bare, with readings and with estimates, in turns: medians of 25.
 
 Results are appended to FILE, one line of JSON for each cell, and an existing cell is not computed again. Tables
 are printed at the end: mean returns, and differences with 95 % intervals, paired by episode or by training seed.
@@ -32,7 +35,7 @@ import gymnasium
 import numpy
 import scipy.linalg
 
-from filtergym.wrappers import CLASSIC_CONTROL, EstimatedObservation, NoisyObservation
+from filtergym.wrappers import CLASSIC_CONTROL, EstimatedObservation, NoisyObservation, vector
 
 EPISODES, FRESH, LEVELS, STACK = 100, 50, ("low", "medium", "high"), 4
 Controller = Callable[[numpy.ndarray], Any]
@@ -98,6 +101,8 @@ FILTERS = ("extended", "unscented")
 STEERING = {"uncertainty": None, "steered": "noise"}
 """Agents that observe deviation, NIS and innovation, too, and the control of their filter."""
 STEERED = ("Pendulum-v1", "CartPole-v1")
+SIZES = ("1", "64")
+"""Lanes whose steps are timed."""
 
 
 def sensors_of(name: str, level: str) -> dict[str, Any]:
@@ -204,7 +209,7 @@ def make(name: str, way: str, level: str) -> Any:
     return env
 
 
-def train(name: str, way: str, level: str, seed: int) -> dict[str, Any]:
+def train(name: str, way: str, level: str, seed: str) -> dict[str, Any]:
     """Train PPO once; return its returns in training and on fresh episodes, and the time."""
     import torch
     from stable_baselines3 import PPO
@@ -219,7 +224,7 @@ def train(name: str, way: str, level: str, seed: int) -> dict[str, Any]:
         DummyVecEnv([lambda: Monitor(make(name, way, level))] * LANES), gamma=settings["gamma"]
     )
     began = time.process_time()
-    model = PPO("MlpPolicy", lanes, seed=seed, **settings)
+    model = PPO("MlpPolicy", lanes, seed=int(seed), **settings)
     model.learn(steps)
     spent = time.process_time() - began
     curve = [(int(at), float(value)) for env in lanes.venv.envs for at, value in zip(
@@ -244,6 +249,38 @@ def train(name: str, way: str, level: str, seed: int) -> dict[str, Any]:
     }
 
 
+def time_steps(lanes: str) -> list[float]:
+    """Return the processor time of a step of Pendulum of some lanes, bare, with readings and estimates, us."""
+    count, sensors, bare = int(lanes), sensors_of("Pendulum-v1", "medium"), "Pendulum-v1"
+    if count == 1:
+        made: list[Any] = [gymnasium.make(bare) for _ in range(3)]
+        wrappers: Any = NoisyObservation, EstimatedObservation
+    else:
+        made = [gymnasium.make_vec(bare, count, "sync") for _ in range(3)]
+        wrappers = vector.NoisyObservation, vector.EstimatedObservation
+    made[1:] = [wrappers[0](env, sensors) for env in made[1:]]
+    made[2] = wrappers[1](made[2])
+    action = numpy.full(made[0].action_space.shape, 0.5, dtype=numpy.float32)
+    spent: list[list[float]] = [[], [], []]
+    for _, (env, times) in itertools.product(range(25), zip(made, spent, strict=True)):
+        env.reset(seed=0)
+        began = time.process_time()
+        for _ in range(150):
+            env.step(action)
+        times.append((time.process_time() - began) / 150 * 1e6)
+    return [float(numpy.median(times)) for times in spent]
+
+
+def print_times(found: dict[tuple[str, ...], Any]) -> None:
+    """Print the processor time of a step."""
+    print(
+        "\n| a step of Pendulum, µs of a processor | bare | with readings | with estimates |\n|---|---|---|---|"
+    )
+    for lanes in SIZES:
+        row = found.get(("time", lanes), [])
+        print(f"| {lanes} at once | " + " | ".join(f"{one:.0f}" for one in row) + " |")
+
+
 def cells(stages: list[str], only: list[str], seeds: int) -> Iterator[tuple[str, ...]]:
     """Yield the cells of the tables, those of the first training seed before those of the next."""
     for name in only:
@@ -252,6 +289,8 @@ def cells(stages: list[str], only: list[str], seeds: int) -> Iterator[tuple[str,
             yield from (
                 ("fixed", name, way, level) for level in LEVELS for way in ("raw", "average", *FILTERS)
             )
+    if "time" in stages:
+        yield from (("time", lanes) for lanes in SIZES)
     if "trained" in stages:
         for seed in range(seeds):
             for level in ("", "medium", "high", "low"):
@@ -409,13 +448,15 @@ def main() -> None:
     for number, cell in enumerate(work, 1):
         stage, *arguments = cell
         print(f"{number} of {len(work)}: {' '.join(filter(None, cell))} ...", file=sys.stderr, flush=True)
-        result = fly(*arguments) if stage == "fixed" else train(*arguments[:3], int(arguments[3]))
+        run: dict[str, Callable[..., Any]] = {"fixed": fly, "trained": train, "time": time_steps}
+        result = run[stage](*arguments)
         found[cell] = result
         with given.out.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"cell": cell, "found": result}) + "\n")
     print_fixed(found, given.only)
     print_trained(found, given.only)
     print_steered(found, given.only)
+    print_times(found)
 
 
 if __name__ == "__main__":

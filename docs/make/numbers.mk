@@ -183,8 +183,8 @@ $(DONE)/own_logs:
 	$(finish)
 
 $(DONE)/loop:
-	$(BIN)/python benchmarks/estimation_in_the_loop.py fixed trained > build/loop.txt
-	$(table) build/loop.txt --name loop_fixed --name loop_trained --name loop_steered --command "python benchmarks/estimation_in_the_loop.py fixed trained"
+	$(BIN)/python benchmarks/estimation_in_the_loop.py fixed trained time > build/loop.txt
+	$(table) build/loop.txt --name loop_fixed --name loop_trained --name loop_steered --name loop_time --command "python benchmarks/estimation_in_the_loop.py fixed trained time"
 	$(finish)
 
 $(DONE)/sensing:

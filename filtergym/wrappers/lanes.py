@@ -110,7 +110,7 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
                 last = None if actions is None else self._shown()
                 estimates.begin(lanes, reading)
             else:
-                estimates.advance(lanes, inputs_of(self.model, actions), reading, own)
+                estimates.advance(lanes, inputs_of(self.model, numpy.asarray(actions)), reading, own)
         return last
 
     def _shown(self) -> numpy.ndarray:

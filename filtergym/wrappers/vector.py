@@ -75,7 +75,7 @@ class EstimatedObservation(FilterLanes, VectorWrapper[Any, Any, Any, Any, Any]):
         """Step the environments, and take their readings in."""
         actions, own = self._split(actions)
         _, rewards, terminations, truncations, infos = self.env.step(actions)
-        last = self._take(numpy.asarray(actions), own)
+        last = self._take(actions, own)
         if last is not None and autoreset_of(self.env) is AutoresetMode.SAME_STEP:
             infos = {**infos, "final_obs": rows_of(infos["_final_obs"], last)}
         return self._shown(), rewards, terminations, truncations, infos
