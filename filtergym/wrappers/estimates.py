@@ -59,9 +59,8 @@ def define_problem(model: EnvironmentModel, sensors: Mapping[str, EnvironmentSen
 
 def _key(value: Any) -> Any:
     """Return numbers and words as text, and a function by its identity."""
-    return (
-        id(value) if callable(value) else repr(value.tolist() if isinstance(value, numpy.ndarray) else value)
-    )
+    plain = value.tolist() if isinstance(value, numpy.ndarray) else value
+    return id(value) if callable(value) else repr(plain)
 
 
 def report_estimate(model: Any, episode: Any) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """What the wrappers of one environment and of many share: an environment is one lane, a vector environment has N."""
 
 import contextlib
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -37,11 +36,7 @@ class SensorLanes(gymnasium.utils.RecordConstructorArgs):
         _set_space(self, "observation", gymnasium.spaces.Box(-limit, limit, dtype=self._dtype.type))
 
     def _begin(
-        self,
-        lanes: numpy.ndarray,
-        observations: Any,
-        seeds: Sequence[int | None] | None,
-        received: Any = False,
+        self, lanes: numpy.ndarray, observations: Any, seeds: Any, received: Any = False
     ) -> numpy.ndarray:
         """Begin episodes of some lanes, and return the readings of all."""
         self.reading = self._readings.begin(lanes, self._state(observations), seeds, received)
