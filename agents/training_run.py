@@ -61,6 +61,7 @@ FILES = {
     "bptt": "bptt",
     "bptt-linear": "bptt_linear",
     "bptt-small": "bptt_small",
+    "bptt-strongest": "bptt_strongest",
     "kalman-net": "kalman_net",
     "student": "student",
 }

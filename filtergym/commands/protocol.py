@@ -121,8 +121,8 @@ def _table(found: ProtocolResult) -> Table:
         "stands below the environment, less one. "
         "A track is lost where an episode's mean cost is beyond the bound of the environment. ANEES is 1 if errors are "
         "as large as the covariance states; ! marks a factor above two or below a half. Of the scenarios that "
-        "are held out from training the worst is named. ns is the processor time of a measurement on one core of this "
-        "machine, of world and competitor."
+        "are held out from training the worst is named. ns is the competitor's processor time of a measurement on one "
+        "core of this machine."
     )
     if not found.complete:
         table.caption += "\nNot all environments were entered: there is no number over all."

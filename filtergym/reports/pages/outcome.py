@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import Record
-from ...evaluation.running.times import EQUAL_TIMES, times_of_records
+from ...evaluation.running.times import longest_equal, times_of_records
 from ..tables.ranking import find_record, ranking, rival_of
 from ..tables.results import Result
 from ..tables.terminal_tables import HEADLINE, consistency_word
@@ -197,7 +197,7 @@ def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) ->
                     name
                     for name in known
                     if ((name in learned) == (origin == "learned")) is own
-                    and times[name] <= first * (1.0 if own else EQUAL_TIMES)
+                    and times[name] <= (first if own else longest_equal(first))
                 ),
                 None,
             )
