@@ -187,6 +187,7 @@ def descend_episodes(
     descend: Callable[[], None],
     gate: Gate | None = None,
     largest: float | None = None,
+    penalty: float = 0.0,
 ) -> float:
     """Simulate one episode in every environment and descend the gradient of the mean cost.
 
@@ -200,13 +201,15 @@ def descend_episodes(
         largest: norm to which the gradient of an episode's costs since the last call with respect to one of its actions
             is clipped. In episodes that lose the track the gradient grows with every decision that it flows back:
             without clipping, few episodes dominate the sum.
+        penalty: cost, in the unit of the reward, of an action whose numbers have the sum of squares one. It keeps
+            actions near zero, the filter itself, where they gain little.
 
     Returns:
         Mean cost of a measurement, in the unit of the reward and compressed in the same way.
     """
     observation, _ = env.reset()
     hidden = policy.new_memory(env.num_envs)
-    total, pending = 0.0, torch.zeros(())
+    total, pending, penalties = 0.0, torch.zeros(()), torch.zeros(())
     memory, start = None, numpy.ones(env.num_envs, dtype=bool)
 
     def cut(gradient: torch.Tensor, largest: float) -> torch.Tensor:
@@ -226,12 +229,14 @@ def descend_episodes(
             action.register_hook(functools.partial(cut, largest=largest))
         observation, reward, _, _, _ = env.step(action)
         pending = pending - reward.mean()
+        penalties = penalties + penalty * action.square().sum(dim=1).mean()
         window = (decision - 1) % truncation + 1
         if window == truncation or decision == env.last_decision:
-            (pending / window).backward()
+            ((pending + penalties) / window).backward()
             total += float(pending.detach())
             descend()
-            pending, hidden, observation = torch.zeros(()), hidden.detach(), observation.detach()
+            pending, penalties = torch.zeros(()), torch.zeros(())
+            hidden, observation = hidden.detach(), observation.detach()
             env.fleet.detach()
     return total / env.last_decision
 
@@ -353,16 +358,19 @@ class Descent:
         """Return the function that simulates an episode in every environment, descends, and returns the mean cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
-        teacher = self.values.get("teacher")
+        teacher, penalty = self.values.get("teacher"), self.values.get("action_penalty", 0.0)
+        check("action_penalty", penalty, float, ParameterLimits(at_least=0.0))
         if env.backend == "compiled":
             reward = _reward_with_teacher(self.run)
             beside = None if teacher is None else Teacher(env, teacher)
-            return Unrolled(env, policy, truncation, reward, beside, gate, largest).descend_episodes
+            return Unrolled(env, policy, truncation, reward, beside, gate, largest, penalty).descend_episodes
         if teacher is not None:
             raise ValueError(
                 f"teacher {teacher!r} needs compiled episodes, and these run on torch: leave it out"
             )
-        return functools.partial(descend_episodes, env, policy, truncation, gate=gate, largest=largest)
+        return functools.partial(
+            descend_episodes, env, policy, truncation, gate=gate, largest=largest, penalty=penalty
+        )
 
     def update(self) -> float:
         """Descend the accumulated gradient and return its norm."""

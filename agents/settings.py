@@ -156,7 +156,14 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
     """
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
-        known |= {"first_action", "fields_kept", "longest_memory", "max_action_grad", "network"}
+        known |= {
+            "action_penalty",
+            "first_action",
+            "fields_kept",
+            "longest_memory",
+            "max_action_grad",
+            "network",
+        }
         known |= {"teacher", "teacher_share"}
     else:
         from .sb3_algorithms import ALGORITHMS

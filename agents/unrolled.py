@@ -313,6 +313,7 @@ class Unrolled:
         teacher: teacher whose estimates are the targets of a share of the reward.
         gate: gate that decides whether the policy acts; other decisions have no gradient.
         largest: norm to which gradients are clipped, see :func:`.bptt.descend_episodes`.
+        penalty: cost of a squared action of one, see :func:`.bptt.descend_episodes`.
     """
 
     def __init__(
@@ -324,10 +325,12 @@ class Unrolled:
         teacher: Teacher | None = None,
         gate: Gate | None = None,
         largest: float | None = None,
+        penalty: float = 0.0,
     ) -> None:
         lanes: Any = env.fleet.only
         self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
         self._truncation, self._largest = min(truncation, env.last_decision), largest
+        self._penalty = penalty
         self._rollout = Rollout(env.model, reward, lanes.width, self._truncation * self._interval)
         self._teacher, self._flown = teacher, 0
         self._policy = UnrolledPolicy(policy, env.num_envs, self._truncation)
@@ -396,6 +399,9 @@ class Unrolled:
                 if interval > 1:
                     rollout.shown_adjoint[self._last] = 0.0
                 of_action = of_action + rollout.action_adjoint[:, :count]
+            if self._penalty > 0.0:
+                action = rollout.action[decision * interval, :, :count]
+                of_action = of_action + 2.0 * self._penalty * share * interval * action
             if self._gate is not None:
                 of_action = of_action * self._opened[decision]
             if self._largest is not None:
