@@ -22,7 +22,7 @@ SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training accepts."""
 ESTIMATORS = ("kalman-net", "student")
 """Algorithms that train a learned estimator: a network that acts in a filter of its own (:class:`.TrainedBanks`)."""
-THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", *ESTIMATORS)
+THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", "ma-ukf", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
 RUN_ARGUMENTS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 """Arguments of an algorithm that a run sets itself."""

@@ -63,6 +63,8 @@ FILES = {
     "bptt-small": "bptt_small",
     "kalman-net": "kalman_net",
     "student": "student",
+    "ma-ukf": "ma_ukf",
+    "rl-ukf": "rl_ukf",
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib")
