@@ -26,6 +26,7 @@ from typing import Any, ClassVar, NamedTuple
 from ...filters import coordinated_turn, unscented
 from ...filters.gaussian import log_density
 from ...filters.ordered_sums import ordered_sum
+from ...filters.small_matrices import outer
 from ..contract.controls import SettingsBank, SteerableFilter
 from ..contract.filter import EstimateState, FilterInput, Initial, Likelihood
 from ..contract.observation import (
@@ -50,6 +51,10 @@ STATES = 5
 POINTS = range(2 * STATES + 1)
 AXES = ("x", "y", "vx", "vy", "turn")
 """Columns of the root of the covariance, by the first state that each moves."""
+PLAIN_FILTER = {"acceleration": 1.0, "turn_rate_change": 0.03, "turn_rate_start": 0.1}
+"""Of the filter that the zero action is, chosen on validation with agents trained in it."""
+LARGEST_DEVIATION = 0.5
+"""Of the turn rate, rad/s: far more than any aircraft needs, and an action may multiply its variance at every scan."""
 SPEED = 100.0
 """Unit of the speed in the observation, m/s."""
 
@@ -71,6 +76,9 @@ class Prediction(NamedTuple):
 class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measurement, EstimateState]):
     """The unscented filter of the turn with settings that an action multiplies."""
 
+    def __init__(self, task: TargetProblem) -> None:
+        super().__init__(task, **PLAIN_FILTER)
+
     def heeds(self, measurement: Measurement) -> Array:
         """Return one where the scan saw the target."""
         return measurement.available
@@ -85,13 +93,20 @@ class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measure
         likelihood = self.likelihood(measurement, *log_density(innovation, S))
         return Prediction(measurement.available * innovation, prior, sensor, likelihood, mean)
 
+    def limit(self, covariance: Array) -> Array:
+        """Limit the deviation of the turn rate: the measurements would no longer determine it."""
+        xp = self.xp
+        ratio = xp.minimum(LARGEST_DEVIATION / xp.sqrt(covariance[4, 4]), 1.0)
+        factors = xp.stack([*([1.0 + 0.0 * ratio] * 4), ratio])
+        return covariance * outer(factors, factors)
+
 
 class WeightedUnscentedTurn(SteeredUnscentedTurn):
     """The unscented filter whose weights of the sigma points an action multiplies."""
 
     settings: Mapping[str, float] = {
-        **{f"mean_{side}{axis}": 10.0 for side in "+-" for axis in AXES},
-        **{f"covariance_{name}": 10.0 for name in ("0", *(side + axis for side in "+-" for axis in AXES))},
+        **{f"mean_{side}{axis}": 5.0 for side in "+-" for axis in AXES},
+        **{f"covariance_{name}": 5.0 for name in ("0", *(side + axis for side in "+-" for axis in AXES))},
     }
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
@@ -105,7 +120,7 @@ class WeightedUnscentedTurn(SteeredUnscentedTurn):
         for_covariance = [for_covariance[i] * factors[2 * STATES + i] for i in POINTS]
         points = coordinated_turn.propagate(unscented.sigma_points(state.mean, state.covariance), T)
         mean, covariance = unscented.combine(points, for_mean, for_covariance)
-        predicted = mean, covariance + self.noise(T)
+        predicted = mean, self.limit(covariance + self.noise(T))
         return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
 
 
@@ -126,7 +141,7 @@ class TunedUnscentedTurn(SteeredUnscentedTurn):
             lambda points: coordinated_turn.propagate(points, T),
             unscented.Spread(spread),
         )
-        predicted = mean, covariance + self.noise(T, acceleration, turn_rate)
+        predicted = mean, self.limit(covariance + self.noise(T, acceleration, turn_rate))
         measurement = measurement._replace(variance=noise * measurement.variance)
         return self.track(given.measurement, self.update_estimate(predicted, measurement))
 
