@@ -4,7 +4,7 @@ They predict over the actual time between two scans; for a scan that missed the 
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ...envs.contract.filter import EstimateState, FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array

@@ -1,4 +1,4 @@
-"""The nearly coordinated turn of ManeuveringTarget, and its unscented Kalman filter: the estimator ``unscented-turn``."""
+"""The nearly coordinated turn of ManeuveringTarget, and the estimator ``unscented-turn``, its unscented filter."""
 
 import math
 
@@ -27,7 +27,7 @@ class TurnModel(ConstantVelocityModel):
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def noise(self, T: Array, acceleration: float | Array = 1.0, turn_rate: float | Array = 1.0) -> Array:
-        """Return the covariance of the process noise over intervals, s, ``(5, 5, N)``, with factors of its variances."""
+        """Return the covariance of the process noise over intervals, s, ``(5, 5, N)``, its variances multiplied."""
         Q = (acceleration * self.variance) * self.motion(T)[1]
         change = turn_rate * (T * self.change) ** 2
         return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, change)[1]
