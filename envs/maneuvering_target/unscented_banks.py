@@ -55,7 +55,7 @@ POINTS = range(2 * STATES + 1)
 AXES = ("x", "y", "vx", "vy", "turn")
 """Columns of the root of the covariance, by the first state that each moves."""
 PLAIN_FILTER = {"acceleration": 1.0, "turn_rate_change": 0.03, "turn_rate_start": 0.1}
-"""Of the filter that the zero action is, chosen on validation with agents trained in it."""
+"""Values of the plain filter, the zero action; chosen on validation with agents trained in it."""
 LARGEST_DEVIATION = 0.5
 """Of the turn rate, rad/s: far more than any aircraft needs, and an action may multiply its variance at every scan."""
 SPEED = 100.0
