@@ -43,7 +43,7 @@ def network_arrays(agent: Any, algorithm: str) -> tuple[dict[str, numpy.ndarray]
     """
     policy: Any = agent.model.policy
     discrete = not hasattr(agent.action_space, "low")
-    if algorithm in ("ppo", "recurrent-ppo"):
+    if algorithm in ("ppo", "recurrent-ppo", "rl-ukf"):
         arrays, activation = _layers(policy.mlp_extractor.policy_net, policy.action_net)
         output = "argmax" if discrete else "clip"
         if algorithm == "recurrent-ppo":

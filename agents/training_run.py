@@ -46,6 +46,7 @@ from .residual import policy_to_correct
 from .settings import (
     ESTIMATORS,
     OPTIONS,
+    RIVALS,
     THROUGH_THE_FILTER,
     check_hyperparameters,
     check_keywords,
@@ -64,6 +65,8 @@ FILES = {
     "bptt-strongest": "bptt_strongest",
     "kalman-net": "kalman_net",
     "student": "student",
+    "ma-ukf": "ma_ukf",
+    "rl-ukf": "rl_ukf",
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib")
@@ -298,10 +301,13 @@ def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
     Raises:
         ValueError: if the environment has no such filter.
     """
-    if algorithm not in ESTIMATORS:
+    if algorithm in RIVALS and RIVALS[algorithm] in cls.controls:
+        return (RIVALS[algorithm],)
+    if algorithm not in ESTIMATORS and algorithm not in RIVALS:
         return cls.controls
     if algorithm not in trained_banks(cls):
-        having = [other.id for other in catalogue().values() if algorithm in trained_banks(other)]
+        own = RIVALS.get(algorithm)
+        having = [c.id for c in catalogue().values() if algorithm in trained_banks(c) or own in c.controls]
         raise ValueError(
             f"{cls.id} has no filter for algorithm {algorithm!r}: choose another algorithm, or {', '.join(having)}"
         )

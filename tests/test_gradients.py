@@ -126,6 +126,7 @@ def random_policy(env, dtype, network="recurrent"):
         ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None, "linear"),
         ("ManeuveringTarget", "kalman-net", {}, 0.01, "recurrent"),
         ("ManeuveringTarget", "student", {}, None, "recurrent"),
+        ("ManeuveringTarget", "sigma-points", {}, 0.01, "recurrent"),
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01, "recurrent"),
         ("UavAutopilot", "gain", {}, None, "recurrent"),
         ("RadarEsmTracking", "evidence", {}, 0.01, "recurrent"),

@@ -8,9 +8,9 @@ from typing import NamedTuple
 from ...envs.contract.filter import FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.banks import SHORTEST
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...filters import kalman, noise_adaptation
-from .estimators import KalmanModel
 
 
 class ProcessNoiseTrack(NamedTuple):

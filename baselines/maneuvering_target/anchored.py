@@ -7,9 +7,10 @@ import numpy
 
 from ...envs.contract.filter import EstimateState, FilterInput, Initial
 from ...envs.data.recording import Recording
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.unscented_turn import DEGREE
 from ...filters import dead_reckoning
-from .estimators import DEGREE, KalmanModel
 
 STEP = 10.0
 """Time over which displacements by both sensors are compared, s: over shorter times noise dominates."""

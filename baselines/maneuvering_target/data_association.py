@@ -5,6 +5,7 @@ Equations: ``filters/data_association.py``. Without clutter each equals the esti
 
 from ...envs.contract.filter import Likelihood
 from ...envs.contract.observation import Array
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...envs.maneuvering_target.semi_markov import SemiMarkov
 from ...envs.maneuvering_target.task import ManeuveringTarget
@@ -13,7 +14,7 @@ from ...filters import data_association, kalman
 from ...filters.data_association import Plots
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import AgedHypotheses
-from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, KalmanModel
+from .estimators import ConstantVelocity, KalmanInteractingMultipleModel
 
 
 class AllPlots(KalmanModel):

@@ -3,43 +3,17 @@
 They predict over the actual time between two scans; for a scan that missed the target they only predict.
 """
 
-import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from ...envs.contract.filter import EstimateState, Filter, FilterInput, Initial, Likelihood
+from ...envs.contract.filter import EstimateState, FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
-from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.unscented_turn import DEGREE, TurnModel
 from ...envs.maneuvering_target.world import Measurement
-from ...filters import coordinated_turn, imm, kalman, unscented
+from ...filters import coordinated_turn, imm, kalman
 from ...filters.ordered_sums import weighted_sum
-
-DEGREE = math.pi / 180.0
-
-
-class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
-    """Base of the estimators with the constant-velocity model."""
-
-    def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate."""
-        return self.first_track(initial)
-
-    def first_track(self, initial: Initial) -> EstimateState:
-        """Return the estimate before the first scan."""
-        return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
-
-    def mean(self, state: Any) -> Array:
-        """Return the position and velocity, without further states."""
-        return state.mean[:4]
-
-    def covariance(self, state: Any) -> Array:
-        """Return the covariance of position and velocity, without further states."""
-        return state.covariance[:4, :4]
-
-    def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
-        """Return the state after an update."""
-        return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))
 
 
 class ConstantVelocity(KalmanModel):
@@ -143,31 +117,6 @@ class KalmanInteractingMultipleModel(KalmanModel):
         return KalmanMixture(mean[:4], covariance[:4, :4], likelihood, means, covariances, probabilities)
 
 
-class TurnModel(ConstantVelocityModel):
-    """The nearly coordinated turn, with the turn rate as fifth state.
-
-    Args:
-        task: the problem.
-        acceleration: standard deviation of the acceleration along x and y, m/s^2.
-        turn_rate_change: standard deviation of the change of the turn rate from scan to scan, degrees/s.
-    """
-
-    def __init__(self, task: ManeuveringTarget, acceleration: float, turn_rate_change: float) -> None:
-        super().__init__(task)
-        self.variance: float = acceleration**2
-        self.change: float = DEGREE * turn_rate_change / task.parameters.sampling_interval
-        self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
-
-    def noise(self, T: Array) -> Array:
-        """Return the covariance of the process noise over intervals, s, ``(5, 5, N)``."""
-        Q = self.variance * self.motion(T)[1]
-        return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, (T * self.change) ** 2)[1]
-
-    def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-        """Apply the time update of the extended Kalman filter over intervals, s."""
-        return coordinated_turn.predict(mean, covariance, T, self.noise(T))
-
-
 class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
     """IMM over quiet and noisy constant velocity and an extended Kalman filter of the coordinated turn.
 
@@ -210,39 +159,3 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
             results.append(straight._replace(mean=mean5, covariance=covariance5))
         predicted = self.turn.predict_turn(mean[:, 2], covariance[:, :, 2], measurement.interval)
         return [*results, self.turn.update_estimate(predicted, measurement)]
-
-
-class UnscentedTurn(TurnModel, KalmanModel):
-    """Unscented Kalman filter of position, velocity and turn rate, always in a nearly coordinated turn.
-
-    The measurement is linear, so only the prediction takes the unscented transform; the update is Kalman's.
-
-    Args:
-        task: the problem.
-        acceleration: standard deviation of the acceleration along x and y, m/s^2.
-        turn_rate_change: standard deviation of the change of the turn rate from scan to scan, degrees/s.
-        turn_rate_start: standard deviation of the turn rate at the start of the track, degrees/s.
-    """
-
-    def __init__(
-        self,
-        task: ManeuveringTarget,
-        acceleration: float = 0.3,
-        turn_rate_change: float = 0.3,
-        turn_rate_start: float = 2.0,
-    ) -> None:
-        super().__init__(task, acceleration, turn_rate_change)
-        self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
-
-    def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate, with a turn rate of mean zero."""
-        return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
-
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Propagate the sigma points through the turn and update with the measured position."""
-        T = given.measurement.interval
-        mean, covariance = unscented.transform(
-            state.mean, state.covariance, lambda points: coordinated_turn.propagate(points, T)
-        )
-        predicted = mean, covariance + self.noise(T)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))

@@ -14,7 +14,9 @@ import numpy
 
 from ...envs.contract.filter import EstimateState, FilterInput, Initial
 from ...envs.data.recording import Recording
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.unscented_turn import UnscentedTurn
 from ...filters import kalman
 from ..table import Tunable, tunable, without_logarithms
 from .adaptive_estimators import SageHusaProcessNoise, VariationalBayes
@@ -22,9 +24,7 @@ from .anchored import DeadReckoning, regress_odometry
 from .estimators import (
     ConstantVelocity,
     KalmanInteractingMultipleModel,
-    KalmanModel,
     KalmanTurnInteractingMultipleModel,
-    UnscentedTurn,
 )
 
 

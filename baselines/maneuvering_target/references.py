@@ -5,11 +5,10 @@ from typing import NamedTuple
 from ...envs.contract.faults import GaussMarkov
 from ...envs.contract.filter import FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
-from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
+from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel, KalmanModel
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
 from ...filters import bounds, kalman
 from ...filters.small_matrices import apply
-from .estimators import KalmanModel
 
 DISTURBANCES = ("glint", "coloured", "bias", "clutter")
 """The reference is given all of them. The bound ignores them: each but false plots, which it never uses, adds

@@ -19,13 +19,13 @@ room_RadarEsmTracking := radar_esm_tracking
 room_LooselyCoupledNavigation := loosely_coupled_navigation
 room_TightlyCoupledNavigation := tightly_coupled_navigation
 
-agents_ManeuveringTarget := bptt bptt-small bptt-linear bptt-strongest ppo recurrent-ppo sac dqn kalman-net student
+agents_ManeuveringTarget := bptt bptt-small bptt-linear bptt-strongest ppo recurrent-ppo sac dqn kalman-net student ma-ukf rl-ukf
 agents_UavAutopilot := bptt bptt-small bptt-linear bptt-strongest ppo sac kalman-net
 agents_RadarEsmTracking := bptt bptt-small bptt-linear bptt-strongest ppo sac kalman-net
 agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear bptt-strongest ppo sac kalman-net
 agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear bptt-strongest kalman-net
 
-shipped_ManeuveringTarget := bptt bptt-small bptt-linear bptt-strongest ppo kalman-net student
+shipped_ManeuveringTarget := bptt bptt-small bptt-linear bptt-strongest ppo kalman-net student ma-ukf rl-ukf
 shipped_UavAutopilot := bptt bptt-small bptt-strongest ppo kalman-net
 shipped_RadarEsmTracking := bptt bptt-small bptt-linear bptt-strongest ppo kalman-net
 shipped_LooselyCoupledNavigation := bptt bptt-small bptt-linear bptt-strongest ppo kalman-net
