@@ -304,8 +304,8 @@ def _figures(result: Result) -> Iterator[Figure]:
         yield Figure(
             "front",
             "Cost and time",
-            "Cost against the competitor's processor time of a measurement. No other competitor has a lower error cost in "
-            "as much time as those on the front, the line; open: runs in Python.",
+            "Cost against the competitor's processor time of a measurement. No other competitor has a lower error cost "
+            "in as much time as those on the front, the line; open: runs in Python.",
             f"On the front, the quickest first: {', '.join(front(points))}.",
         )
     curves = set() if result.curves is None else {str(name) for name in result.curves}
