@@ -59,7 +59,7 @@ def price_words(price: Mapping[str, int] | None) -> str:
 
 
 def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any], Mapping[str, int] | None]:
-    """Return a function of a competitor's name and maker that gives the cost of an update in C, in words."""
+    """Return a function from a competitor's name and maker to the cost of an update in C: operations and bytes."""
     parameters = log_setup(problem, recording).parameters
 
     def price(name: str, maker: Any) -> Mapping[str, int] | None:
@@ -72,14 +72,14 @@ def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any]
 
 
 def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path, seed: int) -> None:
-    """Fit one filter to a whole recording, print its parameters, and write them.
+    """Fit one filter to a whole recording, print its parameters, and write them to a file.
 
     Args:
-        problem: of the recording.
-        name: of what can be fitted, or ``module:Class``.
+        problem: environment of the recording.
+        name: name of a filter that can be fitted, or ``module:Class``.
         found: the recording.
-        folder: for the file.
-        seed: of the starts of the fit.
+        folder: folder of the file.
+        seed: seed of the starts of the fit.
     """
     families = families_of(problem, found)
     if ":" not in name and name not in families:
@@ -225,7 +225,7 @@ def advise_on_log(
 
 
 def _advice_maker() -> Callable[..., str]:
-    """Return the function that makes the report of an advice; errors as of :func:`.result_output.report_maker`."""
+    """Return :func:`.advice_html`; raise ValueError if the packages of HTML reports are not installed."""
     report_maker()
     from ..reports.pages.advice_report import advice_html
 

@@ -130,7 +130,7 @@ def find_data(
     options: FileOptions,
     keywords: Mapping[str, Any],
 ) -> tuple[Problem, Any]:
-    """Return the problem and the data: the name of a scenario, flights, or a recording.
+    """Return the problem, and its data: the name of a scenario, flights, or a recording, read from the files.
 
     Raises:
         ValueError: if the environment is not named, or a file cannot be read.
@@ -176,7 +176,7 @@ def _no_flights(name: str | None) -> ValueError:
 
 
 def assumed_parameters(environment: str | None, names: Sequence[str]) -> dict[str, float]:
-    """Return the parameters for a log without standard deviations, from the first named file of an advised filter."""
+    """Return the noise levels by parameter that the first advised filter among ``names`` assumed for its log."""
     if environment is None:
         return {}
     advised = [name for name in names if name.endswith(SUFFIX)]
@@ -191,9 +191,9 @@ def find_participants(
 
     Args:
         problem: the environment with its competitors.
-        data: of :func:`find_data`. On a recording every shipped competitor runs that can, tuned and learned ones, too;
-            references and bounds need the truth.
-        policies: names that are given.
+        data: data from :func:`find_data`. On a recording all shipped competitors run except references and bounds,
+            which need the truth.
+        policies: names from the command line; empty or None: the default ones.
         trust: load models that can execute code.
     """
     known = problem.baselines
@@ -219,7 +219,7 @@ def causal_competitors(problem: Problem, recording: Recording, agents: bool = Tr
 
 
 def _has_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
-    """Return whether an agent was trained on the fields that a recording with these axes gives."""
+    """Return whether a recording supplies all observation fields on which an agent was trained."""
     stored = getattr(maker, "policy", maker)
     header, control = getattr(stored, "header", None), getattr(stored, "control", None)
     if header is None or control is None:
@@ -229,12 +229,12 @@ def _has_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
 
 
 def has_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
-    """Return whether estimates are stored to score their predictions: for recordings that are not huge.
+    """Return whether the competitors' predictions of a recording are scored; not for more than MOST_PREDICTIONS.
 
     Args:
-        problem: that is evaluated.
-        data: of :func:`find_data`.
-        names: of competitors.
+        problem: the environment with its competitors.
+        data: data from :func:`find_data`.
+        names: names of the competitors.
     """
     log_format = find_companion(problem.task, LogFormat)
     if not isinstance(data, Recording) or log_format is None or log_format.predict is None:
@@ -248,7 +248,7 @@ def tables_of(
     width: int,
     own: Sequence[str] = (),
 ) -> list[Table]:
-    """Return the tables in at most so many columns, widest first, with the rows of the user's competitors marked."""
+    """Return an evaluation's tables, at most ``width`` columns wide; rows of the user's competitors are marked."""
     tables = [flights_table(found.dataset, found.flights, found.records, width)] if found.flights else []
     if found.has_truth:
         paper = found.dataset.attrs["paper"]
@@ -262,13 +262,13 @@ def tables_of(
 
 
 def own_names(problem: Problem, policies: Sequence[str]) -> list[str]:
-    """Return the names that are not shipped: the user's own competitors."""
+    """Return those of the given names that are not shipped with the package: the user's own competitors."""
     shipped = shipped_names(problem)
     return [name for name in dict.fromkeys(policies) if name not in shipped]
 
 
 def _without_comparison(problem: Problem) -> str:
-    """Explain why costs are not compared where no reading of the paper's algorithm takes part."""
+    """Return the sentence that explains why costs are not compared where the paper's algorithm does not take part."""
     paper = problem.baselines.compared_paper
     if not paper:
         return "Costs are not compared: the environment names no paper's algorithm."
@@ -330,7 +330,7 @@ def run(
 
 
 def check_explained(wanted: Sequence[str], names: Sequence[str]) -> None:
-    """Raise ValueError if a name to explain is not evaluated."""
+    """Raise ValueError if a competitor whose cost is to be explained is not among the evaluated ones."""
     for name in wanted:
         if name not in names:
             raise nearest("competitor to explain", name, names)
@@ -416,7 +416,7 @@ def write(
 
 
 def missing_rows(records: Sequence[Any]) -> Iterator[str]:
-    """State in a sentence how many measurements a file of estimates lacks."""
+    """Yield a sentence for each competitor whose file of estimates lacks measurements, with their number."""
     for record in records:
         if record.metric == "missing" and record.value:
             yield (
@@ -428,10 +428,10 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
 def departure_lines(
     problem: Problem, data: Any, learned: Sequence[Competitor], keywords: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Return lines that state which deviations agents observe from a log, and how it departs from their training.
+    """Yield lines on the noise levels that agents observe of a log, and on how the log departs from their training.
 
     Args:
-        problem: whose agents they are.
+        problem: environment of the agents.
         data: scenario, flights or recording.
         learned: the agents.
         keywords: parameters of the task.
@@ -450,9 +450,7 @@ def departure_lines(
 
 
 def _size_warning(size: int, largest: int, asked: bool | None) -> str:
-    """Explain why a dataset of so many bytes, and so many in its largest variable, is not written as NetCDF; empty if
-    it is.
-    """
+    """Return why a dataset of ``size`` bytes is not written as NetCDF; empty if it is written."""
     if asked is False:
         return "--no-netcdf"
     if largest > MOST_BYTES:

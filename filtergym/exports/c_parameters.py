@@ -16,7 +16,7 @@ from .traced_filter import DERIVED, FreeParameters, Member
 
 
 def parameter_members(declared: Sequence[Declared]) -> list[Member]:
-    """Return the members of the struct, with the meaning, default and limits of each."""
+    """Return the members of the parameters' struct, with the meaning, default and limits of each."""
     found = []
     for one in declared:
         values = [f"{value:.6g}" for value in one.values]
@@ -41,7 +41,7 @@ def _limit_words(limits: ParameterLimits) -> list[tuple[str, float | None]]:
 
 
 def parameter_words(free: FreeParameters) -> str:
-    """Return the sentences about the struct."""
+    """Return the sentences about the parameters' struct, for the comment of the header."""
     text = (
         "Parameters, given at the start of a track. They have the names and limits of filtergym."
         if free.declared
@@ -63,8 +63,9 @@ def parameter_words(free: FreeParameters) -> str:
 def parameter_text(
     own: str, free: FreeParameters, scalar: Scalar, struct: Structure
 ) -> tuple[str, list[str]]:
-    """Return tables and functions of the parameters, and the first statements of start, which reject values outside the
-    limits and derive ``own``.
+    """Return the C tables and functions of the parameters, and the first statements of ``start``.
+
+    The statements reject values outside the limits, and compute the numbers ``own`` that the filter derives.
 
     Args:
         own: name of the filter.
@@ -132,9 +133,7 @@ def parameter_text(
 
 
 def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
-    """Return the program with equally deep equal operations as one array operation: derivation in Python is number by
-    number, but loops run over array operations.
-    """
+    """Return a program with equal operations at equal depth joined into array operations, which C writes as loops."""
     depths: list[int] = []
     groups: dict[tuple[int, str], int] = {}
     own = []
@@ -145,14 +144,12 @@ def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
 
 
 def _stated(free: FreeParameters, scalar: Scalar) -> range:
-    """Return the rows that are stored where no parameter is chosen; of float all, which the filter converts from
-    double.
-    """
+    """Return the rows of derived numbers that the C text stores for the default parameters."""
     return free.stated if scalar is DOUBLE else range(len(free.usual))
 
 
 def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused: str) -> list[str]:
-    """Return the statements that reject pairs that do not ascend, and rows of probabilities that do not sum to one."""
+    """Return the C statements that reject pairs that do not ascend, and probabilities that do not sum to one."""
     checks, row = [], 0
     for one in free.declared:
         rows = [f"parameters->{struct.places[row + i]}" for i in range(len(one.values))]

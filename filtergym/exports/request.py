@@ -57,7 +57,7 @@ def request_export(
 
 
 def _own_name(problem: Problem, name: str | Path) -> str:
-    """Return the name of a competitor; of a file its stem, without the name of the environment."""
+    """Return the name of an exported competitor; for a file its stem without the environment's name."""
     text = str(name)
     for ending in file_endings():
         if text.endswith(ending):
