@@ -114,8 +114,8 @@ def requests_of(
 
     Args:
         problem: problem of the competitors.
-        experiment: as :meth:`.baselines.problem.Problem.experiment` makes it.
-        competitors: those that take part.
+        experiment: experiment from :meth:`.baselines.problem.Problem.experiment`.
+        competitors: competitors that take part.
         curves: whether figures will be drawn.
     """
     paper = problem.paper_among({one.name: one.maker for one in competitors})
@@ -176,11 +176,11 @@ def make_policy(
 
 
 def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bool = False) -> SteppingPolicy:
-    """Make a policy for the environment of an experiment, and that environment's model.
+    """Return a policy that acts in the environment of an experiment; its model is that environment's.
 
     Args:
         problem: problem of the policy.
-        policy: name, path, object or class; errors are those of :func:`make_policy`.
+        policy: name, path, object or class; errors as of :func:`make_policy`.
         experiment: experiment that gives the environment its control, scenario and parameters.
         trust: whether to load a model's zip, which can execute code.
     """
@@ -192,7 +192,7 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
 
 
 def _named_policy(problem: Problem, policy: Any, trust: bool) -> tuple[str, Any]:
-    """Return the name of a policy in errors, and its maker.
+    """Return the name of a policy for error messages, and its maker.
 
     Raises:
         ValueError: for a competitor that does not act.
@@ -216,7 +216,7 @@ def _stepping(
 
 
 def _model_of(env: Any) -> Any:
-    """Return the model of an environment.
+    """Return the model inside a Gymnasium environment of this package.
 
     Raises:
         ValueError: if the environment is none of filtergym, or computes in torch.

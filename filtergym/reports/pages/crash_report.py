@@ -30,7 +30,7 @@ def count_verdicts(findings: Sequence[Finding]) -> str:
 
 
 def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
-    """Return the table of one competitor, a line for each alteration that applies.
+    """Return the crash test's table of one competitor, a line for each alteration of the measurements.
 
     Args:
         findings: findings of the competitor, in the order of the catalogue.

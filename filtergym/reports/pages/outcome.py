@@ -13,7 +13,7 @@ from ..tables.results import Result
 from ..tables.terminal_tables import HEADLINE, consistency_word
 
 HALF = (0.45, 0.55)
-"""Range of the cost ratio that is called half."""
+"""Range of the cost ratio that sentences call "half"."""
 
 
 def outcome_sentences(results: Sequence[Result]) -> list[str]:
@@ -30,8 +30,7 @@ def outcome_sentences(results: Sequence[Result]) -> list[str]:
 
 
 def own_sentences(records: Sequence[Record], own: Sequence[str], paper: str) -> list[str]:
-    """Return a sentence for each of the user's competitors on its cost against the paper's algorithm and the best of
-    the others, and on its consistency.
+    """Return a sentence for each of the user's competitors: cost against the paper's algorithm and the best, ANEES.
 
     Args:
         records: records of one environment and scenario with a truth.
@@ -65,9 +64,7 @@ def _own_sentence(records: Sequence[Record], name: str, paper: str) -> str:
 
 
 def _comparison(difference: Record, other: str, first: bool) -> str:
-    """Return how far a cost is above or below another's, where the interval of their paired ratio excludes one; the
-    first comparison of a sentence names the quantity.
-    """
+    """Return a clause on a paired cost difference: ``level with NAME``, or ``3.1 % less than NAME``."""
     value = difference.value or 0.0
     if _low(difference) <= 0.0 <= _high(difference):
         return f"level with {other}"
@@ -78,7 +75,7 @@ def _comparison(difference: Record, other: str, first: bool) -> str:
 
 
 def protocol_sentences(results: Sequence[Result]) -> list[str]:
-    """Return sentences on the basis of the outcome sentences and of the table below them.
+    """Return sentences on episodes, split, seed and statistics of the comparison; empty without records.
 
     Args:
         results: results as in :func:`outcome_sentences`.
@@ -102,7 +99,7 @@ def _any_default(results: Sequence[Result]) -> bool:
 
 
 def sentence_of(result: Result) -> str:
-    """Return the sentence on one environment and scenario with at least one ranked competitor."""
+    """Return the outcome sentence on one environment and scenario with at least one ranked competitor."""
     places = ranking(result.records)
     first = _best_clause(result, places[0])
     rival = rival_of(places, result.learned)
@@ -219,7 +216,7 @@ def _high(record: Record) -> float:
 
 
 def _percent(share: float) -> str:
-    """Return the percentage in two digits, or in three near 100."""
+    """Return a share as a percentage in two digits, or in three near 100."""
     percent = 100.0 * share
     digits = 1 if abs(percent) < 9.95 or 99.0 <= percent < 100.0 else 0
     return f"{percent:,.{digits}f}"

@@ -1,4 +1,4 @@
-"""An advice in words and as a table: the filter, its parameters, and the reasons."""
+"""Tables and sentences of an advice: the recommended filter, its parameters, and the reasons."""
 
 import math
 import textwrap
@@ -50,7 +50,7 @@ FEWEST_MEASUREMENTS = 30
 
 
 def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
-    """Compare the advised filter with the other fitted ones, its rival, the best in hindsight and the next ones.
+    """Return a table of the advised filter, the other fitted ones, its rival and the next best filters.
 
     Args:
         advice: advice from :func:`~..baselines.advice.advise`.
@@ -90,21 +90,19 @@ class Row(NamedTuple):
 
 
 def advice_columns(advice: Advice) -> dict[str, int]:
-    """Return the columns of the table of an advice, and their least widths."""
+    """Return the least width of each column of an advice's table, by its title."""
     return {**COLUMNS, **({} if advice.onboard is None else WITHHELD)}
 
 
 def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
-    """Return the rows of the table: the advised filter first, the vehicle's own last; arguments as of
-    :func:`advice_table`.
-    """
+    """Yield the rows of :func:`advice_table`: the advised filter first, the vehicle's own filter last."""
     errors = None if advice.onboard is None else advice.onboard.errors
     has_truth = advice.recording.truth is not None
     known = advice.rival, advice.best_shipped
     keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
     room = MOST_ROWS - len(keep)
     rest: list[JudgedFilter] = []
-    for each in advice.competitors:  # a filter that answers as another does in this log needs no row
+    for each in advice.competitors:  # a filter whose results on this log equal another's needs no row
         if each not in keep and not any(_has_same_results(each, other) for other in [*keep, *rest]):
             rest.append(each)
     agents = [c for c in rest if c.name in learned]
@@ -125,9 +123,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
 
 
 def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the cost of an update of each filter of :func:`advice_table`, in the order of ``PRICES``; empty where none
-    is known.
-    """
+    """Return name and cost of an update of each filter of :func:`advice_table`; empty if none is known."""
     names = [row.name for row in advice_rows(advice, learned) if row.name != ONBOARD]
     prices = {name: advice.prices[name] for name in names}
     cells = {
@@ -138,7 +134,7 @@ def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[
 
 
 def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
-    """Return a table of :func:`price_rows`; None where there are none."""
+    """Return a table of the cost of an update of each filter of an advice; None if none is known."""
     rows = price_rows(advice, learned)
     if not rows:
         return None
@@ -158,7 +154,7 @@ def _has_same_results(one: JudgedFilter, other: JudgedFilter) -> bool:
 
 
 def reading_lines(recording: Recording) -> Iterator[str]:
-    """Return sentences on the log before a fit: its size, the errors of its measurements, and notes."""
+    """Yield sentences on a log as it was read: size, deviations of its measurements, and notes."""
     seconds = recording.seconds
     steps = numpy.diff(seconds, axis=1)
     missed = ""
@@ -187,7 +183,7 @@ def reading_lines(recording: Recording) -> Iterator[str]:
 
 
 def _extent(recording: Recording) -> Iterator[str]:
-    """Return the span and the speed of the positions, which show a wrong unit to a reader who knows the target."""
+    """Yield a sentence on the span and speeds of a log's positions, by which a user finds a wrong unit."""
     position = recording.measurements.get("position")
     if position is None:
         return
@@ -206,7 +202,7 @@ def _extent(recording: Recording) -> Iterator[str]:
 
 
 def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
-    """Return the results of the advised filter on the judged measurements; None where unknown."""
+    """Return the advised filter's results on the measurements withheld for judgement, by name; None: unknown."""
     one = advice.advised
     numbers = {
         "measurements": float(sum(span.last - span.first for span in advice.share.judged)),
@@ -244,7 +240,7 @@ def _interval(estimate: IntervalEstimate, form: str) -> str:
 
 
 def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Return lines on the advised filter, its parameters, their certainty, and unknown quantities.
+    """Yield lines on the advised filter, its parameters, their certainty, and unknown quantities.
 
     Args:
         advice: advice from :func:`~..baselines.advice.advise`.
@@ -260,9 +256,7 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
 
 
 def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Return sentences on the certainty of the advice and on unknown quantities; arguments as of
-    :func:`advice_lines`.
-    """
+    """Yield the sentences of :func:`advice_lines` after the parameters: certainty, and unknown quantities."""
     yield from _onboard(advice)
     yield from _hindsight(advice)
     yield from _fits(advice)
@@ -276,7 +270,7 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
 
 
 def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
-    """Return the fitted parameters in lines, with units and intervals.
+    """Yield a line for each fitted parameter, with unit and interval.
 
     Args:
         tunable: the fitted filter.
@@ -290,7 +284,7 @@ def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interv
 
 
 def verdict(advice: Advice) -> str:
-    """Return the first sentence."""
+    """Return the first sentence of an advice: the advised filter, and its error against its rival's."""
     one, rival = advice.fitted, advice.rival
     judged = sum(span.last - span.first for span in advice.share.judged)
     where = (
@@ -334,13 +328,13 @@ def verdict(advice: Advice) -> str:
 
 
 def _operations(advice: Advice, name: str, other: str) -> str:
-    """Return the operations of an update of a filter beside another's; empty where one of them is unknown."""
+    """Return a clause that compares the operations of an update of two filters; empty if one is unknown."""
     one, two = (advice.prices.operations(each) for each in (name, other))
     return f"takes {one:,.0f} operations an update for {two:,.0f}" if max(one, two) < math.inf else ""
 
 
 def _amount(advice: Advice, relative: IntervalEstimate) -> str:
-    """Return how much less or more error, with its interval."""
+    """Return a relative error as text: ``3.1 % less error [1.0, 5.2]``."""
     value, low, high = _percent(relative)
     kind = "error" if advice.recording.truth is not None else "error of prediction"
     less = value <= 0.0
@@ -352,9 +346,7 @@ def _amount(advice: Advice, relative: IntervalEstimate) -> str:
 
 
 def _hindsight(advice: Advice) -> Iterator[str]:
-    """Return a sentence on the shipped filter that was best on the judged measurements, which is known in hindsight
-    only.
-    """
+    """Yield a sentence on the shipped filter with the smallest error on the measurements withheld for judgement."""
     best, relative = advice.best_shipped, advice.hindsight
     if best in (advice.advised.name, advice.rival) or not abs(relative.value) >= NEGLIGIBLE:
         return
@@ -366,7 +358,7 @@ def _hindsight(advice: Advice) -> Iterator[str]:
 
 
 def _onboard(advice: Advice) -> Iterator[str]:
-    """Return sentences on the vehicle's own filter, and on the bias in its favour."""
+    """Yield a sentence on the errors of the vehicle's own filter, and on the bias in its favour."""
     found = advice.onboard
     if found is None:
         return
@@ -381,12 +373,12 @@ def _onboard(advice: Advice) -> Iterator[str]:
 
 
 def parameter_name(key: str) -> str:
-    """Return a parameter's name in words, from its name in the search."""
+    """Return a parameter's name in words, from its name in the search, such as ``log10_process_noise``."""
     return key.removeprefix("log10_").replace("_", " ")
 
 
 def parameter_size(key: str, value: float) -> float:
-    """Return a parameter's value, from its value in the search."""
+    """Return a parameter's value, from its value in the search, which may be a decimal logarithm."""
     return float(10.0**value) if key.startswith("log10_") else float(value)
 
 
@@ -403,7 +395,7 @@ class ParameterText(NamedTuple):
 def parameter_text(
     key: str, value: float, interval: Interval | None, tunable: Tunable, is_at_limit: bool
 ) -> ParameterText:
-    """Return a fitted parameter in words with its interval, and whether it is identifiable.
+    """Return a fitted parameter as texts: value, interval, unit, and a remark if it is not identifiable.
 
     Args:
         key: name in the search.
@@ -454,7 +446,7 @@ def _fits(advice: Advice) -> Iterator[str]:
 
 
 def _dearer(advice: Advice) -> Iterator[str]:
-    """Return the gain of the likeliest filter, where a cheaper one is as good."""
+    """Yield a sentence on the filter of the highest likelihood, where a cheaper one is advised."""
     if advice.likeliest is None or math.isnan(advice.likeliest[1].value):
         return
     name, gain = advice.likeliest
@@ -466,7 +458,7 @@ def _dearer(advice: Advice) -> Iterator[str]:
 
 
 def _outliers(advice: Advice) -> Iterator[str]:
-    """Return a sentence on the measurements classified as outliers, by row and time."""
+    """Yield a sentence on the measurements classified as outliers, by row and time."""
     found, recording = advice.outliers, advice.recording
     count = int(found.sum())
     if OUTLIER_SHARE not in advice.fits[advice.fitted.name].values:
@@ -490,7 +482,7 @@ def _outliers(advice: Advice) -> Iterator[str]:
 
 
 def _noise(advice: Advice) -> Iterator[str]:
-    """Return the meaning of the fitted scale of the noise, and its limits."""
+    """Yield sentences on the meaning of the fitted scale of the measurement noise."""
     one = advice.fitted
     if NOISE_SCALE in advice.fits[one.name].values:
         scale = 10.0 ** advice.fits[one.name].values[NOISE_SCALE]
@@ -516,7 +508,7 @@ def _noise(advice: Advice) -> Iterator[str]:
 
 
 def _anchor(advice: Advice) -> Iterator[str]:
-    """Return the reason for or against a filter with a second sensor, and the meaning of its likelihood."""
+    """Yield a sentence on the reason for or against a filter that uses a second sensor."""
     anchor = advice.anchor
     if anchor is None:
         return
@@ -562,7 +554,7 @@ def _warnings(advice: Advice) -> Iterator[str]:
 
 
 def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Return a sentence on the learned agents, which were trained on other data."""
+    """Yield a sentence on the learned agents, which were trained on other data."""
     found: list[JudgedFilter] = [
         c for c in advice.competitors if c.name in learned and not math.isnan(c.relative_error.value)
     ]

@@ -67,7 +67,7 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Beginning of the names of the cell's files."""
+        """Beginning of the cell's file names."""
         return f"{self.problem.short_name}.{self.scenario}"
 
     @property
@@ -81,10 +81,10 @@ def _horizon(cls: Any, scenario: str) -> int:
 
 
 def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[str, ...]:
-    """Return the names of a cell's competitors, the paper's algorithm first.
+    """Return the names of the competitors of a benchmark in one environment, the paper's algorithm first.
 
-    Quick: the most informative ones, tuned where that has won and episodes are not long; other tuned ones; shipped
-    agents. Full: every policy and estimator as it is, tuned ones, shipped agents, smoothers, references, bounds.
+    Quick: the most informative ones, tuned where tuning lowers the cost and episodes are not long, and shipped agents.
+    Full: every policy and estimator, untuned and tuned, shipped agents, smoothers, references, bounds.
 
     Args:
         problem: problem of the competitors.
@@ -104,8 +104,7 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
 
 
 def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
-    """Return the number of episodes that a competitor runs in some seconds: 2000, or 400 where a measurement takes
-    long.
+    """Return the largest number of episodes, at most ``most``, that a competitor runs in about a minute.
 
     Args:
         problem: problem of the competitor.
@@ -119,7 +118,7 @@ def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
 def without_smoothers_of_closed_loops(
     problem: Problem, names: Sequence[str], scenario: Any
 ) -> tuple[str, ...]:
-    """Return the names of competitors that can run in a scenario: in a closed loop there is no smoothing."""
+    """Return the names of competitors without the smoothers, if the scenario is a closed loop."""
     smoothers = {*names} & {*problem.baselines.smoothers}
     if not smoothers or not make_task(problem.task, scenario).closes_loop:
         return tuple(names)
@@ -127,9 +126,9 @@ def without_smoothers_of_closed_loops(
 
 
 def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> list[Cell]:
-    """Return the cells: quick, the default scenario, on which the verdict rests; full, all of them and more episodes.
+    """Return the cells (environment and scenario) of a benchmark: quick, the default scenario; full, all of them.
 
-    Held-out scenarios are for final tables: on another split than "test" only training scenarios run.
+    On another split than "test" only training scenarios run.
     """
     wanted = []
     for id in environments or catalogue():
@@ -160,7 +159,7 @@ def result_of(
     worst: Mapping[str, Sequence[WorstTrack]] | None = None,
     own: Sequence[str] = (),
 ) -> Result:
-    """Convert an evaluation into the content of a file of results.
+    """Return an evaluation as a :class:`Result`, the content of a file of results.
 
     Args:
         problem: the evaluated problem.
@@ -202,7 +201,7 @@ def result_of(
 
 
 class BenchmarkOptions(NamedTuple):
-    """Content and execution of a benchmark."""
+    """Options of a benchmark: scenarios, competitors, episodes and execution."""
 
     full: bool = False
     """All scenarios and policies, and more episodes."""
@@ -226,7 +225,7 @@ class BenchmarkOptions(NamedTuple):
     """Whether to measure the processor time of every competitor, which differs from run to run."""
 
     def requests(self, cell: Cell) -> list[EvaluationRequest]:
-        """Return the requests of a cell."""
+        """Return the evaluation requests of a cell, one for each competitor."""
         experiment = cell.problem.experiment(
             cell.scenario,
             cell.episodes,
@@ -266,7 +265,7 @@ class _Results:
         self._reported = 0
 
     def add(self, i: int, name: str, summary: Summary) -> None:
-        """Add the summary of a competitor of a cell, and report all results that are due."""
+        """Add the summary of a competitor to cell ``i``; pass results of complete cells to the callbacks, in order."""
         cell, found = self.wanted[i], self._summaries[i]
         found[name] = summary
         if len(found) == len(cell.policies):
@@ -278,7 +277,7 @@ class _Results:
             self._reported += 1
 
     def all(self) -> list[Result]:
-        """Return the results, in the order of the cells."""
+        """Return the results of all complete cells, in their order."""
         return [result for result in self._results if result is not None]
 
 
@@ -288,7 +287,7 @@ def run_benchmark(
     callbacks: Callbacks | None = None,
     workers: Workers | None = None,
 ) -> list[Result]:
-    """Run every cell; after an interruption continue with the missing competitors.
+    """Run a benchmark, write ``results.json``, and return the results; resume after an interruption.
 
     Args:
         folder: folder of ``results.json``; finished competitors are in ``unfinished/`` until all are done.

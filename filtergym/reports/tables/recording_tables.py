@@ -27,7 +27,7 @@ def recording_tables(
     width: int,
     own: Collection[str] = (),
 ) -> list[Table]:
-    """Compare competitors by their predictions of each measurement.
+    """Return tables that compare competitors by their predictions of a recording's measurements.
 
     Args:
         records: tidy records of one recording.
@@ -71,7 +71,7 @@ Column = Callable[[str], str]
 
 
 def _beside(draw: Callable[..., Table], parts: Sequence[Mapping[str, Column]], width: int) -> list[Table]:
-    """Return tables of groups of columns, with as many groups side by side as fit, the rest below."""
+    """Return tables of groups of columns: as many groups side by side as fit into ``width``, the rest below."""
     for count in range(len(parts), 0, -1):
         columns = {title: column for part in parts[:count] for title, column in part.items()}
         looks = [draw(columns, control) for control in (True, False)]

@@ -90,7 +90,7 @@ class Result(NamedTuple):
     learned: list[str]
     """Names of the competitors that were learned."""
     knows: dict[str, str]
-    """Knowledge of references and bounds, by their names."""
+    """What each reference and bound knows of the truth, by its name."""
     notes: list[str]
     """Notes on omissions, in sentences."""
     records: list[Record]
@@ -99,7 +99,7 @@ class Result(NamedTuple):
     track: xarray.Dataset | None
     """Track of one episode, see :func:`track_of`."""
     causes: dict[str, str] = {}  # noqa: RUF012  (never written to)
-    """When each cause of the records holds, by name."""
+    """Condition of each cause in words, by its name."""
     explained: list[str] = []  # noqa: RUF012
     """Names of the competitors whose cost is explained."""
     worst: list[WorstTrack] = []  # noqa: RUF012
@@ -114,14 +114,14 @@ class Result(NamedTuple):
 
 
 def settings_of(command: str) -> Settings:
-    """Return a command with the versions of the running libraries."""
+    """Return the settings of a result: its command, and the versions of the installed libraries."""
     return Settings(command, {"Python": python_version(), **library_versions(LIBRARIES)})
 
 
 def select_competitors(
     records: Sequence[Record], paper: str, reference: str, learned: Sequence[str], own: Sequence[str] = ()
 ) -> list[str]:
-    """Return at most ``MOST_SHOWN`` names of the most informative curves.
+    """Return the names of the competitors whose curves a file of results contains, at most ``MOST_SHOWN``.
 
     The paper's algorithm, the reference, the user's own, the learned, the cheapest of each kind, a bound; then by cost.
     """
@@ -141,7 +141,7 @@ def select_competitors(
 
 
 def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
-    """Return curves at fewer times, and every other share of the errors."""
+    """Return curves at most at ``MOST_TIMES`` times, and error distributions at every other share."""
     fewer = curves.isel(time=spread(curves.sizes["time"], MOST_TIMES))
     return fewer.isel(share=slice(None, None, 2)) if "share" in fewer.dims else fewer
 
@@ -206,7 +206,7 @@ def track_of(
 def components_to_draw(
     groups: Mapping[str, Sequence[str]], components: Sequence[str]
 ) -> tuple[list[str], bool]:
-    """Return the components of a drawn track: two of a group that has several, as a plane; else the first three."""
+    """Return the names of the components to draw of a track, and whether the first two span a plane."""
     for parts in groups.values():
         if len(parts) > 1:
             return list(parts[:2]), True
@@ -239,7 +239,7 @@ def serialise_track(track: xarray.Dataset | None) -> dict[str, Any] | None:
 
 
 def serialise_datasets(result: Result) -> dict[str, Any]:
-    """Return the curves and track in JSON's types."""
+    """Return a result's curves and track in JSON's types."""
     return {
         "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
         "track": serialise_track(result.track),

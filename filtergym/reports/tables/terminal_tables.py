@@ -27,7 +27,7 @@ OWN_ROW = ">"
 
 
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
-    """Return the value and interval in significant digits: ``67.0 [66.6, 67.4]``.
+    """Return a record's value and interval as text in significant digits: ``67.0 [66.6, 67.4]``.
 
     Args:
         record: record with ``value``, ``low`` and ``high``; or None.
@@ -54,9 +54,7 @@ HEADLINE = "geometric_cost_difference"
 
 
 def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
-    """Return the share of lost tracks with its interval, %, and the difference of the mean cost to the paper's
-    algorithm, %.
-    """
+    """Return two cells: share of lost tracks with interval, %, and difference of mean cost to the paper's, %."""
     lost, means = (
         found.get((*scenario, name, metric, "", "all"))
         for metric in ("lost_tracks", "relative_cost_difference")
@@ -70,13 +68,14 @@ def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
 
 
 def consistency_word(record: Any) -> str:
-    """Return the meaning of a mean NEES over its dimension: an estimator is consistent where its interval contains one.
+    """Return a word on a record of ANEES: "consistent" if its interval contains one, else "overconfident" or
+    "cautious".
 
     Args:
         record: record with ``value``, ``low`` and ``high``; or None.
 
     Returns:
-        One or two words; by less than a factor of two an inconsistent one is "slightly" overconfident or cautious.
+        One or two words; "slightly" marks an inconsistency of less than a factor of two.
     """
     if record is None or record.value is None:
         return "unknown"
@@ -89,26 +88,24 @@ def consistency_word(record: Any) -> str:
 
 
 def is_far_off(value: float) -> bool:
-    """Return whether a mean NEES over its dimension is off by more than a factor of two."""
+    """Return whether an ANEES (mean NEES over its dimension) is outside 0.5 to 2."""
     return not 0.5 <= value <= 2.0
 
 
 def consistency(record: Any) -> str:
-    """Return the mean NEES over the dimension, marked where it is off by more than a factor of two."""
+    """Return the ANEES of a record as text, marked where it is outside 0.5 to 2."""
     if record is None or record.value is None:
         return "-"
     return f"{record.value:.3g}" + (f" {INCONSISTENT}" if is_far_off(record.value) else "")
 
 
 def score_text(record: Any) -> str:
-    """Return the score with its interval; empty where the reference is not significantly better than the paper's
-    algorithm.
-    """
+    """Return a record of the score as text with its interval; "-" where it has no value."""
     return with_interval(record, negligible=1e-9)
 
 
 def main_components(records: Sequence[Any]) -> list[str]:
-    """Return the components of a table: groups such as "position" where there are any, else the first three."""
+    """Return the names of the components in a table: groups such as "position" if any, else the first three."""
     first = records[0]
     names = [
         r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
@@ -117,7 +114,7 @@ def main_components(records: Sequence[Any]) -> list[str]:
 
 
 def select_components(names: Sequence[str]) -> list[str]:
-    """Return the groups among components and groups where there are any, else the first three."""
+    """Return those names that are groups of components, such as "position"; without any, the first three names."""
     # One namesake is no group: "range" is not made of "range_rate".
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
@@ -147,11 +144,11 @@ def results_tables(
     paper: str = "",
     own: Collection[str] = (),
 ) -> list[Table]:
-    """Compare competitors, lowest cost first: cost against the paper's algorithm, consistency, score, and errors.
+    """Return tables of all competitors, lowest cost first: cost against the paper's, consistency, score, errors.
 
     Args:
         records: tidy records of one environment and scenario.
-        knows: knowledge of references and bounds, by their names.
+        knows: what each reference and bound knows of the truth, by its name.
         width: columns of the terminal; errors that do not fit stand below in tables of their own, so that no number
             is cut.
         paper: name of the paper's algorithm, with which costs are compared.
@@ -199,7 +196,7 @@ RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
 def _cost_columns(
     records: Sequence[Any], found: Mapping[Any, Any], paper: str
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the columns on cost, consistency and time, and the sentences that explain them."""
+    """Return the columns on cost, consistency and time by title, and the notes that explain them."""
     columns: dict[str, Callable[[str], str]] = {
         cost_title(paper): lambda name: with_interval(
             found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
@@ -335,7 +332,7 @@ SHOWN_OF_FLIGHTS = 8
 def flights_table(
     dataset: Any, records: Sequence[Any], over_all: Sequence[Any], width: int = 10_000
 ) -> Table:
-    """Compare competitors flight by flight: error of the paper's algorithm, and what the others cost against it.
+    """Return a table with a row for each flight: RMSE of the paper's algorithm, and others' cost against it.
 
     Args:
         dataset: dataset of an evaluation of flights.
@@ -348,7 +345,7 @@ def flights_table(
 
 
 def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int) -> Table:
-    """Return the table with a limited number of competitors beside the one of the comparison."""
+    """Return the table of flights with at most ``most`` competitors beside the paper's algorithm."""
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
     names = [name for name, kind, _ in rank_competitors(over_all) if kind in RANKED]
     shown, paper = main_components(over_all), dataset.attrs["paper"]
@@ -400,7 +397,7 @@ def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most
 
 
 def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
-    """Return the values that a search has found beside those from which it started."""
+    """Return a table of the tuned values beside the values from which the search started."""
     table = plain_table(f"{outcome.policy} on {outcome.scenario}")
     table.add_column("value")
     for title in ("untuned", "tuned"):
