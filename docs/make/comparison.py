@@ -230,7 +230,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             lambda scenario, name: consistency(found.get((scenario, name, "anees", "state"))),
         ),
         grid(
-            f"Nanoseconds a measurement on one core, with the simulated world; {PYTHON_MARK}: asked in Python; "
+            f"Nanoseconds a measurement on one core, with the simulated world; {PYTHON_MARK}: in Python, not compiled; "
             f"{FRONT_MARK}: on the front, where no other competitor has a lower error cost in as much time",
             columns,
             lambda scenario, name: times[scenario].get(name, "-"),

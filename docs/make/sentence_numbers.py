@@ -73,7 +73,7 @@ def _of_benchmark(data: Any, path: str, interval: bool) -> str:
             [(value, compiled)] = [
                 (m[0], k.endswith("compiled")) for k, m in metrics.items() if k.startswith("nanos")
             ]
-            return f"{time_text(ProcessorTime(value, True))} ns" + ("" if compiled else ", asked in Python")
+            return f"{time_text(ProcessorTime(value, True))} ns" + ("" if compiled else ", in Python")
         key, scale, unit = QUANTITIES.get(quantity, (quantity, 1.0, data["units"].get(quantity, "")))
         # The difference to the best one names it.
         [found] = [values for own, values in metrics.items() if own == key or own.startswith(f"{key} ")]

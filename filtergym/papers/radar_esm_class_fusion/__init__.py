@@ -22,7 +22,10 @@ STEPS = experiment.STEPS
 def reproduce(
     progress: Progress, episodes: int | None = None, workers: Workers | None = None
 ) -> Reproduction:
-    """Run the paper's experiment and judge its claims; 100 episodes at least, so that every class has some."""
+    """Run the paper's experiment, judge its claims, and return claims, tables and figures.
+
+    There are at least 100 episodes, so that every class has some.
+    """
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES, least=100), workers)
     shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))

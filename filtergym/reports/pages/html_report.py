@@ -301,7 +301,8 @@ def _figures(result: Result) -> Iterator[Figure]:
             "front",
             "Cost and time",
             "Cost against the processor time of a measurement, of simulated world and competitor together. No other "
-            "competitor has a lower error cost in as much time as those on the front, the line; open: not compiled.",
+            "competitor has a lower error cost in as much time as those on the front, the line; open: not "
+            "compiled.",
             f"On the front, the quickest first: {', '.join(front(points))}.",
         )
     curves = set() if result.curves is None else {str(name) for name in result.curves}
