@@ -1,7 +1,7 @@
 """Catalogue of the baselines of the environments.
 
-Every folder beside this file contains those of the environment whose folder has the same name, and exports them as
-``BASELINES``; a user's environment may register its own.
+Every folder beside this file contains the baselines of the environment whose folder has the same name, and exports them
+as ``BASELINES``; a user's environment may register its own.
 """
 
 import importlib
@@ -40,7 +40,7 @@ def baselines_of(id: str) -> Baselines:
 
 @cache
 def _declared_baselines(task: type[Task]) -> Baselines:
-    """Return the baselines that the class of a task declares; an action that is no vector is no constant policy."""
+    """Return the baselines of a task that registered none: the paper's algorithm that it declares, random actions."""
     if not isinstance(task.paper_policy.action, tuple):
         return Baselines(task.id, {"random": RandomPolicy})
     paper = type("DeclaredPaper", (PaperAction,), {"control": task.paper_policy.control})

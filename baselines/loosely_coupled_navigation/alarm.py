@@ -26,7 +26,7 @@ class FusionAlarm(Alarm):
         self.axes: int = self.task.parameters.axes
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of the innovations of each axis."""
+        """Return the log-likelihood ratios of faulty innovations of each axis, ``(N, kinds)``."""
         innovation, available = self.innovation(observation)[:, -self.axes :], self.available(observation)
         # The observation contains the mean over a decision's measurements of the compressed value.
         measurements = self.measurements(before)

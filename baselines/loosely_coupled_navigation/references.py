@@ -62,7 +62,7 @@ class _Matched:
         self.eye: Array = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial, truth: Truth) -> ErrorState:
-        """Start where INS and reference agree, with the true prior of the rate errors and of the receiver's."""
+        """Return the state at the start of the track: zero INS error, with the true prior of all other errors."""
         xp, still, zero = self.xp, 0.0 * initial.mean, 0.0 * truth.number
         drift, coloured = truth.drift_deviation, truth.coloured_step / self.sampling.coloured
         P = ins_gnss.AugmentedCovariance(zero, zero, zero, drift * drift, zero, coloured * coloured)
@@ -77,7 +77,7 @@ class _Matched:
     def predict_and_update(
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[ErrorState, Likelihood]:
-        """Predict with the true noise levels, and update by the fix less its pull with the true variance."""
+        """Predict with the true noise levels, update with the fix less its spoofing; return state and likelihood."""
         xp, s = self.xp, self.sampling
         delta = memory.delta + s.step * memory.drift + s.drive * memory.coloured
         coloured = s.decay * memory.coloured
@@ -121,7 +121,7 @@ class Matched(_Matched):
     def update(
         self, memory: ErrorState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, ErrorState, Likelihood]:
-        """Report the INS less its estimated error."""
+        """Return mean and covariance of the position (INS less its estimated error), memory, and likelihood."""
         memory, likelihood = self.predict_and_update(measurement, truth, memory)
         return measurement.ins - memory.delta, self.eye * memory.covariance.ins.position, memory, likelihood
 
@@ -132,6 +132,6 @@ class MatchedCovariance(_Matched):
     kind = "bound"
 
     def update(self, memory: ErrorState, measurement: Measurement, truth: Truth) -> tuple[Array, ErrorState]:
-        """Return the variance of the error of every axis, m^2, ``(A, N)``."""
+        """Return the variance of the error of every axis, m^2, ``(A, N)``, and the memory."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

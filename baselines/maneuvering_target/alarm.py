@@ -32,7 +32,7 @@ class RadarAlarm(Alarm):
         self.elapsed: Reader | None = model.reader("elapsed") if self.fixed_gains else None
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of the scans."""
+        """Return the log-likelihood ratios of a manoeuvre, faulty innovations and missed scans, ``(N, kinds)``."""
         there = self.available(observation) > 0.0
         innovation, *likelihood = (read(observation) for read in self.read)
         if self.bank:

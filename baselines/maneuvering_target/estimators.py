@@ -1,6 +1,6 @@
-"""Estimators of ManeuveringTarget that no action steers.
+"""Estimators of ManeuveringTarget: Kalman filters and IMMs without actions.
 
-They predict over the actual time between two scans; for a scan that missed the target they only predict.
+They predict over the actual time between two scans, and do not update for a scan that missed the target.
 """
 
 import math
@@ -22,23 +22,23 @@ class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
     """Base of the estimators with the constant-velocity model."""
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate."""
+        """Return the filter's state at the start of a track, from the initial estimate."""
         return self.first_track(initial)
 
     def first_track(self, initial: Initial) -> EstimateState:
-        """Return the estimate before the first scan."""
+        """Return the initial estimate as the state of a single Kalman filter, with unknown likelihood."""
         return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
 
     def mean(self, state: Any) -> Array:
-        """Return the position and velocity, without further states."""
+        """Return the mean of position and velocity, ``(4, N)``, without further components of the state."""
         return state.mean[:4]
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of position and velocity, without further states."""
+        """Return the covariance of position and velocity, ``(4, 4, N)``, without further components of the state."""
         return state.covariance[:4, :4]
 
     def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
-        """Return the state after an update."""
+        """Return the result of an update as the filter's state, with the measurement's likelihood."""
         return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))
 
 
@@ -55,7 +55,7 @@ class ConstantVelocity(KalmanModel):
         self.variance: float = acceleration**2
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Predict and update."""
+        """Predict to a scan, update with its measurement, and return the state."""
         F, Q = self.motion(given.measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
         return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
@@ -98,13 +98,13 @@ class KalmanInteractingMultipleModel(KalmanModel):
         self.probabilities: Array = task.constant([scans / sum(lasting) for scans in lasting])
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Extend an estimate of position and velocity to the state in which the filters are mixed."""
+        """Return an estimate of position and velocity extended to the common state of all filters, ``(n, N)``."""
         return mean, covariance
 
     def predict_and_update(
         self, mean: Array, covariance: Array, measurement: Measurement
     ) -> list[kalman.Update]:
-        """Predict and update every filter from its mixed state ``(n, M, N)``."""
+        """Predict and update every filter from its mixed state ``(n, M, N)``; return the updates."""
         F, Q = self.motion(measurement.interval)
         return [
             self.update_estimate(
@@ -114,7 +114,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         ]
 
     def start(self, initial: Initial) -> KalmanMixture:
-        """Start all filters from the initial estimate."""
+        """Return the state at the start of a track: all filters at the initial estimate, with prior probabilities."""
         xp, M = self.xp, self.probabilities.shape[0]
         mean, covariance = self.augment(initial.mean, initial.covariance)
         return KalmanMixture(
@@ -126,7 +126,10 @@ class KalmanInteractingMultipleModel(KalmanModel):
         )
 
     def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
-        """Run one IMM cycle. Its normalised innovation squared is the filters' mean by their posterior weights."""
+        """Run one IMM cycle, and return the state.
+
+        The normalised innovation squared is the filters' mean by their posterior weights.
+        """
         xp, measurement = self.xp, given.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
         mixed = imm.mix(state.means, state.covariances, prediction.mixing)
@@ -159,12 +162,12 @@ class TurnModel(ConstantVelocityModel):
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def noise(self, T: Array) -> Array:
-        """Return the covariance of the process noise over intervals, s, ``(5, 5, N)``."""
+        """Return the covariance of the process noise over intervals T, s, ``(5, 5, N)``."""
         Q = self.variance * self.motion(T)[1]
         return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, (T * self.change) ** 2)[1]
 
     def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-        """Apply the time update of the extended Kalman filter over intervals, s."""
+        """Return mean and covariance predicted by the extended Kalman filter of the turn over intervals T, s."""
         return coordinated_turn.predict(mean, covariance, T, self.noise(T))
 
 
@@ -197,13 +200,13 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Add the turn rate of straight flight."""
+        """Return an estimate with the turn rate of straight flight as fifth component."""
         return coordinated_turn.augment_turn_rate(mean, covariance, self.turn_variance)
 
     def predict_and_update(
         self, mean: Array, covariance: Array, measurement: Measurement
     ) -> list[kalman.Update]:
-        """Predict and update every filter from its mixed state ``(5, 3, N)``."""
+        """Predict and update every filter from its mixed state ``(5, 3, N)``; return the updates."""
         results = []
         for straight in super().predict_and_update(mean[:4], covariance[:4, :4], measurement):
             mean5, covariance5 = self.augment(straight.mean, straight.covariance)
@@ -235,11 +238,11 @@ class UnscentedTurn(TurnModel, KalmanModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate, with a turn rate of mean zero."""
+        """Return the state at the initial estimate, with a turn rate of mean zero."""
         return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Propagate the sigma points through the turn and update with the measured position."""
+        """Propagate the sigma points through the turn, update with the measured position, and return the state."""
         T = given.measurement.interval
         mean, covariance = unscented.transform(
             state.mean, state.covariance, lambda points: coordinated_turn.propagate(points, T)

@@ -12,8 +12,9 @@ from ...filters.small_matrices import apply
 from .estimators import KalmanModel
 
 DISTURBANCES = ("glint", "coloured", "bias", "clutter")
-"""The reference is given all of them. The bound ignores them: each but false plots, which it never uses, adds
-errors."""
+"""Disturbances that the reference knows. The bound ignores them: each adds errors, except false plots, which it never
+uses.
+"""
 
 
 class TurnMemory(NamedTuple):
@@ -50,7 +51,7 @@ class KnownTurn(KalmanModel):
     disturbances = DISTURBANCES
 
     def initialise(self, given: FilterInput) -> TurnMemory:
-        """Start from the initial estimate; a coloured error is stationary from the start."""
+        """Return the state at the initial estimate; a coloured error is stationary from the start."""
         (mean, covariance), truth = given.measurement, given.truth
         if "coloured" in truth.disturbances:
             none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2
@@ -59,7 +60,7 @@ class KnownTurn(KalmanModel):
         return TurnMemory(mean, covariance, Likelihood.unknown(mean[0]), truth)
 
     def block_diagonal(self, first: Array, second: Array) -> Array:
-        """Return the block-diagonal matrix of two blocks, ``(n + m, n + m, N)``."""
+        """Return the block-diagonal matrix ``(n + m, n + m, N)`` of blocks ``(n, n, N)`` and ``(m, m, N)``."""
         corner = 0.0 * first[:, :1] + 0.0 * second[:1]
         return self.xp.concat(
             [
@@ -69,7 +70,9 @@ class KnownTurn(KalmanModel):
         )
 
     def update(self, state: TurnMemory, given: FilterInput) -> TurnMemory:
-        """Predict with the known flight since the scan before, and update with the measured position."""
+        """Predict with the known flight since the last scan, update with the measured position, and return the
+        state.
+        """
         measurement, truth = given.measurement, given.truth
         xp, world, disturbances = self.xp, self.task.world, truth.disturbances
         assert isinstance(world, RadarWorld)
@@ -113,12 +116,13 @@ class KnownInputBound(ConstantVelocityModel):
     disturbances = DISTURBANCES
 
     def start(self, initial: Initial, truth: Truth) -> Array:
-        """Return the covariance of the start."""
+        """Return the initial covariance as the bound's memory."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
-        """Return the bound after this scan: the diagonal of the covariance recursion at the true position. A scan that
-        missed the target adds no information.
+        """Return the bound on the variances after this scan, and the memory, by the recursion at the true position.
+
+        A scan that missed the target adds no information.
         """
         world = self.task.world
         assert isinstance(world, RadarWorld)

@@ -18,13 +18,13 @@ CLASSES = 3
 SURE = 0.9
 """Probability from which a class counts as recognised."""
 LEAST = 1e-6
-"""Probability of the true class whose logarithm is the lowest score."""
+"""Smallest probability of the true class in the logarithmic score."""
 TIMES = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 """Seconds at which the probability of the true class is reported."""
 
 
 def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
-    """Return the ratio of means over episodes, ``(1 + resamples,)``; NaN where the denominator is zero."""
+    """Return the ratio of means over episodes to shares, ``(1 + resamples,)``; NaN where a share is zero."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return means / shares
 
@@ -73,12 +73,12 @@ def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
 
 
 def _of_group(true_class: numpy.ndarray) -> numpy.ndarray:
-    """Return whether a target is of each group, ``(..., 1 + classes)``: all targets, and each class."""
+    """Return boolean masks ``(..., 1 + classes)``: true for all targets, then for each true class."""
     return numpy.concatenate([numpy.ones((*true_class.shape, 1), bool), _of_class(true_class)], axis=-1)
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return the terms of the metrics for each episode; none for a bound, and no beliefs for a reference."""
+    """Return each episode's terms of the metrics, by name; none for a bound, no probabilities for a reference."""
     if _missing(run, "true_class"):
         return MetricInputs()
     true_class = run["true_class"].values.astype(int)
@@ -137,7 +137,7 @@ def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
 
 
 def _moments(seconds: numpy.ndarray) -> dict[float, int]:
-    """Return the indices of the times of :data:`TIMES` within the episode."""
+    """Return the index of each of :data:`TIMES` within the episode, by its time, s."""
     found = {moment: numpy.flatnonzero(numpy.isclose(seconds, moment)) for moment in TIMES}
     return {moment: int(at[0]) for moment, at in found.items() if len(at)}
 
@@ -147,7 +147,7 @@ def _last(seconds: numpy.ndarray) -> int:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the errors by true class, recognition of the class, and calibration, of one policy.
+    """Return the metrics from the episodes' terms: errors by true class, recognition, and calibration.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
     ``time_to_recognise_median``, ``_90_quantile`` (first P(true class) >= 0.9) and ``_censored``, the share of

@@ -22,7 +22,7 @@ class SensorAlarm(Alarm):
         self.others = [sensor.readings.stop - sensor.readings.start for sensor in self.task.sensors[2:]]
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of every group of sensors."""
+        """Return the log-likelihood ratios of a noisy or stuck sensor of every group, ``(N, kinds)``."""
         count = len(observation)
         here = [read(observation).sum(axis=1) for read in self.available]
         here += [numpy.full(count, float(readings)) for readings in self.others]
