@@ -17,7 +17,7 @@ from ..envs.engine.catalogue import nearest, parameter_names
 SCIENTIFIC = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 """Numbers such as 1e-3, which YAML 1.1 parses as strings."""
 OPTIONS = ("control", "scenario", "backend")
-"""Keywords of an environment that are also options of a run."""
+"""Keywords of an environment that are also options of a training run."""
 SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training accepts."""
 ESTIMATORS = ("kalman-net", "student")
@@ -40,7 +40,7 @@ def convert_numbers(value: Any) -> Any:
 
 
 def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge two mappings recursively; the second overrides the first."""
+    """Return two nested mappings merged; the second overrides the first."""
     both = dict(first)
     for name, value in then.items():
         own = both.get(name)
@@ -51,7 +51,7 @@ def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[st
 
 
 def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parse ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
+    """Parse words ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
 
     Returns:
         Keywords of the environment, and hyperparameters.
@@ -80,7 +80,7 @@ def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]
 
 
 def _read_table(path: Path, needs: str) -> dict[str, Any]:
-    """Read a YAML file of sections.
+    """Return the mapping in a YAML file.
 
     Raises:
         ValueError: if it cannot be read, or is not a mapping; ``needs`` describes the expected form.
@@ -110,7 +110,7 @@ def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
 
 
 def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read a file of settings.
+    """Return the settings of an environment from a user's YAML file.
 
     Args:
         path: YAML file with hyperparameters in sections by environment id or ``default``, as in rl-zoo3, with

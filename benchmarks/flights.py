@@ -47,7 +47,7 @@ METRICS = {
     "win_rate": ("wins", 100.0),
     "anees": ("anees", 1.0),
 }
-"""Records in the table, with their columns and units."""
+"""Metrics in the table, with their columns and units."""
 
 
 def main() -> None:

@@ -47,7 +47,7 @@ def resident(processes: list[int]) -> float:
 
 
 def filtergym(*words: str) -> tuple[float, float, float]:
-    """Run a command; return its seconds, seconds of processors, and peak memory of all its processes together, GiB."""
+    """Run a ``filtergym`` command; return its seconds, processor seconds, and peak memory of its processes, GiB."""
     began, most = time.monotonic(), 0.0
     command = [sys.executable, "-m", "filtergym", *words]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -63,7 +63,7 @@ def filtergym(*words: str) -> tuple[float, float, float]:
 
 
 def results(folder: Path) -> str:
-    """Return all results of a benchmark, without the command, which differs between the runs."""
+    """Return the text of a benchmark's results without its command, which differs between the runs."""
     return (folder / "results.json").read_text(encoding="utf-8").partition("\n")[2]
 
 
@@ -103,7 +103,7 @@ def command_of(process: int) -> str:
 
 
 def killing(words: list[str]) -> None:
-    """Run on a cluster of two nodes; after some results kill a worker, then a node with all its processes."""
+    """Run a command on a cluster of two nodes, and kill a worker, then a node, after some results."""
     import ray
     from ray.cluster_utils import Cluster
 

@@ -22,7 +22,7 @@ SCENARIOS = ("random", "atc", "cruise", "descent", "irregular-scans", "glint")
 
 
 def main() -> None:
-    """Evaluate, and print the table."""
+    """Evaluate the training runs and their opponents, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path, help="folders of training runs, of one environment")
     parser.add_argument("--episodes", type=int, default=1000)

@@ -24,7 +24,7 @@ BUDGETS = (100_000, 1_000_000, 10_000_000)
 
 
 def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
-    """Train once for each seed, and return the folders; finished runs are not repeated, interrupted ones continue."""
+    """Train one run for each seed, unless it is finished, and return the runs' folders."""
     words = ["train", id, "--algo", algo, "--steps", str(steps), "--seeds", f"0-{seeds - 1}", "--no-compare"]
     command = [sys.executable, "-m", "filtergym", *words, "--out", str(run)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -282,5 +282,5 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 
 def main() -> None:
-    """Run a command; errors end as those of ``filtergym`` do."""
+    """Run the command line of ``docs/make``; errors end as those of ``filtergym`` do."""
     run(lambda: program_of({"Commands": COMMANDS}), PROGRAM)

@@ -23,11 +23,11 @@ from filtergym.reports.tables.terminal_tables import (
 )
 
 STRONGEST = 4
-"""Classical competitors that the page shows."""
+"""Number of classical competitors that the page shows."""
 
 
 class Comparison(NamedTuple):
-    """The shown results of one environment."""
+    """Tables and figure of one environment on the comparison page."""
 
     environment: str
     grids: list[Grid]
@@ -35,7 +35,7 @@ class Comparison(NamedTuple):
 
 
 def compared_policies(measured: BenchmarkRecords) -> list[str]:
-    """Return the names on the page, among those in the records, in the order of its columns.
+    """Return the names of the competitors that the comparison page shows, in the order of its columns.
 
     Learned agents; the cheapest of all others in the training distribution, of any control and kind; the paper's
     algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
@@ -56,12 +56,12 @@ def compared_policies(measured: BenchmarkRecords) -> list[str]:
 
 
 def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
-    """Return the records of one scenario over all times, by competitor, metric and component."""
+    """Return the records over whole episodes, by competitor, metric, component and window."""
     return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Return cost against the paper's algorithm, lost tracks, means, ANEES and time of a competitor in one scenario."""
+    """Return a competitor's cells: cost against the paper's, lost tracks, means, ANEES and time in one scenario."""
     values = _by_name(records)
     return [
         with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),
@@ -72,9 +72,7 @@ def _cells(name: str, records: Sequence[Record]) -> list[str]:
 
 
 def summary(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Return a table of the best of every origin on the training distribution of each environment, and the
-    reference.
-    """
+    """Return a table of the best competitor of every origin in each environment, and the reference."""
     rows = []
     for problem, every in found:
         reference, learned = problem.baselines.score_reference, pretrained_agents(problem.id)
@@ -135,9 +133,7 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Return a table of the competitors whose covariance does not fit the errors on the training distribution, of all
-    ranked but random actions.
-    """
+    """Return a table of the ranked competitors whose covariance does not fit their errors, without random actions."""
     rows = []
     for measured in found:
         records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
@@ -186,7 +182,10 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
     times = {s: column_of_times([record for record in records if record.scenario == s]) for s in sizes}
 
     def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
-        """Return the table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
+        """Return a table with a row for each scenario and the cell ``text(scenario, name)`` for each name.
+
+        With ``judged`` the first column is the verdict.
+        """
         heads = [f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in names]
         return Grid(
             title,
@@ -261,7 +260,7 @@ def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
 
 
 def _two_lines(record: Record | None, scale: float) -> str:
-    """Return the value above its interval, so that columns stay narrow."""
+    """Return a record's value and interval as text of two lines, for a narrow column."""
     # Percentages to a hundredth: smaller values are rounding.
     negligible = 0.005 if scale == 100.0 else 0.0
     shown = with_interval(record, scale, negligible=negligible)
@@ -269,11 +268,10 @@ def _two_lines(record: Record | None, scale: float) -> str:
 
 
 def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
-    """Return the table over all environments, in Markdown: "best" of every origin, where agents do "harm", or
-    "covariances".
+    """Return the overview table called "best", "harm" or "covariances", over all environments, in Markdown.
 
     Raises:
-        ValueError: for another word.
+        ValueError: for another name.
     """
     tables = {"best": summary, "harm": harm, "covariances": covariances}
     if which not in tables:
@@ -283,7 +281,7 @@ def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
 
 
 def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
-    """Return the sentences and tables of one environment, with the command of the records."""
+    """Return the sentences and tables of one environment in Markdown, with the command of the records."""
     records, paper = measured.records, measured.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})

@@ -20,7 +20,7 @@ BUDGETS = (100, 300, 1000, 5000)
 
 
 def panels_of(found: Sequence[BenchmarkRecords]) -> list[FrontPanel]:
-    """Return the panel of each environment with times in the records, in its training distribution."""
+    """Return the picture's panel of each environment whose records contain times, in its training distribution."""
     panels = []
     for measured in found:
         problem, records = measured
@@ -38,7 +38,7 @@ def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
     """Draw the fronts of several environments in one picture, with its legend in the empty place.
 
     Args:
-        panels: at least one.
+        panels: one or several panels.
         columns: width of the picture in columns of a paper.
     """
     figure, axes = figure_with_pairs(len(panels) // 2 + 1, columns)
@@ -53,7 +53,7 @@ def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
 
 
 def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
-    """Return the competitor of lowest error cost within each time, classical and learned, in Markdown.
+    """Return a table in Markdown: the classical and the learned competitor of lowest error cost within each time.
 
     A learned one is bold where its whole interval lies below that of the classical one, and a classical one in the
     opposite case.

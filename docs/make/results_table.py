@@ -28,11 +28,11 @@ COLUMNS = ("difference", "lost", "means", "ns", "control", "cost", "rmse", "anee
 def scenario_records(
     found: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
 ) -> list[Record]:
-    """Return the results of a benchmark in one scenario, of all but random actions.
+    """Return the records of a benchmark in one scenario, without random actions.
 
     Args:
         found: results in an environment.
-        scenario: default: the training distribution.
+        scenario: name of the scenario; default: the training distribution.
         policies: names of competitors. Default: all.
 
     Raises:
@@ -57,10 +57,10 @@ def scenario_records(
 def results_grid(
     records: Sequence[Record], paper: str, columns: Sequence[str] = COLUMNS
 ) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of the table of one environment.
+    """Return header and rows of the table of results in one environment and scenario, lowest cost first.
 
     Args:
-        records: of one scenario.
+        records: records of one scenario.
         paper: name of the paper's algorithm.
         columns: some of :data:`COLUMNS`.
     """
@@ -96,9 +96,7 @@ def results_grid(
 
 
 def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
-    """Return the whole table of one environment and scenario, the best competitor, and the meaning of the columns, in
-    Markdown.
-    """
+    """Return the table of results in Markdown, with sentences on the best competitor and on the columns."""
     records, paper = scenario_records(found, scenario), found.paper
     note = (
         f"{ranking_sentence(records, paper)} Lowest cost first. {COST_NOTE} ANEES is the mean NEES over the dimension; "
@@ -114,11 +112,11 @@ def chosen_markdown(
     policies: Sequence[str] = (),
     columns: Sequence[str] = (),
 ) -> str:
-    """Return one table of several environments, or of some competitors or columns, in Markdown.
+    """Return one table of results in Markdown over several environments, or with some competitors or columns.
 
     Args:
         found: records of the environments by their short names.
-        scenario: default: the training distribution of each.
+        scenario: name of the scenario; default: the training distribution of each.
         policies: names of competitors. Default: all.
         columns: some of :data:`COLUMNS`. Default: those whose titles are the same in every environment.
 
