@@ -135,7 +135,7 @@ class TrainingRun:
         return {n: value for n, value in self.hyperparameters.get("env_kwargs", {}).items() if n in known}
 
     def make_model(self, scenario: str | None = None) -> Model:
-        """Return the model of the training in one of its scenarios; None: the first one."""
+        """Return the model of the training in one of its scenarios; None: the environment's default one."""
         return make_model(self.problem.task, self.control, scenario, **self.task_keywords)
 
     @property

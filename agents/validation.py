@@ -84,7 +84,7 @@ class TrainingEpisodes:
 
 
 def validation_backend(run: TrainingRun) -> str:
-    """Return the name of the backend of a run's validations, "auto" or "numpy" in place of torch's."""
+    """Return the name of the backend of a run's validations: the run's own, or "auto" for torch."""
     return "auto" if run.backend == "torch" else run.backend
 
 

@@ -97,7 +97,7 @@ def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
 
 
 def summary(problem: Problem, policy: str, cells: list[Cell]) -> str:
-    """Return a competitor's row of the table: counts of cells with harm, gain, lost tracks and inconsistency."""
+    """Return a competitor's row of the table: cells harmed, worst cell and its cost, range of ANEES, lost tracks."""
     worst = max(cells, key=lambda cell: cell.ratio[0])
     anees = [cell.anees for cell in cells]
     outside = sum(not CONSISTENT[0] <= value <= CONSISTENT[1] for value in anees)

@@ -104,7 +104,7 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
 
 
 def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
-    """Return the largest number of episodes, at most ``most``, that a competitor runs in about a minute.
+    """Return the number of episodes, at most ``most``, that a competitor runs in some ten seconds.
 
     Args:
         problem: problem of the competitor.
