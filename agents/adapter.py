@@ -127,7 +127,7 @@ class TaskVecEnv(VecEnv):
         self._seeds = list(seeds)
 
     def step_async(self, actions: numpy.ndarray) -> None:
-        """Store the actions for :meth:`step_wait`."""
+        """Store the agent's actions, corrected by policy and gate if there are any, for the next :meth:`step_wait`."""
         if self.residual_to is not None or self.gate is not None:
             shown = self._shown["observation"] if self.env.privileged else self._shown
         if self.residual_to is not None:
@@ -180,7 +180,7 @@ class TaskVecEnv(VecEnv):
         return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths, "policy": policy}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Continue from a snapshot of an environment made with the same arguments.
+        """Restore a state from :meth:`snapshot`, of an environment made with the same arguments.
 
         Raises:
             ValueError: if the number of environments differs.

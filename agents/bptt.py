@@ -383,7 +383,7 @@ class Descent:
         policy.use_fields(math.ceil(every * (policy.fields_kept / every) ** min(1.0, done / PRUNED)))
 
     def trainee(self) -> Trainee:
-        """Return the agent with its functions for saving."""
+        """Return the agent as a :class:`Trainee`: its policy, and functions that save checkpoint and agent."""
         run, policy = self.run, self.policy
         agent = functools.partial(_make_agent, policy, run.gated)
 
@@ -409,7 +409,7 @@ class Descent:
         (folder / "checkpoint.pt").write_bytes(written.getvalue())
 
     def load_checkpoint(self, folder: Path) -> None:
-        """Load a checkpoint to continue from.
+        """Restore network, optimiser and environments from the checkpoint in a folder.
 
         Raises:
             ValueError: if it cannot be read.

@@ -156,7 +156,7 @@ def _stored(maker: Any) -> Any:
 
 
 def _own_parameters(cls: type[Task], run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters of the task that an agent was trained with."""
+    """Return the task parameters of an agent's training by name, from the record of its run."""
     known = parameter_names(cls)
     given = run.get("hyperparameters", {}).get("env_kwargs", {})
     return {name: value for name, value in given.items() if name in known}

@@ -378,11 +378,13 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         return GatedState(agent, fallback, trusted, odds, squares, degrees)
 
     def mean(self, state: GatedState) -> Array:
-        """Return the mean of the trusted filter."""
+        """Return the mean of the trusted filter's estimate in each lane, ``(C, N)``."""
         return self.xp.where(state.trusted, self.agent.mean(state.agent), self.fallback.mean(state.fallback))
 
     def covariance(self, state: GatedState) -> Array:
-        """Return the covariance of the trusted filter, the fallback's times its variance factor."""
+        """Return the trusted filter's covariance in each lane, ``(C, C, N)``; the fallback's times its variance
+        factor.
+        """
         other = self._variance_factor(state.squares, state.degrees) * self.fallback.covariance(state.fallback)
         return self.xp.where(state.trusted, self.agent.covariance(state.agent), other)
 

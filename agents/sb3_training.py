@@ -55,7 +55,7 @@ class _Trainer(BaseCallback):
 
 
 def training_environment(run: TrainingRun) -> TaskVecEnv:
-    """Return the vector environment of a training run for Stable-Baselines3."""
+    """Return the vector environment of a training run, made for Stable-Baselines3."""
     env: Any = gymnasium.make_vec(
         run.environment,
         num_envs=run.envs,
@@ -114,7 +114,7 @@ def as_saved_agent(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPol
 def save_checkpoint(
     model: BaseAlgorithm, env: TaskVecEnv, normalisation: VecNormalize | None, folder: Path
 ) -> None:
-    """Write everything that later steps depend on."""
+    """Write a checkpoint of model, environments and normalisation into a folder."""
     save_model(model, normalisation, folder)
     if isinstance(model, OffPolicyAlgorithm):
         model.save_replay_buffer(folder / "replay_buffer.pkl")

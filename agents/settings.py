@@ -96,7 +96,7 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
 
 
 def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
-    """Return the section of an environment, or the default one.
+    """Return the section of an environment in a table of settings, or the section ``default``.
 
     Raises:
         ValueError: if there is none.
@@ -110,7 +110,7 @@ def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
 
 
 def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the settings of an environment from a user's YAML file.
+    """Return the settings of an environment in a user's YAML file: its keywords, and hyperparameters.
 
     Args:
         path: YAML file with hyperparameters in sections by environment id or ``default``, as in rl-zoo3, with

@@ -140,12 +140,12 @@ class TrainingRun:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all requested steps are done."""
+        """Whether all requested environment steps are done."""
         return self.steps_done >= self.steps
 
     @property
     def best(self) -> ValidationEntry | None:
-        """The validation with the lowest cost."""
+        """Validation with the lowest cost so far; None before the first one."""
         return min(self.validation, key=lambda entry: entry["cost"], default=None)
 
 
@@ -333,7 +333,7 @@ def scenario_text(weights: Mapping[str, float]) -> str:
 
 
 def read_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
-    """Return the hyperparameters of an algorithm for an environment; default ones if the file has no section for it.
+    """Return the shipped hyperparameters of an algorithm for an environment, by name; else the default ones.
 
     A file that is ``based_on`` another algorithm's contains only the differences, by default and for an environment.
     """

@@ -189,7 +189,7 @@ class UnrolledMemory:
         self._of_matrix = numpy.zeros_like(matrix)
 
     def forward(self, decision: int) -> numpy.ndarray:
-        """Return the memory after a decision, with a last row of ones."""
+        """Return the recurrent memory after a decision, with a last row of ones."""
         size, seen, gates = self._size, self._seen[decision], self._gates[decision]
         hidden, after = seen[self._fields : -1], self._seen[decision + 1, self._fields :]
         numpy.matmul(self._matrix, seen, out=gates)

@@ -104,7 +104,7 @@ class FittedLog:
 
     @cached_property
     def interval(self) -> float:
-        """Median time between measurements, s."""
+        """Median time between the recording's measurements, s."""
         return float(numpy.nanmedian(numpy.diff(self.recording.seconds, axis=1)))
 
     def with_noise(self, family: Tunable, own: bool = False, robust: bool = False) -> Tunable:

@@ -20,7 +20,7 @@ USER_BASELINES: dict[str, Baselines] = {}
 
 @cache
 def package_of(id: str) -> ModuleType | None:
-    """Return the package with the baselines of a Gymnasium id; None where there is none."""
+    """Return the Python package with the baselines of a Gymnasium id; None if this package has none."""
     folder = folders().get(id)
     if folder is None or importlib.util.find_spec(f"{__package__}.{folder}") is None:
         return None

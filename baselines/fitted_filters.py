@@ -160,7 +160,7 @@ def write_advised(
 
 
 def read_artefact(path: Path, problem: Problem) -> Artefact:
-    """Read the file of an advised filter.
+    """Return the content of an advised filter's file.
 
     Args:
         path: path of a file of :func:`write_advised`.

@@ -99,7 +99,7 @@ class Problem:
 
     @property
     def tuned_policies(self) -> list[str]:
-        """Names of policies with tuned values."""
+        """Names ``NAME-tuned`` of policies and estimators with stored tuned values."""
         return self.tuned_values.names()
 
     @property

@@ -90,7 +90,7 @@ class Variant(functools.partial[Any]):
     """
 
     def __new__(cls, make: Callable[..., Any], description: str = "", /, **arguments: Any) -> "Variant":
-        """Return a class with some arguments bound.
+        """Return a competitor's class with some arguments bound, as its maker.
 
         Args:
             make: the class.

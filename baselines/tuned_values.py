@@ -60,7 +60,7 @@ class TunedPolicy:
 
     @property
     def kind(self) -> Kind:
-        """Kind of the competitor that it makes."""
+        """Kind of competitor, "policy" or "estimator"."""
         return "policy" if self.control else "estimator"
 
     def __call__(self, problem: Any) -> Any:

@@ -83,7 +83,7 @@ def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy
 
 
 def geometric_cost(costs: numpy.ndarray) -> float:
-    """Return the geometric mean of the costs of episodes."""
+    """Return the geometric mean of episodes' costs."""
     return float(numpy.exp(numpy.log(costs).mean()))
 
 
@@ -129,7 +129,7 @@ class _Generations:
         self.best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
 
     def cost(self, vector: numpy.ndarray) -> float:
-        """Return the cost of a candidate; infinite when the budget is spent."""
+        """Return the cost of a vector of candidate values; infinite when the search's budget is spent."""
         if self.spent >= self.allowed:
             return math.inf
         values = dict(zip(self.tunable.limits, map(float, vector), strict=True))
@@ -139,7 +139,7 @@ class _Generations:
         return cost
 
     def run(self, population: int, generator: numpy.random.Generator) -> dict[str, float]:
-        """Run generations until the budget is spent; return the best values."""
+        """Run differential evolution from a population until the budget is spent; return the best vector."""
         from scipy.optimize import differential_evolution
 
         limits = list(self.tunable.limits.values())

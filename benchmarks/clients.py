@@ -283,7 +283,7 @@ def python_of(name: str) -> str:
 
 
 def measure(client: str, id: str) -> dict[str, Any]:
-    """Return the steps per second of a client in an environment, or the reason of a failure."""
+    """Return the steps per second of a client in an environment, or the reason of its failure, by name."""
     _, distribution, rollouts = CLIENTS[client]
     try:
         version = importlib.metadata.version(distribution)

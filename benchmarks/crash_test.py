@@ -34,7 +34,7 @@ def row(name: str, findings: Sequence[Finding]) -> list[str]:
 
 
 def main() -> None:
-    """Test all competitors and print the table."""
+    """Run the crash test of all competitors of an environment, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -214,7 +214,7 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
 
 
 def least_time(call: Any, count: int) -> float:
-    """Return the least nanoseconds of a call, over runs of some calls."""
+    """Return the nanoseconds of a call, the least mean over several runs of ``count`` calls."""
     call()
     times = []
     for _ in range(7):

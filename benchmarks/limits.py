@@ -47,7 +47,7 @@ class Nearest(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Verdict on the reference, as text."""
+        """Verdict, as text, whether the reference is a limit in this scenario."""
         return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
 
 

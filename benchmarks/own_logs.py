@@ -225,7 +225,7 @@ def problem_id(name: str) -> str:
 
 
 def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
-    """Return the columns of each recording of a table."""
+    """Return the columns by name of each recording in a CSV file."""
     table = np.genfromtxt(file, delimiter=",", names=True)
     return [
         {name: table[name][table["recording"] == number] for name in table.dtype.names}

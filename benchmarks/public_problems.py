@@ -168,7 +168,7 @@ WHEEL_SCALE = 1.075
 
 
 def drive(x: Any) -> list[Any]:
-    """Return the state after a second forward along the heading."""
+    """Return the segway's state after a second of motion along its heading."""
     middle = x[3] + 0.5 * x[4]
     return [
         x[0] + x[2] * numpy.cos(middle),
@@ -536,7 +536,7 @@ def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECORDS) -> None:
-    """Write a record of each table, with its figures."""
+    """Write the records ``public_problems`` and ``public_drives`` from all results."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = {
         PROBLEMS: (problem_table, "noise_floor_db", "rows"),

@@ -32,7 +32,7 @@ def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
 
 
 def main() -> None:
-    """Train, evaluate, and print the table."""
+    """Train agents with each budget, evaluate them on test episodes, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=Path, default=Path("runs/budgets"), help="folder of the runs")
     parser.add_argument("--algo", default="bptt")

@@ -110,7 +110,7 @@ def record(
 def requests_of(
     problem: Problem, experiment: Experiment, competitors: Sequence[Competitor], curves: bool = True
 ) -> list[EvaluationRequest]:
-    """Return the requests of an evaluation, one for each competitor.
+    """Return the :class:`.EvaluationRequest` of each competitor in an experiment.
 
     Args:
         problem: problem of the competitors.

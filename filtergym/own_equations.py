@@ -17,7 +17,8 @@ from .own_drifts import Discretised, discretise_drift
 
 Function = Callable[..., Any] | Sequence[Sequence[float]] | numpy.ndarray
 """A function of the state ``(n,)`` that returns a list of numbers, or a matrix; with more arguments see
-:func:`.own_models.state_space`."""
+:func:`.own_models.state_space`.
+"""
 FURTHER = ("dt", "u")
 """Names of the further arguments that f may take after the state."""
 FAR = 3.0
@@ -49,7 +50,7 @@ class Surroundings:
 
     @property
     def usual_inputs(self) -> numpy.ndarray:
-        """Means of the inputs, ``(p,)``."""
+        """Means of the distributions of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
 

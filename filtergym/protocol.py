@@ -86,7 +86,7 @@ def protocol_names() -> list[str]:
 
 
 def read_protocol(name: str) -> tuple[Protocol, str]:
-    """Read a protocol.
+    """Return a protocol, read from its file and checked, and the file's digest.
 
     Args:
         name: name of one of this package, or the path of a ``.toml``.
@@ -244,7 +244,7 @@ class ProtocolResult(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether all environments were entered; otherwise there is no number."""
+        """Whether every environment of the protocol has an entry; otherwise there is no number."""
         return len(self.environments) == len(self.protocol.environments)
 
     @property
@@ -372,7 +372,7 @@ def _costs(found: Sequence[Summary]) -> Iterator[tuple[str, numpy.ndarray]]:
 
 
 def bib_entry(result: ProtocolResult, version: str) -> str:
-    """Return a BibTeX entry of the protocol.
+    """Return a BibTeX entry that cites the protocol of a result.
 
     Args:
         result: result to quote.

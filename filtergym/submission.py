@@ -179,7 +179,7 @@ def protocol_of(problem: Problem, name: str) -> tuple[Protocol, str]:
 
 
 def read_submission(path: Path) -> tuple[Submission, str]:
-    """Read a submission without running any of it.
+    """Return the submission in a file, without running any of it, and the file's digest.
 
     Args:
         path: path of the file.
@@ -419,7 +419,7 @@ def run_submission(
     seed: int | None = None,
     references: bool = False,
 ) -> Run:
-    """Run the competitor of a submission over the scenarios of its protocol.
+    """Run the competitor of a submission over the scenarios of its protocol, and return the results.
 
     Args:
         problem: problem of the submission.
@@ -483,7 +483,7 @@ class Deviation(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether rounding or chance explains it."""
+        """Whether rounding, or on fresh episodes chance, explains the deviation."""
         return self.size <= 1.0
 
 

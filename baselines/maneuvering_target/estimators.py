@@ -126,7 +126,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         )
 
     def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
-        """Run one IMM cycle, and return the state.
+        """Run one IMM cycle (mix, predict, update) with a scan, and return the state.
 
         The normalised innovation squared is the filters' mean by their posterior weights.
         """

@@ -116,7 +116,7 @@ class KnownInputBound(ConstantVelocityModel):
     disturbances = DISTURBANCES
 
     def start(self, initial: Initial, truth: Truth) -> Array:
-        """Return the initial covariance as the bound's memory."""
+        """Return the bound's memory at the start of the track, the initial covariance."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:

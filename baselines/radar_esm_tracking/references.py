@@ -78,7 +78,7 @@ class _KnownDraw:
         return self.xp.stack([self.xp.stack(row) for row in rows])
 
     def of(self, matrices: Array, target_class: Array) -> Array:
-        """Return the matrix of each lane's class, ``(3, 3, N)``, out of ``(3, 3, M)``."""
+        """Return the matrix of each lane's class, ``(3, 3, N)``, chosen from those of all classes ``(3, 3, M)``."""
         return self.xp.take(matrices, target_class, axis=-1)
 
     def white(self, truth: Truth) -> Array:

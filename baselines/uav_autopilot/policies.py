@@ -112,7 +112,7 @@ BANKS: dict[str, Any] = {
 
 
 def _tunable_bank(name: str, prior: LevelPrior) -> Tunable:
-    """Return the tunable values of the bank of noise levels."""
+    """Return the tunable values of the bank over noise levels."""
     found = tunable(
         BANKS[name],
         log10_gust_change=(-3.5, math.log10(prior.gust_change), -1.0),

@@ -173,7 +173,7 @@ def causes_table() -> str:
 
 
 def environment_table(problem: Problem, name: str) -> str:
-    """Return one table of an environment in Markdown.
+    """Return the table of an environment called ``name`` (actions, fields, ...), in Markdown.
 
     Raises:
         ValueError: if there is no table of that name.

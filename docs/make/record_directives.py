@@ -224,7 +224,7 @@ class TrainingCurves(_Rendered):
 
     @property
     def data(self) -> dict[str, Any]:
-        """Data of the record, without runs that have no curve."""
+        """Data of the record of training seeds, without runs that have no curve."""
         environment_id(self.name_given)
         data = self.record(f"{SEEDS}/{self.name_given}").data
         return {**data, "runs": [run for run in data["runs"] if run[0] in data.get("curves", {})]}
@@ -282,7 +282,7 @@ class CommandLine(_Rendered):
     with_headings: ClassVar[bool] = True
 
     def markdown(self) -> str:
-        """Return the ``--help`` of all commands."""
+        """Return the ``--help`` of all commands in Markdown."""
         return command_line_markdown()
 
 

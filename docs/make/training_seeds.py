@@ -73,7 +73,7 @@ class SeedRun(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name among the policies, different from all opponents."""
+        """Name of the run in tables, algorithm and seed."""
         return f"{self.algorithm} seed {self.run.seed}"
 
 
@@ -246,7 +246,7 @@ class Study(NamedTuple):
 
     @property
     def problem(self) -> Problem:
-        """Problem of all runs."""
+        """Problem (task and baselines) of all runs."""
         return self.runs[0].run.problem
 
 
@@ -372,7 +372,7 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
         values: Any,
         component: str = "",
     ) -> None:
-        """Add an estimate, or the interval of a statistic and its resamples."""
+        """Append a comparison: an estimate, or an interval from a statistic and its bootstrap resamples."""
         estimate = values if isinstance(values, IntervalEstimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
         where = (problem.id, scenario, study.split, study.seed, episodes)

@@ -96,7 +96,7 @@ class Outputs(NamedTuple):
     estimates: Path | None
 
     def check(self) -> None:
-        """Raise ValueError for an output that cannot be written."""
+        """Raise ValueError for an output file or folder that cannot be written."""
         check_formats(list(self.formats))
         check_columns(self.columns)
         if self.folder is not None:
@@ -278,7 +278,7 @@ def _without_comparison(problem: Problem) -> str:
 def run(
     requests: Sequence[EvaluationRequest], outputs: Outputs, workers: Workers, store: Store
 ) -> tuple[Evaluation, str, dict[str, str]]:
-    """Run the competitors of an evaluation; one that fails loses only its own row.
+    """Run the competitors of an evaluation, and return the results; a failing one loses only its own row.
 
     Every number of every episode is stored only on request.
 

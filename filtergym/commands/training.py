@@ -50,7 +50,7 @@ def trainer_of(algo: str) -> Trainer:
 
 
 def open_run(problem: Problem, options: RunOptions, session: Session) -> Training:
-    """Begin a run in the folder of a session, or continue the one that is there.
+    """Return a training run, begun in the folder of a session or continued there, with its session.
 
     Args:
         problem: training problem.
@@ -120,7 +120,7 @@ def train_runs(opened: Sequence[Training], trainer: Trainer, workers: Workers) -
 
 
 def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
-    """Train in this process until a request to stop; each run stores its own state."""
+    """Train runs one after another in this process, until a request to stop."""
     for training in waiting:
         _train_here(training, trainer)
         if not training.run.is_complete:
@@ -142,7 +142,10 @@ def _train_here(training: Training, trainer: Trainer) -> None:
 
 
 def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[Path, TrainingRun]:
-    """Train in other processes; the reports of each are printed when it has ended."""
+    """Train runs in parallel processes, and return each finished run by its folder.
+
+    The reports of a run are printed when it has ended.
+    """
     found = {}
     sizes = [training.run.steps for training in waiting]
     with progress_bar() as bar:
@@ -162,7 +165,7 @@ def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[P
 
 
 def _train(training: Training, tick: Any) -> list[str]:
-    """Train in a separate process; return its reports."""
+    """Train a run in a separate process, and return its reports, sentences on its validations."""
     lines: list[str] = []
     _, run, session = training
     trainer_of(run.algorithm)(run, replace(session, report=lines.append))

@@ -168,7 +168,7 @@ def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
 
 
 def network_graph(stored: StoredPolicy, model: Model) -> Any:
-    """Return the ONNX model of a network.
+    """Return a network as an ONNX model: observation and memory in, action and memory out.
 
     Args:
         stored: arrays of the agent.
@@ -223,7 +223,7 @@ def network_graph(stored: StoredPolicy, model: Model) -> Any:
 
 
 def export_onnx(request: ExportRequest, path: Path) -> None:
-    """Write the network of an agent as ONNX.
+    """Write the network of an agent as an ONNX file.
 
     Args:
         request: request of an agent, shipped or in a file.

@@ -64,7 +64,7 @@ class Declaration(NamedTuple):
 
     @property
     def all(self) -> list[Declared]:
-        """All parameters, values of the tuning first."""
+        """All parameters that can be set, values of the tuning first."""
         return [*self.tuned, *self.own]
 
 
@@ -111,7 +111,7 @@ def _arguments(maker: Any) -> dict[str, Any]:
 
 
 def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
-    """Return the tuning value of an untuned filter, and the parameter of which it is the decimal logarithm, or None."""
+    """Return a tunable parameter's untuned value, and if that is a decimal logarithm, its argument, else None."""
     is_log = name.startswith("log10_")
     size = arguments.get(name.removeprefix("log10_"))
     if isinstance(size, int | float) and not (is_log and size <= 0.0):

@@ -29,7 +29,7 @@ class ExportRequest(NamedTuple):
 def request_export(
     problem: Problem, name: str | Path, scenario: Any = None, *, trust: bool = False, **keywords: Any
 ) -> ExportRequest:
-    """Find a competitor by its name.
+    """Return the request to export a competitor, found by its name or file.
 
     Args:
         problem: problem of the competitor.

@@ -89,7 +89,7 @@ class FreeParameters(NamedTuple):
 
     @property
     def values(self) -> list[float]:
-        """Current parameters, row by row."""
+        """Current values of all parameters, row by row."""
         return [value for one in self.declared for value in one.values]
 
 

@@ -79,7 +79,7 @@ def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
 
 
 def verdict_if(holds: bool) -> Verdict:
-    """Return the verdict on a claim that holds or does not."""
+    """Return the verdict on a claim of one part: "reproduced" if it holds, else "not reproduced"."""
     return "reproduced" if holds else "not reproduced"
 
 

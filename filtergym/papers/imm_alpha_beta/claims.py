@@ -299,7 +299,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the measured quantities in the texts and verdicts of the claims, by name."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     comparison = comparisons(r)
     imm, adaptive = r.main["imm"].squares, r.main["adaptive"].squares
     best = findings(r, "gains used", WINDOWS["all"])
@@ -396,7 +396,7 @@ def _readings(r: Results) -> str:
 
 
 def _others(comparison: Mapping[str, Comparison]) -> str:
-    """Return a text with the experiments by their verdict on C1, against each adaptive filter."""
+    """Return a text that groups the experiments by their verdict on claim C1, for each adaptive filter."""
     others: dict[tuple[str, Verdict], list[str]] = {}
     for name, change in comparison.items():
         experiment, _, opponent = name.partition("; against ")

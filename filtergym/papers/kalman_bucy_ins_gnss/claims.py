@@ -141,7 +141,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     a, b = roots(r)
     theory, exact, agreement = r.example.theory, exact_root_mean_squares(), riccati_agreement()
     return [

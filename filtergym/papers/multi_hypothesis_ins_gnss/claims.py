@@ -173,7 +173,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the measured quantities in the texts and verdicts of the claims, by name."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     increment, kinematic = r.courses.values()
     adaptive, free, best = (increment[name] for name in (ADAPTIVE, "Singer, no aperture", "known mode"))
     few = len(free.nis)
@@ -232,7 +232,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     header = [
         "filter",
         "leg",

@@ -65,7 +65,7 @@ class Variant(NamedTuple):
 
 
 def variant(r: Results, name: str, s: int) -> Variant:
-    """Return the results of a variant for targets of one class."""
+    """Return recognition time and error ratios in a variant of the experiment, for targets of one class."""
     fused, radar = r.variants[name]
     of = fused.true_class == s
     if not of.any():
@@ -170,7 +170,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the measured quantities in the texts and verdicts of the claims, by name."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     early, middle, _ = WINDOWS.values()
     printed, joint = r.fixed_type["quasi-optimal"], r.fixed_type["joint-type"]
     fighter = (printed.true_class == 2) & (printed.true_type == 1)
@@ -236,7 +236,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     errors = [
         [
             f"{name} {component}, {unit}",

@@ -107,7 +107,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the measured quantities in the texts and verdicts of the claims, by name."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     plants = ("P, H = I", "U")
     ours = P, U = [r.noise[plant]["kalman"] for plant in plants]
     raw = [r.noise[plant]["raw-sensors"] for plant in plants]
@@ -152,7 +152,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     rows = []
     for case, loops in r.noise.items():
         for name, s in loops.items():

@@ -66,7 +66,7 @@ class Signals:
 
     @property
     def decibel(self) -> float:
-        """Noise of node 2 over noise of node 3, dB."""
+        """Noise power of the observation over that of the estimate, dB."""
         return 10.0 * math.log10(self.variance("observation") / self.variance("estimate"))
 
 
@@ -210,7 +210,7 @@ def flatness(values: numpy.ndarray) -> float:
 
 
 def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the theoretical spectrum of each node of the steady-state loop under white noise, by name."""
+    """Return the theoretical power spectrum of each signal of the control loop under white noise, by name."""
     (F, B, H, L, K, Q, R), T = matrices(task), interval(task)
     n, m = len(F), len(R)
     loop = linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)

@@ -95,7 +95,7 @@ def advice_html(
 
 
 def _shown(advice: Advice) -> list[str]:
-    """Return the names of the drawn filters, the advised one first."""
+    """Return the names of the filters that the pictures show, the advised one first."""
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
 
 

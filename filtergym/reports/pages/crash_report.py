@@ -55,7 +55,7 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
 
 
 def crash_page(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
-    """Return a self-contained page of HTML.
+    """Return the tables of a crash test as a self-contained HTML page.
 
     Args:
         title: title above the tables.

@@ -72,7 +72,7 @@ class Cell(NamedTuple):
 
     @property
     def measurements(self) -> int:
-        """Measurements of all policies together."""
+        """Number of measurements that all competitors of the cell process together."""
         return self.episodes * _horizon(self.problem.task, self.scenario) * len(self.policies)
 
 
@@ -371,5 +371,5 @@ def headline_half_width(result: Result) -> float:
 
 
 def all_records(results: Sequence[Result]) -> list[Record]:
-    """Return the records of all results."""
+    """Return the records of all results in one list."""
     return [record for result in results for record in result.records]

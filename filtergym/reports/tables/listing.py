@@ -26,12 +26,12 @@ def _backend(cls: type[Task]) -> str:
 
 
 def summary_of(cls: type[Task]) -> str:
-    """Return the first line of an environment's documentation."""
+    """Return the first line of the docstring of an environment's class."""
     return (cls.__doc__ or "").strip().partition("\n")[0]
 
 
 def list_lines(tasks: Mapping[str, type[Task]], width: int | None) -> Iterator[str]:
-    """Yield a line for each environment.
+    """Yield a line for each environment: its id and a summary.
 
     Args:
         tasks: tasks by id.

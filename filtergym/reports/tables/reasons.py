@@ -37,7 +37,7 @@ class Reason(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Weight, see :func:`.evaluation.statistics.cause_split.reason_weight`."""
+        """Weight by which causes are ordered, from :func:`.evaluation.statistics.cause_split.reason_weight`."""
         shares = (numpy.array(record.value or 0.0) for record in (self.share, self.measurements))
         return float(reason_weight(*shares))
 

@@ -214,7 +214,7 @@ def components_to_draw(
 
 
 def write_results(path: Path, results: Iterable[Result], settings: Settings) -> None:
-    """Write results completely or not at all.
+    """Write results to a file, completely or not at all.
 
     Raises:
         ValueError: if the file cannot be written.
@@ -247,7 +247,7 @@ def serialise_datasets(result: Result) -> dict[str, Any]:
 
 
 def read_results(path: Path) -> tuple[list[Result], Settings]:
-    """Read a file of :func:`write_results`, or raise an error with the reason.
+    """Return the results in a file of :func:`write_results`, and their settings.
 
     Args:
         path: path of the file, or of the folder that contains it as ``results.json``.
@@ -269,7 +269,7 @@ def read_results(path: Path) -> tuple[list[Result], Settings]:
 
 
 def read_all_results(paths: Sequence[Path]) -> tuple[list[Result], Settings]:
-    """Read several files of results as one.
+    """Return the results of several files in one list, and their settings.
 
     Raises:
         ValueError: if one cannot be read, or they contain a scenario twice.
