@@ -329,7 +329,7 @@ def advise(
     competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     chosen, anchor = _choose(log, fits, judgement, competitors)
     name, tunable = chosen.name, fits.tunables[chosen.name]
-    takes_fitted = tunable.anchored or judgement.is_worth(chosen, rival, prices.operations)
+    takes_fitted = tunable.anchored or judgement.is_worthwhile(chosen, rival, prices.operations)
     profiles = _fit_again(log, fits, name, between(RUN, REFITTED))
     if log.share.apart:
         judgement = judge(

@@ -185,7 +185,7 @@ class Judgement:
         as_good = (c for c in fitted if self.difference(likeliest.name, c.name).low <= 0.0)
         return next(as_good, likeliest)
 
-    def is_worth(self, fitted: JudgedFilter, rival: str, operations: Callable[[str], float]) -> bool:
+    def is_worthwhile(self, fitted: JudgedFilter, rival: str, operations: Callable[[str], float]) -> bool:
         """Return whether a fitted filter gains beyond chance over the rival, or is cheaper and ``AS_GOOD``."""
         low = fitted.gain.low
         return low > 0.0 or (low > -AS_GOOD and operations(fitted.name) < operations(rival))

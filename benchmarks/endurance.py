@@ -42,7 +42,7 @@ def actions(space: gymnasium.Space, generator: numpy.random.Generator, size: int
     return numpy.where(on_edge, edge, inside).astype(space.dtype)
 
 
-def lost_covariances(covariance: numpy.ndarray) -> int:
+def count_indefinite(covariance: numpy.ndarray) -> int:
     """Return the number of covariances ``(n, n, N)`` that, scaled to correlations, have an eigenvalue below -1e-9."""
     P = numpy.moveaxis(covariance[:, :, numpy.isfinite(covariance).all((0, 1))], -1, 0)
     sigma = numpy.sqrt(numpy.maximum(numpy.einsum("nii->ni", P), 1e-300))
@@ -72,7 +72,7 @@ def endure(
         finite &= numpy.isfinite(covariance).all((0, 1))
         failed["not finite"] += int((~finite).sum())
         if done // size % CHECKED_EVERY == 0:
-            failed["lost covariances"] += lost_covariances(covariance)
+            failed["lost covariances"] += count_indefinite(covariance)
     return done, failed
 
 

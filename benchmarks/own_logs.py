@@ -190,7 +190,7 @@ def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[st
 
 def processor_time(name: str, folder: Path) -> float:
     """Return the processor time of the page's three commands (fit, evaluate, export) for a machine, s."""
-    machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", used()
+    machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", children_time()
     for words in (
         ["advise", folder / f"{name}.csv", "--environment", machine, "--out", filter],
         [
@@ -209,10 +209,10 @@ def processor_time(name: str, folder: Path) -> float:
         subprocess.run(
             command, cwd=EXAMPLES, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True, capture_output=True
         )
-    return used() - before
+    return children_time() - before
 
 
-def used() -> float:
+def children_time() -> float:
     """Return the processor time of all finished child processes, s."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime

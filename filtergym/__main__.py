@@ -100,7 +100,9 @@ class Program(typer.core.TyperGroup):
         for group, commands in self.groups.items():
             if name in commands:
                 return (
-                    _listed(name, commands[name], group) if self.listing else _command(name, commands[name])
+                    _help_command(name, commands[name], group)
+                    if self.listing
+                    else _command(name, commands[name])
                 )
         return None
 
@@ -145,7 +147,7 @@ def _docstrings(module: str) -> dict[str, str | None]:
     return {n.name: ast.get_docstring(n) for n in ast.parse(text).body if isinstance(n, ast.FunctionDef)}
 
 
-def _listed(name: str, command: Callable[..., None] | str, group: str) -> Any:
+def _help_command(name: str, command: Callable[..., None] | str, group: str) -> Any:
     """Return a click command with the help text only, read from the source without importing the module."""
     if isinstance(command, str):
         module, _, function = command.partition(":")

@@ -72,7 +72,7 @@ def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
     return numpy.asarray(true_class[..., None] == numpy.arange(CLASSES))
 
 
-def _of_group(true_class: numpy.ndarray) -> numpy.ndarray:
+def _group_masks(true_class: numpy.ndarray) -> numpy.ndarray:
     """Return boolean masks ``(..., 1 + classes)``: true for all targets, then for each true class."""
     return numpy.concatenate([numpy.ones((*true_class.shape, 1), bool), _of_class(true_class)], axis=-1)
 
@@ -114,7 +114,10 @@ def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
     detected = _first(stays & (numpy.arange(len(seconds)) >= change[:, None]))
     false = right[:, :-1] & ~right[:, 1:] & (true_class[:, 1:] == true_class[:, :-1])
     score = numpy.log(numpy.maximum(true_probability, LEAST))
-    at_moments, at_last = _of_group(true_class[:, list(moments.values())]), _of_group(true_class[:, last])
+    at_moments, at_last = (
+        _group_masks(true_class[:, list(moments.values())]),
+        _group_masks(true_class[:, last]),
+    )
     averaged = {
         "probability": true_probability[:, list(moments.values()), None] * at_moments,
         "share_at_moments": at_moments,
@@ -192,7 +195,7 @@ def _beliefs(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
         for i in numpy.flatnonzero(shares[0]):
             value = bootstrap.interval(_ratio(probability[:, i], shares[:, i]))
             yield Measure("mean_true_class_probability", GROUPS[i], f"{moment:g} s", value, "1")
-    for mode, chosen in zip(GROUPS, _of_group(each["first_class"]).T, strict=True):
+    for mode, chosen in zip(GROUPS, _group_masks(each["first_class"]).T, strict=True):
         if chosen.any():
             yield from _recognition("time_to_recognise", bootstrap, each["recognised"], chosen, seconds, mode)
     changed = each["change"] < len(seconds)

@@ -11,7 +11,7 @@ import typer
 from front import draw_fronts, panels_of
 from notebooks import notebook_files, write_executed
 from playground import FILTERS, compile_filter, has_compiler, module_file
-from readme import with_numbers, with_printed
+from readme import insert_numbers, insert_outputs
 from records import (
     BENCHMARK,
     FOLDER,
@@ -19,12 +19,12 @@ from records import (
     ResultRecord,
     benchmark_data,
     markdown_tables,
+    merge_competitors,
     read_benchmark,
     read_record,
     recorded_environments,
+    strip_folders,
     today,
-    with_competitors,
-    without_place,
     write_record,
 )
 
@@ -87,11 +87,11 @@ def record(
             found.setdefault(result.environment, []).extend(result.records)
         for id, records in found.items():
             data = benchmark_data(problem_of(id), records)
-            made = ResultRecord(without_place(settings.command), today(), settings.versions, note, data)
+            made = ResultRecord(strip_folders(settings.command), today(), settings.versions, note, data)
             name = f"{BENCHMARK}/{bare_name(id)}"
             if add:
                 whole = read_record(name, into)
-                made = whole._replace(note=note or whole.note, data=with_competitors(whole.data, data, add))
+                made = whole._replace(note=note or whole.note, data=merge_competitors(whole.data, data, add))
             console.print(
                 f"{write_record(name, made, into)}: {len(data['scenarios'])} scenarios", soft_wrap=True
             )
@@ -134,14 +134,14 @@ def readme(
     """
     check_columns(columns)
     check_formats([picture.suffix.removeprefix(".").lower()])
-    text = with_numbers(page)
+    text = insert_numbers(page)
     panels = panels_of([read_benchmark(name)[0] for name in recorded_environments()])
     if not panels:
         raise ValueError("the records hold no times: make them by filtergym benchmark")
     save(draw_fronts(panels, columns=columns), picture)
     write_text(page, text)
     if printed:
-        write_text(page, with_printed(page))
+        write_text(page, insert_outputs(page))
 
 
 def notebooks(
@@ -227,7 +227,7 @@ def seeds(
         data = training_seeds.seeds_data(study, records)
         name = f"{SEEDS}/{bare_name(problem.id)}"
         if add:
-            data = training_seeds.with_runs(read_record(name, into).data, data)
+            data = training_seeds.merge_runs(read_record(name, into).data, data)
         made = ResultRecord(command, today(), settings_of(command).versions, note, data)
         write_record(name, made, into)
     store.clear()

@@ -16,8 +16,8 @@ from filtergym.reports.tables.ranking import HARM, best_competitor, ranking, ran
 from filtergym.reports.tables.terminal_tables import (
     HEADLINE,
     INCONSISTENT,
-    against_paper,
     consistency,
+    paper_cells,
     score_text,
     with_interval,
 )
@@ -65,7 +65,7 @@ def _cells(name: str, records: Sequence[Record]) -> list[str]:
     values = _by_name(records)
     return [
         with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),
-        *against_paper(values, name),
+        *paper_cells(values, name),
         consistency(values.get((name, "anees", "state", "all"))),
         column_of_times(records).get(name, "-"),
     ]
@@ -201,7 +201,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
         )
 
     def tail(scenario: str, name: str) -> str:
-        lost, means = against_paper(by_window, name, (scenario,))
+        lost, means = paper_cells(by_window, name, (scenario,))
         return "-" if means == "-" else f"{lost}<br>{means}"
 
     quantity = f"{metric} {component}".replace("_", " ").replace("rmse", "RMSE").strip()

@@ -19,7 +19,7 @@ from sentence_numbers import number_text
 NUMBER = re.compile(r"(<!-- (value|number): (\S+(?: \S+)*?) -->).*?(<!-- end -->)", re.S)
 
 
-def with_numbers(page: Path) -> str:
+def insert_numbers(page: Path) -> str:
     """Return the text of a page with every number replaced by that of its record.
 
     Raises:
@@ -46,7 +46,7 @@ MODULE = re.compile(r"In `(\w+\.py)`:\n\n```python\n(.*?)```", re.S)
 WIDTH = 100
 
 
-def with_printed(page: Path) -> str:
+def insert_outputs(page: Path) -> str:
     """Return the text of a page with the output of its commands replaced, run in a folder with its files.
 
     Raises:

@@ -54,7 +54,7 @@ class _Rendered(SphinxDirective):
     final_argument_whitespace = True
 
     @property
-    def name_given(self) -> str:
+    def argument_text(self) -> str:
         """Argument of the directive; empty without one."""
         return self.arguments[0].strip() if self.arguments else ""
 
@@ -111,7 +111,7 @@ class ResultsTable(_Rendered):
 
     def markdown(self) -> str:
         """Return the directive's table in Markdown."""
-        names = self.name_given.split() or recorded_environments()
+        names = self.argument_text.split() or recorded_environments()
         scenario = self.options.get("scenario", "")
         policies, columns = (
             _words(self.options[key]) if key in self.options else () for key in ("policies", "columns")
@@ -126,14 +126,14 @@ class ComparisonTables(_Rendered):
 
     def markdown(self) -> str:
         """Return sentences and tables in Markdown."""
-        measured, record = self.benchmark(self.name_given)
+        measured, record = self.benchmark(self.argument_text)
         self.compared = comparison.compare_environment(measured)
         return comparison.comparison_markdown(self.compared, measured, record)
 
     def figure(self) -> tuple[str, str, Any]:
         """Return the figure of cost in every scenario, with name and alternative text."""
-        words = f"Cost against the paper's algorithm in every scenario, {self.name_given}"
-        return f"comparison_{self.name_given}", words, self.compared.figure
+        words = f"Cost against the paper's algorithm in every scenario, {self.argument_text}"
+        return f"comparison_{self.argument_text}", words, self.compared.figure
 
 
 class ComparisonOverview(_Rendered):
@@ -142,7 +142,7 @@ class ComparisonOverview(_Rendered):
     def markdown(self) -> str:
         """Return the directive's table in Markdown."""
         found = [self.benchmark(name)[0] for name in recorded_environments()]
-        return comparison.overview_markdown(found, self.name_given)
+        return comparison.overview_markdown(found, self.argument_text)
 
 
 class FrontFigure(_Rendered):
@@ -150,12 +150,12 @@ class FrontFigure(_Rendered):
 
     def figure(self) -> tuple[str, str, Any]:
         """Return the figure of the fronts, with name and alternative text."""
-        names = self.name_given.split() or recorded_environments()
+        names = self.argument_text.split() or recorded_environments()
         panels = panels_of([self.benchmark(name)[0] for name in names])
         if not panels:
             raise ValueError(f"the records of {', '.join(names)} hold no times")
         words = f"Cost against processor time of every competitor: {', '.join(names)}"
-        return "_".join(["front", *self.name_given.split()]), words, draw_fronts(panels)
+        return "_".join(["front", *self.argument_text.split()]), words, draw_fronts(panels)
 
 
 class PublicFigure(_Rendered):
@@ -198,10 +198,10 @@ class SeedsTables(_Rendered):
 
     def markdown(self) -> str:
         """Return the tables in Markdown."""
-        if not self.name_given:
+        if not self.argument_text:
             return seeds_overview([self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)])
-        environment_id(self.name_given)
-        return seeds_markdown(self.record(f"{SEEDS}/{self.name_given}"))
+        environment_id(self.argument_text)
+        return seeds_markdown(self.record(f"{SEEDS}/{self.argument_text}"))
 
 
 class SeedProfiles(_Rendered):
@@ -210,7 +210,7 @@ class SeedProfiles(_Rendered):
     def markdown(self) -> str:
         """Return the directive's table in Markdown."""
         records = [self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)]
-        self.scores = recorded_scores(records, self.name_given.split())
+        self.scores = recorded_scores(records, self.argument_text.split())
         return interquartile_table(self.scores)
 
     def figure(self) -> tuple[str, str, Any]:
@@ -225,14 +225,14 @@ class TrainingCurves(_Rendered):
     @property
     def data(self) -> dict[str, Any]:
         """Data of the record of training seeds, without runs that have no curve."""
-        environment_id(self.name_given)
-        data = self.record(f"{SEEDS}/{self.name_given}").data
+        environment_id(self.argument_text)
+        data = self.record(f"{SEEDS}/{self.argument_text}").data
         return {**data, "runs": [run for run in data["runs"] if run[0] in data.get("curves", {})]}
 
     def markdown(self) -> str:
         """Return a sentence on the runs without a curve; empty without such runs."""
         shown = {run[1] for run in self.data["runs"]}
-        every = dict.fromkeys(run[1] for run in self.record(f"{SEEDS}/{self.name_given}").data["runs"])
+        every = dict.fromkeys(run[1] for run in self.record(f"{SEEDS}/{self.argument_text}").data["runs"])
         missing = ", ".join(f"`{name}`" for name in every if name not in shown)
         return f"Curves of {missing} were not kept." if missing else ""
 
@@ -240,8 +240,8 @@ class TrainingCurves(_Rendered):
         """Return the figure of the record's curves, with name and alternative text; None without curves."""
         if not self.data["runs"]:
             return None
-        words = f"Validation cost over training, median and range over training seeds, {self.name_given}"
-        return f"training_{self.name_given}", words, learning_curves(self.data)
+        words = f"Validation cost over training, median and range over training seeds, {self.argument_text}"
+        return f"training_{self.argument_text}", words, learning_curves(self.data)
 
 
 class RecordTable(_Rendered):
@@ -251,7 +251,7 @@ class RecordTable(_Rendered):
 
     def markdown(self) -> str:
         """Return the table in Markdown, with a sentence on its origin unless the option ``bare`` is set."""
-        record = self.record(self.name_given)
+        record = self.record(self.argument_text)
         titles, rows = record.data["columns"], record.data["rows"]
         if "columns" in self.options:
             places = [titles.index(title) for title in _words(self.options["columns"])]
@@ -269,11 +269,11 @@ class EnvironmentTable(_Rendered):
 
     def markdown(self) -> str:
         """Return the table in Markdown."""
-        if self.name_given == "causes":
+        if self.argument_text == "causes":
             return causes_table()
         if "environment" not in self.options:
             raise ValueError("the option environment is missing, such as `:environment: ManeuveringTarget`")
-        return environment_table(problem_of(environment_id(self.options["environment"])), self.name_given)
+        return environment_table(problem_of(environment_id(self.options["environment"])), self.argument_text)
 
 
 class CommandLine(_Rendered):

@@ -121,7 +121,7 @@ def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
     return ResultRecord(**values)
 
 
-def without_place(command: str) -> str:
+def strip_folders(command: str) -> str:
     """Return a command without folders and number of processes, which do not affect its results."""
     return re.sub(r" --(out|jobs|threads|cluster)[ =]\S+", "", command)
 
@@ -183,7 +183,7 @@ def benchmark_data(problem: Problem, records: Sequence[Record]) -> dict[str, Any
     return {"environment": problem.id, "split": split, "seed": seed, "units": units, "scenarios": scenarios}
 
 
-def with_competitors(
+def merge_competitors(
     data: Mapping[str, Any], added: Mapping[str, Any], names: Collection[str]
 ) -> dict[str, Any]:
     """Return a benchmark's data with the rows of competitors that were measured later, over the same episodes.

@@ -13,9 +13,9 @@ from filtergym.reports.tables.terminal_tables import (
     COST_NOTE,
     HEADLINE,
     INCONSISTENT,
-    against_paper,
     consistency,
     main_components,
+    paper_cells,
     rank_competitors,
     score_text,
     with_interval,
@@ -77,8 +77,8 @@ def results_grid(
                 found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
             )
         },
-        "lost": {"lost tracks, %": lambda name: against_paper(found, name)[0]},
-        "means": {"means, %": lambda name: against_paper(found, name)[1]},
+        "lost": {"lost tracks, %": lambda name: paper_cells(found, name)[0]},
+        "means": {"means, %": lambda name: paper_cells(found, name)[1]},
         "ns": {TIME_TITLE: lambda name: times.get(name, "-")},
         "control": {"control": lambda name: controls[name]},
         "cost": {"mean cost": number("cost")},

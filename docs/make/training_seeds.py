@@ -507,7 +507,7 @@ def compare_scenarios(
     """
     records: list[Comparison] = []
     grids: list[Grid] = []
-    runs = trained_of(study.runs)
+    runs = describe_runs(study.runs)
     for scenario in scenarios:
         means = episode_means(study, scenario, progress, store, workers)
         comparisons = compare(study, means, scenario)
@@ -516,7 +516,7 @@ def compare_scenarios(
     return records, grids
 
 
-def trained_of(runs: Sequence[SeedRun]) -> list[Trained]:
+def describe_runs(runs: Sequence[SeedRun]) -> list[Trained]:
     """Return a description of each training run, for pages."""
     return [
         Trained(
@@ -536,7 +536,7 @@ def runs_data(runs: Sequence[SeedRun]) -> dict[str, Any]:
     return {
         "environment": runs[0].run.problem.id,
         "paper": runs[0].run.problem.paper,
-        "runs": [list(each) for each in trained_of(runs)],
+        "runs": [list(each) for each in describe_runs(runs)],
         "curves": {name: list(curve) for name, curve in curves.items() if curve is not None},
     }
 
@@ -559,7 +559,7 @@ def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any
     }
 
 
-def with_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
+def merge_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
     """Return a record's data with algorithms added or replaced that were scored later over the same episodes.
 
     Raises:

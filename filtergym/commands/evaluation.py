@@ -35,7 +35,7 @@ from ..evaluation.storage.store import Store
 from ..extensions import DEPARTURES, load_present
 from ..names import find_competitors, ranked_names, shipped_names
 from ..reports.pages.outcome import own_sentences
-from ..reports.tables.benchmark import result_of, without_smoothers_of_closed_loops
+from ..reports.tables.benchmark import drop_smoothers_of_closed_loops, result_of
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv, write_records
 from ..reports.tables.reasons import reason_sentences
 from ..reports.tables.recording_tables import recording_tables
@@ -201,7 +201,7 @@ def find_participants(
         return find_competitors(problem, policies, trust)
     if not isinstance(data, Recording):
         return find_competitors(
-            problem, without_smoothers_of_closed_loops(problem, known.benchmark or known.names, data)
+            problem, drop_smoothers_of_closed_loops(problem, known.benchmark or known.names, data)
         )
     return [*causal_competitors(problem, data), *find_competitors(problem, [*known.smoothers])]
 
@@ -254,7 +254,7 @@ def tables_of(
         paper = found.dataset.attrs["paper"]
         compared = results_tables(found.records, problem.knows, width, paper, own)
         if paper not in {record.policy for record in found.records}:
-            compared[-1].caption = f"{_without_comparison(problem)}\n{compared[-1].caption}"
+            compared[-1].caption = f"{_missing_comparison(problem)}\n{compared[-1].caption}"
         tables += compared
     if found.recorded:
         tables += recording_tables(found.records, found.differences, found.has_truth, width, own)
@@ -267,7 +267,7 @@ def own_names(problem: Problem, policies: Sequence[str]) -> list[str]:
     return [name for name in dict.fromkeys(policies) if name not in shipped]
 
 
-def _without_comparison(problem: Problem) -> str:
+def _missing_comparison(problem: Problem) -> str:
     """Return the sentence that explains why costs are not compared where the paper's algorithm does not take part."""
     paper = problem.baselines.compared_paper
     if not paper:

@@ -168,12 +168,12 @@ class FilterText:
                 *body,
                 *self._guard(),
                 "*state = after;",
-                self._taken(),
+                self._return_statement(),
             ]
         else:
             if "next" in " ".join(body):
                 body = [f"{state.name} *const next = state;", *body]
-            body.append(self._taken())
+            body.append(self._return_statement())
         if traced.network is not None:
             zero = literal(0.0, self.scalar)
             answers = f"{real} answer[{action_size(traced.network)}] = {{{zero}}};"
@@ -210,7 +210,7 @@ class FilterText:
             "}",
         ]
 
-    def _taken(self) -> str:
+    def _return_statement(self) -> str:
         """Return the C statement that returns ``TAKEN`` after a received measurement, else ``MISSED``."""
         own, zero = self.name.upper(), literal(0.0, self.scalar)
         there = [

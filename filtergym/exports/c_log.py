@@ -305,7 +305,7 @@ class RegularReading(NamedTuple):
     """Numbers of the reading; the first ``WHOLE`` columns have no empty cell."""
 
 
-def _with_others(first: list[str], columns: Mapping[str, str]) -> list[str]:
+def _all_columns(first: list[str], columns: Mapping[str, str]) -> list[str]:
     """Return the column names ``first``, then all others of a log except time and recording."""
     return [*first, *(name for name in columns if name not in (*first, "time", RECORDING))]
 
@@ -323,7 +323,7 @@ def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading
         values[f"increment{end}"] = f"cell[{axis}] - before[{axis}]"
         values[f"fix{end}"] = f"found[0] > 0.0 ? cell[{A + stated + axis}] : 0.0"
     return RegularReading(
-        _with_others(first, columns),
+        _all_columns(first, columns),
         len(first),
         READ_FIXES.format(axes=A, check=CHECK_SIGMA.format(sigma=A) if stated else ""),
         values,
@@ -335,7 +335,7 @@ def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading
 def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -> RegularReading:
     """Return the reading of rows of a radar with ESM reports; ``numbers`` are the format's constants."""
     first = ["range", "range_rate", *(name for name in columns if name == "looked")]
-    names = _with_others(first, columns)
+    names = _all_columns(first, columns)
     optional = ("looked", "decision", "bearing_difference", "radar_bearing", "esm_bearing")
     cells = {name: f"row->cell[{names.index(name)}]" if name in names else "(double)NAN" for name in optional}
     start = {"mean_0": "cell[0]", "mean_1": "cell[1]"}

@@ -94,7 +94,7 @@ def parameter_text(
     body = [
         f"const {real} *number;",
         f"{real} own[{max(count, 1)}];",
-        "const int usual = !parameters;" if _stated(free, scalar) else "",
+        "const int usual = !parameters;" if _stored_rows(free, scalar) else "",
         f"if (!parameters) parameters = &{own}_defaults;",
         f"number = (const {real} *)parameters;",
         f"for (int k = 0; k < {len(lengths)}; ++k) {{",
@@ -116,12 +116,12 @@ def parameter_text(
         write_program(
             code, f"{own}_derive", listed, read, lambda _, row: f"own[{row}]", scalar, arrays=arrays
         )
-        for code in (free.derive, _by_depth(free.derive))
+        for code in (free.derive, _merge_by_depth(free.derive))
     ]
     texts = [[s.functions, function_text("static void", f"{own}_derive", listed, s.body)] for s in sources]
     before += min(texts, key=lambda parts: sum(map(len, parts)))
     body.append(f"{own}_derive(parameters, own);")
-    if stated := _stated(free, scalar):
+    if stated := _stored_rows(free, scalar):
         # The same bits for every library of functions.
         numbers = numpy.array([free.usual[row] for row in stated])
         before.append(array_text(f"{own}_usual", numbers, scalar))
@@ -132,7 +132,7 @@ def parameter_text(
     return "\n".join(before), [line for line in body if line]
 
 
-def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
+def _merge_by_depth(code: StraightLineProgram) -> StraightLineProgram:
     """Return a program with equal operations at equal depth joined into array operations, which C writes as loops."""
     depths: list[int] = []
     groups: dict[tuple[int, str], int] = {}
@@ -143,7 +143,7 @@ def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
     return code._replace(origins=numpy.column_stack([own, range(len(own))]), callers={})
 
 
-def _stated(free: FreeParameters, scalar: Scalar) -> range:
+def _stored_rows(free: FreeParameters, scalar: Scalar) -> range:
     """Return the rows of derived numbers that the C text stores for the default parameters."""
     return free.stated if scalar is DOUBLE else range(len(free.usual))
 

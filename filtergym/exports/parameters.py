@@ -90,13 +90,13 @@ def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str)
         for key, (low, high) in tunable.limits.items():
             value, size, base = float(values[key]), None, key.removeprefix("log10_")
             if not isinstance(maker, TunedPolicy):
-                value, size = _in_force(arguments, key, value)
+                value, size = _untuned_value(arguments, key, value)
             unit = tunable.units.get(base, "")
             words = described.get(base, f"{base.replace('_', ' ')}{', ' if unit else ''}{unit}")
             words = f"Decimal logarithm: {words}" if base != key else words
             tuned.append(Declared(key, (), (value,), min(low, value), max(high, value), words, size=size))
         taken = {*tunable.apply(values)[0], *tunable.limits}
-    return Declaration(tuned, [p for p in _of_task(task.parameters) if p.name not in taken], tunable)
+    return Declaration(tuned, [p for p in _task_parameters(task.parameters) if p.name not in taken], tunable)
 
 
 def _arguments(maker: Any) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def _arguments(maker: Any) -> dict[str, Any]:
     return {**(prior._asdict() if hasattr(prior, "_asdict") else {}), **given}
 
 
-def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
+def _untuned_value(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
     """Return a tunable parameter's untuned value, and if that is a decimal logarithm, its argument, else None."""
     is_log = name.startswith("log10_")
     size = arguments.get(name.removeprefix("log10_"))
@@ -119,7 +119,7 @@ def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[fl
     return start, float(f"{10.0**start:.15g}") if is_log else None
 
 
-def _of_task(parameters: Any) -> Iterator[Declared]:
+def _task_parameters(parameters: Any) -> Iterator[Declared]:
     """Yield the numbers and arrays among the parameters of a task, with values, limits and meaning."""
     words = {
         name: text for base in reversed(type(parameters).__mro__) for name, text in field_words(base).items()

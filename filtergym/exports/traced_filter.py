@@ -527,8 +527,8 @@ def _trace(
     condition = None
     if conditions:
         whole = functools.reduce(functools.partial(graph.node, "logical_and"), conditions)
-        condition = _renumbered(program(graph, [ProgramResult(CONDITION, 0, whole)]), PARAMETER, moved)
-    derive = _renumbered(own.program(), PARAMETER, moved) if declared else None
+        condition = _renumber_rows(program(graph, [ProgramResult(CONDITION, 0, whole)]), PARAMETER, moved)
+    derive = _renumber_rows(own.program(), PARAMETER, moved) if declared else None
     own.read()
     start = program(graph, [ProgramResult(STATE, row, node) for row, node in enumerate(begun)])
     update = program(graph, written)
@@ -537,8 +537,8 @@ def _trace(
     members = [listed[member] for member in live]
     members += [Member("derived", (own.kept,), row, DERIVED_WORDS) for row in range(own.kept)]
     found = TracedFilter(
-        _renumbered(start, STATE, place),
-        _renumbered(update, STATE, place),
+        _renumber_rows(start, STATE, place),
+        _renumber_rows(update, STATE, place),
         members_of(initial),
         members_of(measurement),
         members,
@@ -691,7 +691,7 @@ def _live_members(
         live = more
 
 
-def _renumbered(code: StraightLineProgram, argument: int, place: Mapping[int, int]) -> StraightLineProgram:
+def _renumber_rows(code: StraightLineProgram, argument: int, place: Mapping[int, int]) -> StraightLineProgram:
     """Return a program with the rows of one argument renumbered by ``place``."""
     steps, arguments = code.steps, code.steps.arguments.copy()
     inputs = steps.begins[:-1][steps.which("input")]

@@ -19,7 +19,7 @@ def panels(rows: int, columns: int, size: tuple[float, float], **keywords: Any) 
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
 
 
-def looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return Matplotlib's colour and dash style of each curve's name."""
     return {
         name: style | {"linestyle": LINES[i % len(LINES)]}

@@ -189,7 +189,7 @@ def episode_count(episodes: int | None, default: int, least: int = 2) -> int:
     return count
 
 
-def its_command(module: str, episodes: int | None) -> str:
+def reproduction_command(module: str, episodes: int | None) -> str:
     """Return the command that reproduces the paper of a module; with ``--episodes`` unless ``episodes`` is None."""
     paper = module.rpartition(".")[2].replace("_", "-")
     runs = "" if episodes is None else f" --episodes {episodes}"

@@ -116,7 +116,7 @@ class GridFinding(NamedTuple):
     """Smallest error in the box over the smallest anywhere, minus one."""
 
 
-def inside_box() -> numpy.ndarray:
+def box_mask() -> numpy.ndarray:
     """Return a boolean mask ``(6, 8)`` of the grid's cells within the recommended gains."""
     low, high = numpy.array(LOW_GAINS), numpy.array(HIGH_GAINS)
     inside_low = (low >= LOW_BOX[0] - 1e-9) & (low <= LOW_BOX[1] + 1e-9)
@@ -133,7 +133,7 @@ def grid_errors(grid: numpy.ndarray, window: tuple[int, int] | None) -> numpy.nd
 
 def grid_finding(errors: numpy.ndarray) -> GridFinding:
     """Return the minimum of a grid of errors ``(1 + resamples, 6, 8)``, and its place relative to the box."""
-    inside = inside_box()
+    inside = box_mask()
     flat = errors.reshape(len(errors), -1)
     best = flat.argmin(axis=1)
     row, column = divmod(int(best[0]), len(HIGH_GAINS))
@@ -175,7 +175,7 @@ def dominance_verdict(straight: Sequence[Quantity], turn: Quantity) -> Verdict:
     return verdict_of([mean.low > 0.5 for mean in straight] + [turn.high < 0.5])
 
 
-def ramps_begun(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
+def ramp_starts(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
     """Return a boolean mask ``(episodes, K)`` of scans at which the adaptive filter began another ramp of its gain."""
     alarms = numpy.abs(alpha - high) < 1e-9
     alarms[:, 0] = False
@@ -307,7 +307,7 @@ def quantities(r: Results) -> dict[str, Any]:
     windows = {name: slice(first - 1, last) for name, (first, last) in WINDOWS.items()}
     before, turn, after = (mean(probability[:, windows[w]].mean(axis=1)) for w in ("pre", "turn", "post"))
     begins = SECTION[0]
-    alarms = ramps_begun(r.main["adaptive"].alpha, 0.7)
+    alarms = ramp_starts(r.main["adaptive"].alpha, 0.7)
     row, column = LOW_GAINS.index(0.3), HIGH_GAINS.index(0.7)
     return {
         "r": r,

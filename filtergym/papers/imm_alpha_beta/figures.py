@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ...evaluation.figures.looks import styles
-from ..panels import draw, finish, legend_outside, looks, panels, shade
+from ..panels import draw, finish, legend_outside, line_styles, panels, shade
 from ..quantities import means
 from .claims import HIGH_BOX, LOW_BOX, NEAR_MINIMUM, grid_errors
 from .experiment import COMPARED_POLICIES, COMPONENTS, HIGH_GAINS, LOW_GAINS, NAMES, WINDOWS, Results
@@ -46,7 +46,7 @@ def draw_trajectory(r: Results) -> Any:
     figure, grid = panels(1, 2, (10.0, 4.6))
     truth, seen = r.recording.truth[:, :2, 0] / 1e3, r.recording.measurement[:, :, 0] / 1e3
     estimate = truth + r.main["imm"].first[:, :2] / 1e3
-    style = looks(["true", "estimate", "measured"])
+    style = line_styles(["true", "estimate", "measured"])
     first, last = WINDOWS["turn"]
     for axis in grid[0]:
         axis.plot(*truth.T, label="true flight", **style["true"])
@@ -76,7 +76,7 @@ def draw_gain(r: Results) -> Any:
         "best schedule, flight known": r.schedule[None],
     }
     _shade_turn(axis)
-    for width, (name, style) in zip((2.4, 1.6, 1.6, 1.6), looks(curves).items(), strict=True):
+    for width, (name, style) in zip((2.4, 1.6, 1.6, 1.6), line_styles(curves).items(), strict=True):
         draw(axis, scans, curves[name], label=name, **(style | {"linewidth": width}))
     axis.set_ylim(0.0, 1.0)
     finish(axis, "scan k", "position gain alpha")
@@ -90,7 +90,7 @@ def draw_errors(r: Results) -> Any:
     scans = numpy.arange(1, len(r.schedule) + 1)
     for c, (axis, (component, unit)) in enumerate(zip(grid[:, 0], COMPONENTS, strict=True)):
         _shade_turn(axis)
-        for name, style in looks((*COMPARED_POLICIES, "known-turn")).items():
+        for name, style in line_styles((*COMPARED_POLICIES, "known-turn")).items():
             draw(axis, scans, numpy.sqrt(r.main[name].squares[:, :, c]), label=NAMES[name], **style)
         axis.set_ylim(bottom=0.0)
         finish(

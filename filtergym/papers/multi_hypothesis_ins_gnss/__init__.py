@@ -13,7 +13,7 @@ Reading: "without rates", "pseudoranges only": the standard deviation of what is
 """
 
 from ...evaluation.running.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
+from ..reproduction import Progress, Reproduction, episode_count, judge_claims, reproduction_command
 from . import claims, experiment, figures
 
 TITLE = "Adaptive multi-hypothesis algorithm of an inertial-satellite navigation system"
@@ -29,4 +29,4 @@ def reproduce(
     """
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
-    return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))
+    return Reproduction(TITLE, *shown, command=reproduction_command(__name__, episodes))

@@ -6,7 +6,7 @@ import numpy
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.figures.looks import styles
-from ..panels import draw, finish, legend_outside, looks, panels, shade
+from ..panels import draw, finish, legend_outside, line_styles, panels, shade
 from ..quantities import means
 from .claims import BAND, COORDINATE_LOSS, matched_ratios
 from .experiment import ADAPTIVE, COMPONENTS, JUMP, MOTION, SHORTEST_LEG, Results, loss
@@ -80,7 +80,7 @@ def draw_probabilities(r: Results) -> Any:
         for column, (axis, (what, (first, last))) in enumerate(zip(grid[row], spans.items(), strict=True)):
             shown = probability[:, first - 1 : last]
             steps = numpy.arange(first, first + shown.shape[1])
-            for i, (name, style) in enumerate(looks(HYPOTHESES).items()):
+            for i, (name, style) in enumerate(line_styles(HYPOTHESES).items()):
                 points = {"marker": "o", "markersize": 3.0} if column else {}
                 label = name.replace("-", " ").replace("singer", "Singer")
                 draw(axis, steps, shown[:, :, i], 0.25, label=label, **style, **points)

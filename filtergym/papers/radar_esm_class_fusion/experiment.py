@@ -75,7 +75,7 @@ def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
     return numpy.sum(probabilities[:, None] * (logarithm[:, None] - logarithm[None]), axis=-1)
 
 
-def leaking(probability: float) -> tuple[tuple[float, ...], ...]:
+def leaky_transition(probability: float) -> tuple[tuple[float, ...], ...]:
     """Return the class transition matrix with ``probability`` of leaving a class, equally to each other one."""
     return tuple(
         tuple(1.0 - probability if i == j else probability / 2.0 for j in range(3)) for i in range(3)
@@ -92,8 +92,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "noise on the acceleration only": {"process_noise": "acceleration"},
     "sigma_D = 300 m": {"range_sigma": 300.0},
     "range without Doppler": {"range_rate_sigma": WORTHLESS_RATE},
-    "1 % class leakage, filters mixed": {"class_transition": leaking(0.01)},
-    "5 % class leakage, filters mixed": {"class_transition": leaking(0.05)},
+    "1 % class leakage, filters mixed": {"class_transition": leaky_transition(0.01)},
+    "5 % class leakage, filters mixed": {"class_transition": leaky_transition(0.05)},
 }
 STEPS = 3 * len(CLASSES) + 2 + 2 + 2 * len(VARIANTS)
 

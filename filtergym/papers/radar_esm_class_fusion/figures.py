@@ -6,7 +6,7 @@ import numpy
 
 from ...baselines.radar_esm_tracking.metrics import SURE
 from ...evaluation.figures.looks import styles
-from ..panels import draw, finish, legend_outside, looks, panels
+from ..panels import draw, finish, legend_outside, line_styles, panels
 from ..quantities import means
 from .experiment import CLASSES, COMPONENTS, INTERVAL, Results
 
@@ -46,7 +46,7 @@ def draw_probabilities(r: Results) -> Any:
     figure, grid = panels(2, 1, (8.0, 5.6), sharex=True)
     probability = r.fused[0].probability
     t = _times(probability.shape[1])
-    for s, (name, style) in enumerate(looks(CLASSES).items()):
+    for s, (name, style) in enumerate(line_styles(CLASSES).items()):
         values = probability[:, :, s]
         grid[0, 0].plot(t, values[0], label=f"P({name})", drawstyle="steps-post", **style)
         grid[1, 0].fill_between(
@@ -118,7 +118,7 @@ def draw_fixed_type(r: Results) -> Any:
     """Draw the share of runs in which a wrong class has P >= 0.9 over time, for targets of one type each."""
     figure, grid = panels(1, 2, (10.0, 3.9))
     names = {"quasi-optimal": "printed rule (8)", "joint-type": "joint posterior of type and class"}
-    for name, style in looks(names).items():
+    for name, style in line_styles(names).items():
         run = r.fixed_type[name]
         wrong = 100.0 * run.wrong()
         fighter = (run.true_class == 2) & (run.true_type == 1)

@@ -7,7 +7,7 @@ import numpy
 from ...baselines.uav_autopilot.theory import stationary
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.figures.looks import COLOURS
-from ..panels import finish, legend_outside, looks, panels
+from ..panels import finish, legend_outside, line_styles, panels
 from .experiment import (
     HORIZON,
     STEADY_WINDOW,
@@ -162,7 +162,7 @@ def draw_covariance(task: UavAutopilot) -> Any:
     figure, axes = panels(1, 2, (9.0, 3.8))
     curves = covariance_curves(task)
     t = numpy.arange(1, TWO_MINUTES + 1) * interval(task)
-    for (label, values), style in zip(curves.items(), looks(curves).values(), strict=True):
+    for (label, values), style in zip(curves.items(), line_styles(curves).values(), strict=True):
         axes[0, 0].plot(t, values[0], label=label, **style)
         if values[1].any():
             axes[0, 1].plot(t, values[1], label=label, **style)

@@ -81,7 +81,7 @@ def advice_html(
         settings=settings,
         figures=pack(
             {
-                "names": _shown(advice),
+                "names": _drawn_names(advice),
                 "episodes": list(_episodes(advice, replay, task)),
                 "profiles": list(_profiles(advice)),
                 "drop": DROP,
@@ -94,7 +94,7 @@ def advice_html(
     )
 
 
-def _shown(advice: Advice) -> list[str]:
+def _drawn_names(advice: Advice) -> list[str]:
     """Return the names of the filters that the pictures show, the advised one first."""
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
 
@@ -136,12 +136,12 @@ def _episodes(advice: Advice, replay: xarray.Dataset, task: Task) -> Iterator[di
             "seconds": _numbers(seconds[::step]),
             "outlier_seconds": _numbers(seconds[advice.outliers[episode, :rows]]),
             "spans": list(_spans(advice, episode, seconds)),
-            **_track(run, task, _shown(advice), step, advice.outliers[episode, :rows]),
+            **_track(run, task, _drawn_names(advice), step, advice.outliers[episode, :rows]),
             **_innovations(run, advice.advised.name, step),
             **_onboard(advice, episode, rows, step),
         }
         if "nis" in run:
-            found["nis"] = [_mean_nis(run, name, seconds) for name in _shown(advice)]
+            found["nis"] = [_mean_nis(run, name, seconds) for name in _drawn_names(advice)]
         yield found
 
 

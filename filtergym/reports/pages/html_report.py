@@ -17,9 +17,9 @@ from ..tables.ranking import origin, ranking_sentence, remarks
 from ..tables.results import Result, Settings, serialise_datasets
 from ..tables.terminal_tables import (
     HEADLINE,
-    against_paper,
     consistency_word,
     main_components,
+    paper_cells,
     rank_competitors,
     score_text,
     with_interval,
@@ -137,7 +137,7 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
     header += ["origin", "control"]
     rows = []
     for name, kind, control in rank_competitors(records):
-        lost, means = against_paper(found, name)
+        lost, means = paper_cells(found, name)
         nees = found.get((name, "anees", "state", "all"))
         value = None if nees is None else nees.value
         score = found.get((name, "score", "", "all"))

@@ -260,7 +260,7 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     yield from _onboard(advice)
     yield from _hindsight(advice)
     yield from _fits(advice)
-    yield from _dearer(advice)
+    yield from _likeliest(advice)
     yield from _outliers(advice)
     if not advice.tunables[advice.fitted.name].anchored:
         yield from _noise(advice)
@@ -445,7 +445,7 @@ def _fits(advice: Advice) -> Iterator[str]:
         )
 
 
-def _dearer(advice: Advice) -> Iterator[str]:
+def _likeliest(advice: Advice) -> Iterator[str]:
     """Yield a sentence on the filter of the highest likelihood, where a cheaper one is advised."""
     if advice.likeliest is None or math.isnan(advice.likeliest[1].value):
         return

@@ -115,9 +115,7 @@ def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
     return min(most, max(FEWEST_EPISODES_FULL, int(2.0 * FULL_SECONDS / seconds)))
 
 
-def without_smoothers_of_closed_loops(
-    problem: Problem, names: Sequence[str], scenario: Any
-) -> tuple[str, ...]:
+def drop_smoothers_of_closed_loops(problem: Problem, names: Sequence[str], scenario: Any) -> tuple[str, ...]:
     """Return the names of competitors without the smoothers, if the scenario is a closed loop."""
     smoothers = {*names} & {*problem.baselines.smoothers}
     if not smoothers or not make_task(problem.task, scenario).closes_loop:
@@ -145,9 +143,7 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
                 affordable = int(FULL_SECONDS / problem.baselines.measurement_seconds)
                 measurements, fewest = min(10 * MEASUREMENTS, affordable), FEWEST_EPISODES_FULL
             episodes = max(fewest, min(5000 if full else 500, measurements // horizon))
-            names = without_smoothers_of_closed_loops(
-                problem, benchmark_policies(problem, full, horizon), name
-            )
+            names = drop_smoothers_of_closed_loops(problem, benchmark_policies(problem, full, horizon), name)
             wanted.append(Cell(problem, name, episodes, names))
     return wanted
 

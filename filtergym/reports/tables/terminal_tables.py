@@ -53,7 +53,7 @@ HEADLINE = "geometric_cost_difference"
 """Metric of the first column: geometric mean of the ratios of the episodes' costs to the paper's, less one."""
 
 
-def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
+def paper_cells(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
     """Return two cells: share of lost tracks with interval, %, and difference of mean cost to the paper's, %."""
     lost, means = (
         found.get((*scenario, name, metric, "", "all"))
@@ -202,8 +202,8 @@ def _cost_columns(
             found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
         ),
         "cost": lambda name: with_interval(found.get((name, "cost", "", "all"))),
-        "lost\ntracks, %": lambda name: against_paper(found, name)[0],
-        "means,\n%": lambda name: against_paper(found, name)[1],
+        "lost\ntracks, %": lambda name: paper_cells(found, name)[0],
+        "means,\n%": lambda name: paper_cells(found, name)[1],
         "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
     }
     compared = any(r.metric == HEADLINE and r.value is not None for r in records)
