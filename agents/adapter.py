@@ -76,7 +76,7 @@ def to_sb3(
 
 
 class TaskVecEnv(VecEnv):
-    """A native vector environment with the interface of Stable-Baselines3, see :func:`to_sb3`."""
+    """A native vector environment with the interface of Stable-Baselines3, made by :func:`to_sb3`."""
 
     def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any, gate: Gate | None) -> None:
         self.env = env

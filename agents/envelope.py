@@ -84,7 +84,7 @@ class EnvelopeAlarm(Alarm):
 
 
 class NetworkWatch:
-    """Share of a network's recent observations that lie outside the range of its training.
+    """Monitor of a live network: share of its recent observations outside the range of its training.
 
     Args:
         model: the model whose observations are passed.
@@ -163,7 +163,7 @@ def _own_parameters(cls: type[Task], run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Departure(NamedTuple):
-    """Difference between the task that an agent is to act in and its training."""
+    """Difference between the task in which an agent acts and its training."""
 
     share: float
     """Share of the values of one field outside the range of training: the field with the largest share."""

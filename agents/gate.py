@@ -154,14 +154,14 @@ class Trust:
 
 
 class GateMemory(NamedTuple):
-    """Memory of a gate."""
+    """Memory of a gate: alarms, fallback policy."""
 
     trust: TrustMemory | None
     fallback: Any
 
 
 class Gate:
-    """Choice between an agent's action and that of a fallback, in training.
+    """Choice in training between an agent's action and a fallback's, by the agent's trust.
 
     Args:
         model: the model whose observations are passed.
@@ -313,7 +313,7 @@ class GatedState(NamedTuple):
 
 
 class GatedEstimator(Filter[Any, Any, GatedState]):
-    """An agent's filter and a fallback side by side.
+    """An agent's filter and a fallback side by side; the estimate is that of the trusted one.
 
     The agent is not trusted while the fallback has predicted the measurements better. The log-likelihood ratios of the
     two are summed within :data:`MOST_ODDS`, so that new ratios soon outweigh old ones. A fallback that uses data that
@@ -422,7 +422,7 @@ def is_gateable(maker: Any) -> bool:
 
 
 class GatedMaker:
-    """Factory of an agent behind a gate, which an evaluation calls with a task.
+    """Maker of an agent behind a gate, which an evaluation calls with a task.
 
     Args:
         problem: the problem of agent and fallback.
@@ -545,7 +545,7 @@ def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
 
 
 class PolicyMaker:
-    """Factory of a policy with wrappers, which is called with a model.
+    """Maker of a wrapped policy, which is called with a model.
 
     Args:
         maker: the policy inside, or a factory of it.

@@ -303,7 +303,7 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
 
 
 class StoredPolicy:
-    """Factory of the policy of a file, which an evaluation calls with a model."""
+    """Maker of the policy in a file, which an evaluation calls with a model."""
 
     def __init__(self, path: Path) -> None:
         self.arrays, self.header = read_arrays(path)

@@ -70,7 +70,7 @@ LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "s
 
 
 class ValidationEntry(TypedDict):
-    """One validation of a run."""
+    """One validation of a training run: step, cost, and difference to the paper's algorithm."""
 
     steps: int
     cost: float
@@ -151,7 +151,7 @@ class TrainingRun:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """A user's options of a run; options that are None come from the algorithm's hyperparameters."""
+    """A user's options of a training run; options that are None come from the algorithm's hyperparameters."""
 
     algorithm: str
     """Name of the algorithm, one of ``FILES``."""

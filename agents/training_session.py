@@ -121,7 +121,7 @@ class Session:
 
 
 class Trainee(NamedTuple):
-    """An agent while it is trained."""
+    """An agent in training: its policy, and functions that save it."""
 
     policy: Any
     """Policy of the agent, for an evaluation."""
@@ -132,7 +132,7 @@ class Trainee(NamedTuple):
 
 
 class Bookkeeping:
-    """Validations and checkpoints of a run, with its record.
+    """Bookkeeping of a run in training: validations, checkpoints, and the record.
 
     Args:
         run: the record, which is updated.

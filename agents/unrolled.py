@@ -149,7 +149,7 @@ class UnrolledLayers:
 
 
 class UnrolledMemory:
-    """The recurrent unit of a policy.
+    """Forward and backward pass of the gated recurrent unit of a policy.
 
     All products of a GRU with its parameters are one matrix times one vector of observation (shown), memory, and 1::
 

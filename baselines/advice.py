@@ -149,7 +149,7 @@ class FittedLog:
         return self._cut[key]
 
     def likelihood(self, spans: Sequence[Span], tunable: Tunable, thinned: bool = False) -> WindowLikelihood:
-        """Return the likelihood function of a family's parameters on spans of the recording.
+        """Return the likelihood function of a filter family's parameters on spans of the recording.
 
         For an anchored family, or with ``thinned``, it uses measurements that are ``APART``.
         """
@@ -170,7 +170,7 @@ class FittedLog:
 
 
 class Fits(NamedTuple):
-    """Families fitted to a log, by name."""
+    """Families of filters fitted to a log, by name: fits, tunables and likelihoods."""
 
     found: dict[str, Fit]
     tunables: dict[str, Tunable]
@@ -187,9 +187,7 @@ class Fits(NamedTuple):
 
 
 class Anchor(NamedTuple):
-    """Comparison of a filter with a second sensor and the best without one, on predictions of measurements some time
-    apart.
-    """
+    """Comparison of a filter with a second sensor to the best one without, on measurements ``APART`` seconds apart."""
 
     name: str
     other: str
@@ -289,7 +287,7 @@ def advise(
     progress: Callable[[str, float], None] = lambda what, share: None,
     price_of: Callable[[str, Any], Mapping[str, int] | None] = lambda name, maker: None,
 ) -> Advice:
-    """Fit every family of filters to a recording, choose one, and judge it against the shipped filters.
+    """Fit every family of filters to a recording, and recommend a fitted or a shipped filter for it.
 
     Args:
         log: the recording, with the options of the fits.
@@ -504,7 +502,7 @@ def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit
 
 
 def _compare_anchored(log: FittedLog, tunables: Mapping[str, Tunable], fitted: Fit) -> Anchor:
-    """Return the gain of a filter with a second sensor over another one, on measurements ``APART`` (time apart).
+    """Return the gain of a filter with a second sensor over another one, on measurements ``APART`` seconds apart.
 
     It is the first of the two ``tunables``, and ``fitted`` is its fit; the other one is fitted here.
 

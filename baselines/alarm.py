@@ -130,8 +130,9 @@ class Alarm:
 
 
 class InnovationAlarm(Alarm):
-    """Alarm of any task whose observation has a block or quantity ``innovation``, each component over its predicted
-    deviation: it detects one that is too large, or for a while too large, too small, or to one side. Where
+    """Alarm for faulty innovations: one that is too large, or several that are too large, too small or to one side.
+
+    It reads the block or quantity ``innovation`` of the observation, each component over its predicted deviation. Where
     ``available`` is zero there is no innovation, which is no evidence.
 
     Raises:

@@ -67,7 +67,7 @@ def own_family(name: str, cls: Any) -> Tunable:
 
 
 class Artefact(NamedTuple):
-    """Content of the file of an advised filter."""
+    """Content of an advised filter's file."""
 
     filter: str
     """Name of the family, or of the shipped filter."""

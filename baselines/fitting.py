@@ -93,8 +93,7 @@ class Fit(NamedTuple):
 
 
 class ScaledNoise(Filter[Task, Any, Any]):
-    """A filter that multiplies the stated deviations of measurements by a factor; its state is that of the scaled
-    filter.
+    """A filter run with the stated deviations of measurements multiplied by a factor; its state is the inner filter's.
 
     Args:
         own: the filter.
@@ -158,7 +157,7 @@ class RobustState(NamedTuple):
     """State of a filter that models outliers."""
 
     own: Any
-    """State of the filter."""
+    """State of the inner filter."""
     likelihood: Likelihood
     """Likelihood of the mixture."""
 

@@ -34,7 +34,7 @@ LONGEST_WARM_UP = 20
 
 
 class Share(NamedTuple):
-    """Spans of a recording on which filters are fitted, chosen and judged."""
+    """Spans of a recording for the fit of filters, the choice among them, and the judgement of the chosen one."""
 
     fitted: list[Span]
     chosen: list[Span]
@@ -119,7 +119,7 @@ def roles_of(share: Share, shape: tuple[int, int]) -> Roles:
 
 
 class Judgement:
-    """Comparison of all competitors on the measurements of the choice and of the judgement.
+    """Comparison of all competitors on a log's measurements for the choice and for the judgement.
 
     Args:
         scores: sums of all competitors.
@@ -241,7 +241,7 @@ class Judgement:
         return tuple(diverging) if len(diverging) < len(fits) else ()
 
     def competitor(self, name: str, rival: str) -> JudgedFilter:
-        """Return a competitor's results on choice and judgement, paired with those of a rival."""
+        """Return a filter's results on the measurements for choice and judgement, paired with a rival's."""
         scores, i, other = self.scores, self._numbers[name], self._numbers[rival]
         penalty, predicts = self._penalty(name), name in self._predicting
         gain = self._chosen.difference(i, other)

@@ -45,7 +45,7 @@ def report_picture(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 class PairSums:
-    """Sums over stretches of values of competitors, for each pair over the measurements for which both are finite.
+    """Sums of competitors' values over stretches of a log, for each pair over the measurements where both are finite.
 
     Args:
         competitors: number of competitors, n.
@@ -246,7 +246,7 @@ class LogScores:
         )
 
     def nis(self, i: int) -> float:
-        """Return competitor i's mean NIS over its dimension in the judgement; NaN where it is unknown."""
+        """Return competitor i's mean NIS over its dimension, on the measurements for the judgement; NaN: unknown."""
         squares, degrees = self._nis[i].tolist()
         return squares / degrees if degrees else math.nan
 

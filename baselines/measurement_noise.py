@@ -14,7 +14,7 @@ LEAST = 0.1
 
 
 class MeasurementNoise:
-    """Noise as stated, by the sensor or its data sheet; subclasses estimate it."""
+    """Noise model of a sensor: its variance as stated; subclasses estimate it from innovations."""
 
     def start(self, stated: Array) -> Any:
         """Return the memory at the start of a track, from the stated variance, ``(N,)``."""
@@ -37,7 +37,7 @@ class MeasurementNoise:
 
 
 class Mehra(MeasurementNoise):
-    """Noise estimated by the mean square of the last innovations.
+    """Noise variance estimated by the mean square of the last innovations.
 
     Args:
         window: number of innovations in the mean.
@@ -58,7 +58,7 @@ class Mehra(MeasurementNoise):
 
 
 class FadingNoise(MeasurementNoise):
-    """Noise estimated with a fading memory.
+    """Base of noise models that estimate the variance with a fading memory.
 
     Args:
         memory: effective number of measurements, ``1 / (1 - b)``.
@@ -71,7 +71,7 @@ class FadingNoise(MeasurementNoise):
 
 
 class SageHusaMeasurementNoise(FadingNoise):
-    """Noise estimated by the fading mean square of the innovations; arguments of :class:`FadingNoise`."""
+    """Noise variance estimated by the fading mean square of the innovations; arguments of :class:`FadingNoise`."""
 
     def start(self, stated: Array) -> adaptation.Level:
         """Return the memory at the start: a fading mean at the stated variance."""
@@ -86,7 +86,9 @@ class SageHusaMeasurementNoise(FadingNoise):
 
 
 class VariationalBayesMeasurementNoise(FadingNoise):
-    """Noise estimated by an inverse-gamma distribution; arguments of :class:`FadingNoise`, with ``rho`` for ``b``."""
+    """Noise variance estimated as an inverse-gamma distribution; arguments of :class:`FadingNoise`, ``rho`` for
+    ``b``.
+    """
 
     iterations = 2
 

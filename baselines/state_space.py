@@ -34,7 +34,7 @@ class StateSpaceKalman(ConstantPolicy):
 
 
 class CovarianceMatching(Policy):
-    """Process noise raised while the normalised innovation squared is above its mean, lowered while it is below."""
+    """Process noise raised while the normalised innovation squared is above its mean, and lowered while it is below."""
 
     control = "noise"
     traceable = True

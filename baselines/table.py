@@ -43,8 +43,9 @@ class Tunable:
     lowest cost where its covariance is too small.
     """
     anchored: bool = False
-    """Whether it uses a second sensor of the motion, with which it distinguishes lasting errors from motion. Advice
-    fits it to measurements some time apart, and compares it with other filters on these (:mod:`.advice`).
+    """Whether it uses a second sensor of the motion, with which it distinguishes lasting errors from motion. The search
+    for the best filter of a log fits it to measurements some time apart, and compares it with other filters on these
+    (:mod:`.advice`).
     """
 
 

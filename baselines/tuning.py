@@ -113,7 +113,7 @@ class Search:
 
 
 class _Generations:
-    """Candidates of a search, and the best of them so far.
+    """Candidates of a search, evaluated within the budget, and the best of them so far.
 
     Args:
         tunable: declaration of the searched values.

@@ -58,9 +58,9 @@ class Cost(NamedTuple):
     """Time of a process."""
 
     processor: float
-    """Seconds."""
+    """Processor time, s."""
     wall: float
-    """Seconds."""
+    """Elapsed time, s."""
 
 
 def commands(quick: bool) -> dict[str, list[str]]:

@@ -111,7 +111,7 @@ class Size(NamedTuple):
 
 
 class Compilers(NamedTuple):
-    """Compilers of the files."""
+    """C compilers for the exported files."""
 
     own: str
     cross: list[str]

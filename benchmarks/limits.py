@@ -30,7 +30,7 @@ SIGNIFICANT = 3.0
 
 
 class Nearest(NamedTuple):
-    """Comparison of the competitors of a scenario with the reference."""
+    """The competitor of least cost in a scenario, compared with the reference."""
 
     environment: str
     scenario: str

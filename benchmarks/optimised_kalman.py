@@ -54,7 +54,7 @@ class Problem(NamedTuple):
     certainty: float
     """Value of every variance of the initial mean's error."""
     stored: bool = False
-    """Whether it is judged on KalmanNet's stored set."""
+    """Whether it is evaluated on KalmanNet's stored test set."""
 
 
 F, H = public.F, public.H
@@ -67,7 +67,7 @@ PROBLEMS = (
 
 
 class ExtendedOptimised(okf.OKF):  # type: ignore[misc]
-    """The package's filter for KalmanNet's Taylor series of the attractor, linearised at the estimate."""
+    """OKF's filter for KalmanNet's Taylor series of the Lorenz attractor, linearised at the estimate."""
 
     def __init__(self, order: int, *args: Any, **keywords: Any) -> None:
         super().__init__(*args, **keywords)

@@ -20,7 +20,7 @@ from filtergym.envs.engine.catalogue import catalogue
 
 
 class Parity(NamedTuple):
-    """Differences in one scenario under one control."""
+    """Largest differences of compiled steps from NumPy's in one scenario under one control."""
 
     environment: str
     control: str

@@ -119,7 +119,7 @@ def write_datasets(
 
 
 class DatasetPlan(NamedTuple):
-    """Data sets before they are written; all errors except those of the folder have been raised by then."""
+    """Checked plan of data sets: experiment, policies and names; writing it raises errors of the folder only."""
 
     experiment: Experiment
     """Experiment of the episodes."""

@@ -40,7 +40,7 @@ MOST_BYTES = 100_000
 
 
 class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One environment of a protocol."""
+    """One environment of a protocol: version, paper's algorithm and scenarios."""
 
     id: str
     """Gymnasium id."""

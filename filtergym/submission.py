@@ -94,7 +94,7 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 
 class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a file, without further members."""
+    """Base of the parts of a submission's file; further members are errors."""
 
 
 class Card(_Stored, frozen=True):
@@ -582,7 +582,7 @@ def _number(value: float | None) -> str:
 
 
 class Verification(NamedTuple):
-    """Results of a verification."""
+    """Results of a verification: deviations on the same and on fresh episodes, and suspicions."""
 
     submission: Submission
     digest: str
@@ -600,7 +600,7 @@ class Verification(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether rounding explains the one deviation, and chance the other."""
+        """Whether the results hold: rounding explains the deviation on the same episodes, chance that on fresh ones."""
         return self.deviation.holds and self.fresh_deviation.holds
 
 

@@ -15,7 +15,7 @@ from .augmented import AugmentedFilter, AugmentedMemory
 
 
 class Navigator(NamedTuple):
-    """State of the augmented filter."""
+    """State of the augmented filter: position, and memory of its errors."""
 
     mean: Array
     """Position, ``(A, N)``, m."""

@@ -175,7 +175,7 @@ class InnovationAdaptive(TimeVarying):
 
 
 class _Offset(NamedTuple):
-    """Memory of :class:`AugmentedFilterGain`."""
+    """Memory of :class:`AugmentedGain`."""
 
     offset: numpy.ndarray
     """Estimate of the augmented filter less the steered one, ``(axes, N)``, m."""

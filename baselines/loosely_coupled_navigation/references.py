@@ -30,7 +30,7 @@ from .estimators import likelihood_of_fix
 
 
 class ErrorState(NamedTuple):
-    """State of the filter that is given the draw of the episode."""
+    """State of the reference filter, the INS error and the receiver's coloured error."""
 
     delta: Array
     """Estimate of the INS error, m, ``(A, N)``."""
@@ -41,13 +41,11 @@ class ErrorState(NamedTuple):
     receiver: Array
     """Estimate of the receiver's coloured error, m, ``(A, N)``."""
     covariance: receiver_faults.FaultCovariance
-    """``(N,)`` each, the same for every axis."""
+    """Covariance entries, ``(N,)`` each, the same for every axis."""
 
 
 class _Matched:
-    """The Kalman filter that is given the draw of the episode. Errors are then Gaussian, so it is the filter of least
-    mean square error.
-    """
+    """Kalman filter that knows the draw of the episode; errors are then Gaussian, and the filter is optimal."""
 
     traceable = True
     knows = (
@@ -112,8 +110,10 @@ class _Matched:
 
 
 class Matched(_Matched):
-    """The Kalman filter that is given the draw of the episode, the estimate of least mean square error: the noise
-    levels of INS and receiver, sample by sample, that of the coloured error, and onset and rate of the spoofing.
+    """The Kalman filter that knows the draw of the episode: the estimate of least mean square error.
+
+    The draw is the noise levels of INS and receiver, sample by sample, that of the coloured error, and onset and rate
+    of the spoofing.
     """
 
     kind = "reference"

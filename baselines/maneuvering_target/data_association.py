@@ -17,7 +17,7 @@ from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, Kalman
 
 
 class AllPlots(KalmanModel):
-    """Probabilistic data association in place of the nearest plot.
+    """Base of filters with probabilistic data association in place of the nearest plot.
 
     The density of false plots is unknown; it is estimated by that of the plots of the scan (nonparametric; Bar-Shalom
     and Fortmann 1988, section 6.4).

@@ -62,7 +62,7 @@ class ConstantVelocity(KalmanModel):
 
 
 class KalmanMixture(NamedTuple):
-    """State of the IMM over Kalman filters."""
+    """State of the IMM over Kalman filters: their estimates and mode probabilities."""
 
     mean: Array
     covariance: Array
@@ -147,7 +147,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
 
 
 class TurnModel(ConstantVelocityModel):
-    """The nearly coordinated turn, with the turn rate as fifth state.
+    """Motion model of the nearly coordinated turn, with the turn rate as fifth state.
 
     Args:
         task: the problem.

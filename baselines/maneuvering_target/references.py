@@ -28,7 +28,7 @@ class TurnMemory(NamedTuple):
 
 
 class KnownTurn(KalmanModel):
-    """The Kalman filter that is given the manoeuvres of the episode: the optimal one, given these.
+    """The Kalman filter that knows the manoeuvres of the episode: the optimal one, given these.
 
     It knows begin, end and kind of each: the acceleration of thrust, the rate of a turn. Then the flight has no random
     disturbance. With x the state, z the given state of the target and F the transition that turns a deviation of the
@@ -38,8 +38,8 @@ class KnownTurn(KalmanModel):
     clutter the plot of the target. Of a coloured error it knows deviation and correlation time, and estimates its level
     as two more states.
 
-    Flights that are tables, such as those of aircraft, have no turn rates: there it is given the acceleration from scan
-    to scan, which counts as thrust.
+    Flights that are tables, such as those of aircraft, have no turn rates: there it knows the acceleration from scan to
+    scan, which counts as thrust.
     """
 
     kind = "reference"
@@ -108,7 +108,7 @@ class KnownTurn(KalmanModel):
 
 
 class KnownInputBound(ConstantVelocityModel):
-    """Posterior Cramér-Rao bound of an estimator that is given the whole acceleration: no process noise."""
+    """Posterior Cramér-Rao bound of an estimator that knows the whole acceleration: no process noise."""
 
     kind = "bound"
     traceable = True

@@ -24,8 +24,10 @@ LEAST = 1e-300
 
 
 class ClassAlarm(Alarm):
-    """Alarm on a class that explains the radar better than the weights in force, on decisions that are all about one
-    type, where the paper draws the type anew every time, and on too many decisions that the bearing gate rejects.
+    """Alarm for a wrong class, for ESM decisions that are all on one type, and for too many rejected decisions.
+
+    A class is wrong where another one explains the radar better than the weights in force. The paper draws the type of
+    a decision anew every time. The bearing gate rejects decisions.
 
     Radar errors that no class explains raise no alarm: other weights of the classes cannot correct them.
     """
@@ -77,7 +79,7 @@ class ClassAlarm(Alarm):
 
 
 class InnovationsAlarm(Alarm):
-    """Innovations of all hypotheses of control ``hypotheses`` together that are larger, smaller or to one side."""
+    """Alarm for innovations of all hypotheses together that are larger, smaller or to one side (``hypotheses``)."""
 
     window = 50
 

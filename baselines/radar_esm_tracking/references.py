@@ -111,7 +111,7 @@ class _KnownDraw:
 
 
 class Ideal(_KnownDraw):
-    """The Kalman filter that is given the draw of the episode: the optimal one, given it."""
+    """The Kalman filter that knows the draw of the episode: the optimal one, given it."""
 
     kind = "reference"
 

@@ -8,8 +8,9 @@ from ..alarm import LARGER, Alarm, fault_evidence, scale_ratio
 
 
 class SensorAlarm(Alarm):
-    """Innovations of a group of sensors too large under every hypothesis, or accelerometers that repeat their last
-    reading exactly: noise never does. Hidden satellites raise no alarm: the filters observe which are hidden.
+    """Alarm for sensors: too large innovations under every hypothesis, or accelerometers that repeat a reading.
+
+    Noise never repeats exactly. Hidden satellites raise no alarm, since the filters observe which are hidden.
     """
 
     window = 20

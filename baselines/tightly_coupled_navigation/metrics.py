@@ -45,7 +45,7 @@ def find_lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarra
 
 
 class Switch(NamedTuple):
-    """One change of the true hypothesis."""
+    """One change of the true hypothesis, with the bank's delay in following it."""
 
     episode: int
     before: int

@@ -150,7 +150,7 @@ class _KnownMode:
 
 
 class KnownMode(_KnownMode):
-    """One extended Kalman filter that is given the draw of the episode: legs, faults, and all noise levels.
+    """One extended Kalman filter that knows the draw of the episode: legs, faults, and all noise levels.
 
     At rest, and in straight flight on the fixed courses, which has steady increments and no noise, the bank's small
     regularising noise remains, so that the reported covariance stays invertible.
@@ -197,7 +197,7 @@ class KnownMode(_KnownMode):
 
 
 class KnownModeBound(_KnownMode):
-    """Posterior Cramér-Rao bound of an estimator that is given the hypothesis and the beginnings of manoeuvres.
+    """Posterior Cramér-Rao bound of an estimator that knows the hypothesis and the beginnings of manoeuvres.
 
     The covariance recursion of the motion that generates the truth, along the true states: no motion noise
     at rest, that of the increments on random straight flight (none on the fixed courses, whose increments are

@@ -25,7 +25,7 @@ from ..table import Variant
 
 
 class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
-    """The nominal filter with its settled, constant gain; it ignores missing readings."""
+    """The nominal filter with its steady-state, constant gain; it ignores missing readings."""
 
     def __init__(self, task: UavAutopilot) -> None:
         super().__init__(task)
@@ -51,7 +51,7 @@ class SensorAware(NamedTuple):
     """State of one filter with its estimate of the sensors' noise."""
 
     mean: Array
-    """``(n, N)``."""
+    """Mean of the state, ``(n, N)``."""
     covariance: Array
     """Covariance of the state, packed."""
     noise: tuple[Any, ...]
@@ -59,7 +59,7 @@ class SensorAware(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Result of the update with one measurement."""
+    """Result of a prediction and the update with one measurement."""
 
     filter: SensorAware
     log_likelihood: Array
@@ -76,9 +76,9 @@ class AdaptiveState(NamedTuple):
     """State of a filter that estimates noise."""
 
     mean: Array
-    """``(n, N)``."""
+    """Mean of the state, ``(n, N)``."""
     covariance: Array
-    """``(n, n, N)``."""
+    """Covariance of the state, ``(n, n, N)``."""
     likelihood: Likelihood
     memory: Any
     """Memory of the filter, with the filters of an IMM."""

@@ -16,7 +16,7 @@ from ...filters import packed_covariance
 
 
 class TrueState:
-    """The true state as the estimate: no estimator is better for this loop."""
+    """Reference whose estimate is the true state: no estimator is better for this loop."""
 
     kind = "reference"
     traceable = True

@@ -90,7 +90,7 @@ class Trained(NamedTuple):
 
 
 class EpisodeMeans(NamedTuple):
-    """Means over every episode of one scenario, from which all statistics follow."""
+    """All policies' mean costs and squared errors of every episode in one scenario."""
 
     cost: dict[str, numpy.ndarray]
     """Mean cost of every episode, ``(episodes,)``, by policy."""
@@ -100,7 +100,7 @@ class EpisodeMeans(NamedTuple):
 
 
 class PolicyMeans(NamedTuple):
-    """Means over every episode of one policy."""
+    """One policy's mean cost and squared errors of every episode."""
 
     cost: numpy.ndarray
     """Mean cost of every episode, ``(episodes,)``."""
@@ -120,7 +120,7 @@ class Spread(NamedTuple):
 
 
 def spread(values: numpy.ndarray) -> Spread:
-    """Return mean and variances of training seeds and of episodes (two-way random effects, one value a cell).
+    """Return the mean with interval, and its variation over training seeds and over episodes (random effects).
 
     The moment estimates are those of the analysis of variance. The interval of the mean covers new seeds
     and new episodes: Student's t with Satterthwaite's degrees of freedom. A bootstrap over five seeds would

@@ -82,7 +82,7 @@ class FileOptions(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Files that an evaluation writes."""
+    """Files that an evaluation writes, with their formats."""
 
     folder: Path | None
     """Folder for records, a table, the whole result and figures."""

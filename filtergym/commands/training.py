@@ -19,7 +19,7 @@ Trainer = Callable[[TrainingRun, Session], TrainingRun]
 
 
 class Training(NamedTuple):
-    """A run and its session."""
+    """A training run with the settings of its session."""
 
     folder: Path
     """Folder of the run, as the user names it."""

@@ -289,10 +289,10 @@ class LogText(FilterText):
 
 
 class RegularReading(NamedTuple):
-    """Reading of rows at one rate."""
+    """Parts of the C program that reads a log of rows at one rate."""
 
     names: list[str]
-    """Names of the columns."""
+    """Names of the columns that the program reads."""
     needed: int
     """Number of required columns, which are the first ones."""
     reading: str

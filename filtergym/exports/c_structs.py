@@ -10,7 +10,7 @@ from .traced_filter import Member
 
 
 class Structure(NamedTuple):
-    """A struct of C."""
+    """A struct of C: its arrays, and the places of numbers in it."""
 
     name: str
     arrays: list[tuple[str, tuple[int, ...], str, list[int]]]

@@ -57,7 +57,7 @@ class Declaration(NamedTuple):
     """The parameters of a competitor that can be set."""
 
     tuned: list[Declared]
-    """Values of its tuning."""
+    """Parameters of its tuning."""
     own: list[Declared]
     """Parameters of the task."""
     tunable: Tunable | None

@@ -592,7 +592,7 @@ def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
 
 
 class _Derived:
-    """Largest expressions of parameters alone in a filter, in the order of the rows of ``DERIVED``.
+    """Largest expressions of a filter that depend on parameters alone, in the order of the rows of ``DERIVED``.
 
     Args:
         nodes: expressions of the filter.

@@ -11,7 +11,7 @@ class VarianceReduction(NamedTuple):
 
     position: Array
     velocity: Array
-    """In units of 1 / T^2."""
+    """Velocity variance, in units of 1 / T^2."""
     prediction: Array
 
 

@@ -102,7 +102,7 @@ def comparisons(r: Results) -> dict[str, Comparison]:
 
 
 class GridFinding(NamedTuple):
-    """Minimum of an error on the gain grid."""
+    """Minimum of an error on the gain grid, and its place relative to the recommended box."""
 
     minimum: float
     gains: tuple[float, float]
@@ -111,7 +111,7 @@ class GridFinding(NamedTuple):
     near: int
     """Cells within ``NEAR_MINIMUM`` of the smallest."""
     near_inside: int
-    """Those of them in the box."""
+    """Cells within ``NEAR_MINIMUM`` of the smallest that are in the box."""
     inside_excess: Quantity
     """Smallest error in the box over the smallest anywhere, minus one."""
 

@@ -25,7 +25,7 @@ class Flight(NamedTuple):
     variance: numpy.ndarray
     """Variance of the measurement at the true position, from the start on, m^2, ``(K + 1,)``."""
     interval: float
-    """T, s."""
+    """Sampling interval T, s."""
 
 
 def maneuver_flight(parameters: ManeuveringTargetParameters) -> Flight:
@@ -49,9 +49,9 @@ class MeanSquares(NamedTuple):
     """Mean square of the error in each scan."""
 
     position: numpy.ndarray
-    """m^2, ``(K, ...)``."""
+    """Mean square of the position error, m^2, ``(K, ...)``."""
     velocity: numpy.ndarray
-    """(m/s)^2, ``(K, ...)``."""
+    """Mean square of the velocity error, (m/s)^2, ``(K, ...)``."""
 
 
 def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:

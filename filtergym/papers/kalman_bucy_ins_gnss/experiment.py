@@ -63,7 +63,7 @@ GAINS = {
 
 
 class FirstOrder(NamedTuple):
-    """Runs of example (a)."""
+    """Results of the runs of example (a)."""
 
     time: numpy.ndarray
     path: Mapping[str, numpy.ndarray]

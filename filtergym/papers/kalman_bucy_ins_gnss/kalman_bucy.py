@@ -165,9 +165,9 @@ class Moments(NamedTuple):
     """Mean and covariance of the random process at given instants."""
 
     mean: Matrix
-    """``(k, n)``."""
+    """Mean at each instant, ``(k, n)``."""
     covariance: Matrix
-    """``(k, n, n)``."""
+    """Covariance at each instant, ``(k, n, n)``."""
 
 
 def moments(
@@ -209,11 +209,11 @@ class SampledCovariance(NamedTuple):
     """Error covariances of a sampled filter, measurement by measurement."""
 
     predicted: Matrix
-    """Before each measurement, ``(steps, n, n)``."""
+    """Covariance before each measurement, ``(steps, n, n)``."""
     updated: Matrix
-    """After each measurement, ``(steps, n, n)``."""
+    """Covariance after each measurement, ``(steps, n, n)``."""
     gain: Matrix
-    """Of each measurement, ``(steps, n, m)``; the counterpart of ``K step``."""
+    """Gain of each measurement, ``(steps, n, m)``; the counterpart of ``K step``."""
 
 
 def sampled_covariance(

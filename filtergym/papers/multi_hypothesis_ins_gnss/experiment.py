@@ -88,7 +88,8 @@ class Run(NamedTuple):
 
     squares: numpy.ndarray
     """Squared spherical errors of position, velocity, acceleration, attitude, and squared errors of clock
-    bias and drift, ``(E, K, 6)``."""
+    bias and drift, ``(E, K, 6)``.
+    """
     variance: numpy.ndarray
     """Reported variance of the position, ``(E, K)``, m^2."""
     probability: numpy.ndarray
@@ -252,7 +253,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
 
 
 class Loss(NamedTuple):
-    """Lost tracks: their number, and times."""
+    """Lost tracks: their share, and times from the manoeuvre to the loss."""
 
     rate: float
     median: float

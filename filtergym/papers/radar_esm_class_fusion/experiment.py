@@ -135,9 +135,9 @@ class Run(NamedTuple):
     true_probability: numpy.ndarray
     """Probability of the true class, ``(episodes, K)``."""
     true_class: numpy.ndarray
-    """``(episodes,)``."""
+    """Index of the true class, ``(episodes,)``."""
     true_type: numpy.ndarray
-    """``(episodes,)``."""
+    """Index of the true type, ``(episodes,)``."""
     cost: numpy.ndarray
     """Mean cost over the scans, ``(episodes,)``."""
 

@@ -167,7 +167,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
 
 
 class Loop(NamedTuple):
-    """Matrices of the loop: plant, sensors, feedback, settled filter gain, covariances of the noise."""
+    """Matrices of the control loop: plant, sensors, feedback, steady-state filter gain, noise covariances."""
 
     F: numpy.ndarray
     B: numpy.ndarray

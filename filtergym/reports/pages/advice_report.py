@@ -47,7 +47,7 @@ ROLES = {"fitted": "fitted to", "chosen": "chosen by", "judged": "judged by"}
 def advice_html(
     advice: Advice, task: Task, sentences: Sequence[str], learned: Sequence[str], settings: Settings
 ) -> str:
-    """Return the HTML page of an advice.
+    """Return the HTML report on the filter that is recommended for a recording.
 
     Args:
         advice: advice from :func:`~..baselines.advice.advise`.

@@ -20,7 +20,7 @@ from ...evaluation.stress.crash_test import (
 
 STYLES = {PASSED: "green", DEGRADED: "yellow", FAILED: "red", NOTHING: "dim"}
 PAGE_WIDTH = 150
-"""Columns of a page."""
+"""Width of the tables on a page, characters."""
 
 
 def count_verdicts(findings: Sequence[Finding]) -> str:

@@ -264,15 +264,15 @@ def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
 
 
 class Figure(NamedTuple):
-    """A figure of a scenario."""
+    """Title and texts of a figure of a scenario; the page's script draws it."""
 
     kind: str
     """Kind, by which the page's script draws it."""
     title: str
     text: str
-    """Description."""
+    """Description below the figure."""
     alternative: str
-    """Alternative for readers who do not see it."""
+    """Text for readers who do not see the figure."""
 
 
 def _figures(result: Result) -> Iterator[Figure]:

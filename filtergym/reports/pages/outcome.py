@@ -157,9 +157,9 @@ class Lead(NamedTuple):
     name: str
     """Name of the leader where the most time is allowed."""
     first: float
-    """Lower end, ns."""
+    """Shortest of these times, ns."""
     last: float
-    """Upper end, ns: the time of the competitor that ends the lead."""
+    """Longest of these times, ns: that of the competitor that ends the lead."""
 
 
 def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) -> Lead | None:

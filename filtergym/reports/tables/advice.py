@@ -81,7 +81,7 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
 
 
 class Row(NamedTuple):
-    """A row of the table of an advice."""
+    """A row of the table that compares the recommended filter with others."""
 
     name: str
     label: str
@@ -90,7 +90,7 @@ class Row(NamedTuple):
 
 
 def advice_columns(advice: Advice) -> dict[str, int]:
-    """Return the least width of each column of an advice's table, by its title."""
+    """Return the least width of each column of the table of compared filters, by its title."""
     return {**COLUMNS, **({} if advice.onboard is None else WITHHELD)}
 
 

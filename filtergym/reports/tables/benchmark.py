@@ -53,7 +53,7 @@ cost as much as many.
 
 
 class Cell(NamedTuple):
-    """One environment in one scenario."""
+    """A cell of a benchmark: one environment in one scenario, with its competitors and episodes."""
 
     problem: Problem
     scenario: str
@@ -204,7 +204,7 @@ class BenchmarkOptions(NamedTuple):
     seed: int = 0
     """Number of the experiment."""
     environments: Sequence[str] = ()
-    """Ids; empty: all."""
+    """Gymnasium ids; empty: all environments."""
     split: str = "test"
     """Split of the episodes; another one than test is for development."""
     backend: str = "auto"

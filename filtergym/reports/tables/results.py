@@ -43,7 +43,7 @@ REQUIRED_DIMENSIONS: dict[str, tuple[str, ...]] = {
 
 
 class Settings(NamedTuple):
-    """How results were made."""
+    """Command and versions with which results were made."""
 
     command: str
     """Command that makes them again."""
@@ -73,14 +73,14 @@ class WorstTrack(NamedTuple):
 
 
 class Result(NamedTuple):
-    """One environment in one scenario."""
+    """Results of one environment in one scenario: records, curves, a track, and texts."""
 
     environment: str
     scenario: str
     description: str
     """Description of the scenario."""
     default: bool
-    """Whether it is the environment's training distribution."""
+    """Whether the scenario is the environment's training distribution."""
     training: bool
     """Whether agents may be trained in it."""
     paper: str
