@@ -61,8 +61,8 @@ from .table import Tunable
 from .tuned_values import make_tuned_policy
 
 FITTED, RUN, REFITTED = 0.35, 0.7, 0.97
-"""Share of an advice that is done when all families are fitted, all competitors have run over the log, and the chosen
-one is fitted again; of logs of some ten thousand measurements.
+"""Share of the work of :func:`advise` that is done when all families are fitted, all competitors have run over the log,
+and the chosen one is fitted again; of logs of some ten thousand measurements.
 """
 APART = 10.0
 """Time between the measurements to which anchored filters are fitted, s. Over shorter times the fixes reflect the

@@ -1,4 +1,4 @@
-"""Comparison of a vehicle's own filter with the filters of an advice on fixes withheld from the latter.
+"""Comparison of a vehicle's own filter with fitted and shipped filters on fixes withheld from the latter.
 
 Every fifth fix of a log is withheld. Filters run over the others, and predict the withheld ones. The estimates of the
 vehicle's own filter come from the log; there is no truth. A fix is logged with a delay, so the estimate is read that

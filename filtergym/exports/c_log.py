@@ -204,7 +204,7 @@ class LogText(FilterText):
         return self._log(about, follow, names, len(names), limits)
 
     def _plot_log(self, rows: PlotRows, log: LogSetup) -> str:
-        """Return the text of the C program for plots, read as for the advice of the filter; empty for other logs."""
+        """Return the text of the C program for plots, read as for the filter's fit; empty for other logs."""
         names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
         measured = {*self.structs["measurement"].columns.values()}
         second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), None)
@@ -247,11 +247,11 @@ class LogText(FilterText):
         return self._log(about, follow, columns, 2, limits)
 
     def _regular_log(self, numbers: Mapping[str, float], log: LogSetup) -> str:
-        """Return the text of the C program for rows at one rate, read as for the advice; empty for other logs.
+        """Return the text of the C program for rows at one rate, read as for the filter's fit; empty for other logs.
 
         Args:
             numbers: constants of the reading.
-            log: reading of the log for the advice.
+            log: options with which the log of the fit was read.
         """
         if "range_rate" in log.columns:
             rows = _rows_with_looks(log.columns, numbers)

@@ -194,12 +194,12 @@ class Agreement(NamedTuple):
 
 
 def closed_form(times: Any) -> numpy.ndarray:
-    """Return the covariance (5) of example (a) at given times, in closed form."""
+    """Return the Riccati covariance (5) of example (a) at given times, in closed form."""
     return kalman_bucy.riccati_scalar(A, INTENSITY, 1.0 / RECEIVER, 0.0, times)
 
 
 def riccati_agreement() -> Agreement:
-    """Solve (5) in three ways, and return the largest differences between the solutions."""
+    """Solve the Riccati equation (5) in three ways, and return the largest differences between the solutions."""
     times = numpy.linspace(0.01, 5.0, 50)
     solvers = (kalman_bucy.riccati_hamiltonian, kalman_bucy.riccati_ode)
     scalar = [solve(A, INTENSITY, 1.0, RECEIVER, 0.0, times)[:, 0, 0] for solve in solvers]

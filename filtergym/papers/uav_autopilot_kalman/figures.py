@@ -113,7 +113,7 @@ def draw_node(name: str, unit: str, title: str, noise: Signals, step: Signals) -
 
 
 def draw_pitch_spectra(signals: Signals) -> Any:
-    """Draw the spectra of plant U."""
+    """Draw the power spectra of the signals in the loop of plant U."""
     figure, axes = panels(1, 1, (8.0, 3.8))
     axis, T = axes[0, 0], interval(signals.task)
     nodes = (("observation", "node 2", 5), ("estimate", "node 3", 0), ("innovation", "node 4", 2))

@@ -1,4 +1,4 @@
-"""An advice as one self-contained page: sentences, tables, the checks of the log, and pictures of the results.
+"""The report on a recommended filter as one self-contained page: sentences, tables, checks of the log, pictures.
 
 Time in pictures is in seconds since the first row of the log.
 """

@@ -1,4 +1,4 @@
-"""Tables and sentences of an advice: the recommended filter, its parameters, and the reasons."""
+"""Tables and sentences on a recommended filter, its parameters, and the reasons."""
 
 import math
 import textwrap
@@ -21,7 +21,7 @@ MOST_OUTLIERS = 12
 """Largest number of outliers in a sentence."""
 MOST_ROWS = 12
 LEAST_CORRELATION = 0.1
-"""Correlation of successive prediction errors from which the advice mentions it."""
+"""Correlation of successive prediction errors from which a sentence mentions it."""
 SMALL_SCALE = 0.3
 """Scale of the noise below which most of the error lasts longer than a measurement, or the stated
 deviations are wrong.
@@ -44,7 +44,7 @@ PRICES = {
 NEGLIGIBLE = 5e-4
 """Difference of errors that is zero in the digits of a sentence."""
 FEW = 80
-"""Number of measurements below which an advice warns."""
+"""Number of measurements below which a sentence warns."""
 FEWEST_MEASUREMENTS = 30
 """Least number of measurements of an informative log; a choice: six for each of some five parameters."""
 
@@ -134,7 +134,7 @@ def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[
 
 
 def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
-    """Return a table of the cost of an update of each filter of an advice; None if none is known."""
+    """Return a table of the cost of an update of each compared filter; None if none is known."""
     rows = price_rows(advice, learned)
     if not rows:
         return None
@@ -284,7 +284,7 @@ def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interv
 
 
 def verdict(advice: Advice) -> str:
-    """Return the first sentence of an advice: the advised filter, and its error against its rival's."""
+    """Return the first sentence of a recommendation: the filter, and its error against its rival's."""
     one, rival = advice.fitted, advice.rival
     judged = sum(span.last - span.first for span in advice.share.judged)
     where = (
