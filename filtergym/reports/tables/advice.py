@@ -288,9 +288,9 @@ def verdict(advice: Advice) -> str:
     one, rival = advice.fitted, advice.rival
     judged = sum(span.last - span.first for span in advice.share.judged)
     where = (
-        f"on {judged:,} measurements that neither was chosen by"
+        f"on {judged:,} measurements on which neither was chosen"
         if advice.share.apart
-        else f"on the same {judged:,} measurements that it was fitted to, which flatters it"
+        else f"on the same {judged:,} measurements to which it was fitted, where its error is underestimated"
     )
     if one is not advice.advised and one.relative_error.low > 0.0 and one.gain.value > 0.0:
         return (
@@ -316,8 +316,8 @@ def verdict(advice: Advice) -> str:
     if math.isnan(one.relative_error.value):
         return f"{name}: {one.difference.value:+.3f} nats per measurement against {rival}, {where}."
     text = (
-        f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter that one would take by the "
-        f"same measurements, {where}."
+        f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter chosen on the same "
+        f"measurements, {where}."
     )
     if one.relative_error.low <= 0.0 <= one.relative_error.high:
         costs = _operations(advice, rival, one.name)
