@@ -107,17 +107,17 @@ class FittedLog:
         """Median time between the recording's measurements, s."""
         return float(numpy.nanmedian(numpy.diff(self.recording.seconds, axis=1)))
 
-    def with_noise(self, family: Tunable, own: bool = False, robust: bool = False) -> Tunable:
+    def with_noise(self, family: Tunable, is_own: bool = False, robust: bool = False) -> Tunable:
         """Return a family with the scale of the measurement noise as one more parameter, if ``noise`` is set.
 
         A family with a second sensor is returned unchanged: measurements ``APART`` contain little information on the
-        scale. With ``robust`` the share of outliers is added, except to a user's ``own`` family, whose records may be
-        incomplete.
+        scale. With ``robust`` the share of outliers is added, except to a user's family (``is_own``), whose records
+        may be incomplete.
         """
         log_format = find_companion(self.problem.task, LogFormat)
         if family.anchored or log_format is None or log_format.scale_noise is None:
             return family
-        if robust and not own:
+        if robust and not is_own:
             family = with_outliers(family, log_format.scale_noise)
         return with_noise_scale(family, log_format.scale_noise) if self.noise else family
 
@@ -283,7 +283,7 @@ class Advice(NamedTuple):
 def advise(
     log: FittedLog,
     shipped: Mapping[str, Any],
-    own: Mapping[str, Tunable] | None = None,
+    user_families: Mapping[str, Tunable] | None = None,
     progress: Callable[[str, float], None] = lambda what, share: None,
     price_of: Callable[[str, Any], Mapping[str, int] | None] = lambda name, maker: None,
 ) -> Advice:
@@ -292,7 +292,7 @@ def advise(
     Args:
         log: the recording, with the options of the fits.
         shipped: competitors that are not fitted, by name.
-        own: further families, such as a user's estimator with limits of its parameters.
+        user_families: further families, such as a user's estimator with limits of its parameters.
         progress: function that is called with a description of the work done, or an empty text, and the share of all
             work.
         price_of: function from a competitor's name and maker to the costs of an update: ``operations`` and further
@@ -302,7 +302,7 @@ def advise(
         ValueError: if no family can be fitted, or the recording is too short.
     """
     problem, recording = log.problem, log.recording
-    fits = _fit_families(log, own or {}, progress)
+    fits = _fit_families(log, user_families or {}, progress)
     makers = {**shipped, **{name: fits.make(name) for name in fits.found}}
     prices = Prices(makers, price_of)
     counts = {name: len(found.values) for name, found in fits.found.items()}
@@ -479,14 +479,14 @@ def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, In
     return tunable, found, {name: each.interval for name, each in profiles.items()}
 
 
-def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit) -> numpy.ndarray:
+def find_outliers(task: Task, recording: Recording, tunable: Tunable, result: Fit) -> numpy.ndarray:
     """Return a boolean mask ``(E, T)`` of the measurements that a fitted filter treats as outliers."""
     is_outlier: numpy.ndarray = numpy.zeros(recording.seconds.shape, dtype=bool)
-    if OUTLIER_SHARE not in found.values:
+    if OUTLIER_SHARE not in result.values:
         return is_outlier
     template, like = measure_once(type(task)(task.parameters), recording.measurements)
     initial = {name: numpy.moveaxis(values, 0, -1) for name, values in recording.initial.items()}
-    estimator = tunable.apply(found.values)[1](task)
+    estimator = tunable.apply(result.values)[1](task)
     # The scale of the noise is outside, the choice between two updates within.
     scaled = estimator if isinstance(estimator, ScaledNoise) else ScaledNoise(estimator, lambda m, _: m, 1.0)
     robust: Any = scaled.own

@@ -103,7 +103,7 @@ def write_advised(
     problem: Problem,
     name: str,
     recording: Any,
-    found: Fit | None,
+    fit: Fit | None,
     intervals: Mapping[str, Interval],
     command: str,
     **further: Any,
@@ -115,7 +115,7 @@ def write_advised(
         problem: problem of the filter.
         name: name of its family, or of the shipped filter.
         recording: recording on which it was fitted or judged.
-        found: result of the fit; None for a shipped filter.
+        fit: result of the fit; None for a shipped filter.
         intervals: intervals of its parameters.
         command: command that wrote it.
         **further: further entries of the file, such as its held-out numbers.
@@ -127,18 +127,18 @@ def write_advised(
     table: dict[str, Any] = {
         "environment": problem.id,
         "filter": name,
-        "fitted": found is not None,
-        "values": {} if found is None else {key: round_value(value) for key, value in found.values.items()},
+        "fitted": fit is not None,
+        "values": {} if fit is None else {key: round_value(value) for key, value in fit.values.items()},
         "intervals": {
             key: [round_value(each.low), round_value(each.high)] for key, each in intervals.items()
         },
-        "measurements": None if found is None else found.measurements,
+        "measurements": None if fit is None else fit.measurements,
         "log": {
             **log._asdict(),
             "units": {key: known[key].text for key in log.columns if key in known},
-            "noise_scale": 1.0 if found is None else round_value(10.0 ** found.values.get(NOISE_SCALE, 0.0)),
-            "outlier_share": round_value(10.0 ** found.values[OUTLIER_SHARE])
-            if found is not None and OUTLIER_SHARE in found.values
+            "noise_scale": 1.0 if fit is None else round_value(10.0 ** fit.values.get(NOISE_SCALE, 0.0)),
+            "outlier_share": round_value(10.0 ** fit.values[OUTLIER_SHARE])
+            if fit is not None and OUTLIER_SHARE in fit.values
             else None,
             "start": "from the first row"
             if log_format and log_format.regular_rows

@@ -133,12 +133,12 @@ class ScaledNoise(Filter[Task, Any, Any]):
         return self.own.records(state, self.scaled(measurement, self.factor))
 
 
-def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunable:
+def with_noise_scale(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tunable:
     """Return a tunable estimator with the decimal logarithm of the measurement noise's scale as one more parameter.
 
     Args:
         tunable: an estimator.
-        scaled: function of a measurement and a factor that multiplies the stated deviations by it.
+        scale: function of a measurement and a factor that multiplies the stated deviations by it.
     """
     low, start, high = NOISE_LIMITS
 
@@ -146,7 +146,7 @@ def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tun
         own = {name: value for name, value in values.items() if name != NOISE_SCALE}
         keywords, make = tunable.apply(own)
         factor = 10.0 ** values[NOISE_SCALE]
-        return keywords, lambda task: ScaledNoise(as_filter(task, make(task)), scaled, factor)
+        return keywords, lambda task: ScaledNoise(as_filter(task, make(task)), scale, factor)
 
     limits = {**tunable.limits, NOISE_SCALE: (low, high)}
     start_values = {**tunable.start, NOISE_SCALE: start}
@@ -213,7 +213,7 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         return self.own.covariance(state.own)
 
 
-def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunable:
+def with_outliers(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tunable:
     """Return a tunable estimator with the share of outliers as one more parameter.
 
     Arguments are those of :func:`with_noise_scale`.
@@ -224,7 +224,7 @@ def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunabl
         own = {name: value for name, value in values.items() if name != OUTLIER_SHARE}
         keywords, make = tunable.apply(own)
         share = 10.0 ** values[OUTLIER_SHARE]
-        return keywords, lambda task: RobustEstimator(as_filter(task, make(task)), scaled, share)
+        return keywords, lambda task: RobustEstimator(as_filter(task, make(task)), scale, share)
 
     limits = {**tunable.limits, OUTLIER_SHARE: (low, high)}
     return dataclasses.replace(
@@ -338,7 +338,7 @@ class _Way(NamedTuple):
 def fit_profiles(
     likelihood: WindowLikelihood,
     tunable: Tunable,
-    found: Fit,
+    result: Fit,
     tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Fit, dict[str, Profile]]:
     """Return the fit at the likelihood's maximum, and the profile likelihood of each parameter.
@@ -348,17 +348,17 @@ def fit_profiles(
     Args:
         likelihood: likelihood of the tunable's parameters.
         tunable: the estimator, with limits.
-        found: result of :func:`fit`.
+        result: result of :func:`fit`.
         tick: function that is called with the share of the work done, which falls where the fit starts again.
     """
     for _ in range(MOST_RESTARTS):
-        profiles, higher = _search_profiles(likelihood, tunable, found, tick)
+        profiles, higher = _search_profiles(likelihood, tunable, result, tick)
         if higher is None:
-            return found, profiles
+            return result, profiles
         start = dict(zip(tunable.limits, map(float, higher), strict=True))
         again = fit(likelihood, dataclasses.replace(tunable, start=start), starts=1)
-        found = again._replace(spread=found.spread + again.log_likelihood - found.log_likelihood)
-    return found, _search_profiles(likelihood, tunable, found, tick, stop=False)[0]
+        result = again._replace(spread=result.spread + again.log_likelihood - result.log_likelihood)
+    return result, _search_profiles(likelihood, tunable, result, tick, stop=False)[0]
 
 
 def _search_profiles(

@@ -265,13 +265,13 @@ def measure_scaling(id: str) -> Iterator[Record]:
         yield {**row, "time 4 : 2": found[4][0] / found[2][0], "memory 4 : 2": found[4][1] / found[2][1]}
 
 
-def show(title: str, rows: Iterator[Record], kept: dict[str, list[Record]]) -> None:
+def show(title: str, rows: Iterator[Record], records: dict[str, list[Record]]) -> None:
     """Collect the rows of a section and print them as a Markdown table."""
-    kept[title] = []
+    records[title] = []
     for row in rows:
-        kept[title].append(row)
+        records[title].append(row)
         print(f"  {title}: {next(iter(row.values()))} ...", file=sys.stderr, flush=True)
-    table = pandas.DataFrame(kept[title])
+    table = pandas.DataFrame(records[title])
     texts = [[_cell(value) for value in line] for line in table.to_numpy(dtype=object).tolist()]
     print(f"\n{title}\n\n| {' | '.join(table.columns)} |\n|{'---|' * len(table.columns)}")
     print("\n".join(f"| {' | '.join(line)} |" for line in texts), flush=True)

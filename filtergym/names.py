@@ -110,11 +110,11 @@ def shipped_names(problem: Problem) -> list[str]:
     return [*problem.names, *learned_names(problem.id)]
 
 
-def adopt(found: Any) -> Any:
+def adopt(candidate: Any) -> Any:
     """Return a user's object as a competitor: wrapped if it is a model of a known library, else unchanged."""
     for source in _sources():
-        found = source.adopt(found)
-    return found
+        candidate = source.adopt(candidate)
+    return candidate
 
 
 def find_competitors(

@@ -322,14 +322,14 @@ def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> N
             dataset.storage.update_metadata({**scores, "num_episodes_average_score": entry.episodes})
 
 
-def datasets_table(written: Iterable[DatasetSummary]) -> Table:
+def datasets_table(summaries: Iterable[DatasetSummary]) -> Table:
     """Return a table of written data sets for the terminal, grouped by environment."""
     table = plain_table()
     table.add_column("data set", overflow="fold")
     table.add_column("environment", overflow="fold")
     for title in ("episodes", "steps", "mean return"):
         table.add_column(title, justify="right")
-    for entry in written:
+    for entry in summaries:
         made_with = ", ".join(f"{name}={value}" for name, value in entry.environment.items())
         table.add_row(
             entry.name, made_with, f"{entry.episodes:,}", f"{entry.steps:,}", f"{entry.mean_return:.4g}"

@@ -54,23 +54,25 @@ class Surroundings:
         return numpy.array([one.mean for one in self.inputs.values()])
 
 
-def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceModel:
+def make_model(equations: Mapping[str, Any], around: Surroundings) -> StateSpaceModel:
     """Check the equations of a state-space model, and return them traced.
 
     Args:
-        given: equations by name: f and Q, or drift and diffusion; h and R; with sensors the blocks of R.
+        equations: equations by name: f and Q, or drift and diffusion; h and R; with sensors the blocks of R.
         around: state, interval and inputs that they must fit; a timed covariance is checked at the typical interval.
 
     Raises:
         ValueError: for equations that do not fit, or cannot be traced.
     """
     n = len(around.mean)
-    h = trace_measurement("h", given["h"], n, len(around.inputs))
-    motion = _continuous(given, around) if given.get("drift") is not None else _discrete(given, around)
-    blocks = given["R"] if given.get("sensors") else [NoiseBlock("R", given["R"], h.size)]
+    h = trace_measurement("h", equations["h"], n, len(around.inputs))
+    motion = (
+        _continuous(equations, around) if equations.get("drift") is not None else _discrete(equations, around)
+    )
+    blocks = equations["R"] if equations.get("sensors") else [NoiseBlock("R", equations["R"], h.size)]
     R = _sensor_noise(blocks, around, isinstance(motion.Q, VectorFunction))
     model = StateSpaceModel(
-        motion.f, h, motion.Q, R, motion.G, _of_inputs(given["h"], h, around), motion.sources
+        motion.f, h, motion.Q, R, motion.G, _of_inputs(equations["h"], h, around), motion.sources
     )
     check_covariance("Q", process_noise(model, around.mean, around.interval, around.usual_inputs), n)
     _check_sensor_noise(model, blocks, around)

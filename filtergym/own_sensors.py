@@ -17,22 +17,26 @@ NOISES = ("process", "measurement")
 """Names of the other noises, which no sensor can have."""
 
 
-def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[str, Sensor]:
+def replace_sensors(sensors: Mapping[str, Sensor] | None, replacements: Any) -> dict[str, Sensor]:
     """Return sensors by name, some of them replaced; None in place of ``sensors`` allows any name.
 
     Raises:
         ValueError: for an object that is no sensor, or an unknown name.
     """
-    if not isinstance(given, Mapping) or not all(isinstance(one, Sensor) for one in given.values()):
-        raise ValueError(f"sensors must be a mapping from names to Sensor, got {quote_shortened(given)}")
-    if {*given} & {*NOISES}:
+    if not isinstance(replacements, Mapping) or not all(
+        isinstance(one, Sensor) for one in replacements.values()
+    ):
+        raise ValueError(
+            f"sensors must be a mapping from names to Sensor, got {quote_shortened(replacements)}"
+        )
+    if {*replacements} & {*NOISES}:
         raise ValueError(
             f"sensors cannot be called {' or '.join(NOISES)}, which are the names of other noises"
         )
-    if sensors is not None and not {*given} <= {*sensors}:
-        unknown = next(name for name in given if name not in sensors)
+    if sensors is not None and not {*replacements} <= {*sensors}:
+        unknown = next(name for name in replacements if name not in sensors)
         raise ValueError(f"sensors are {', '.join(sensors) or 'not named'}, got {unknown!r}")
-    return {**(sensors or {}), **given}
+    return {**(sensors or {}), **replacements}
 
 
 def stack_sensors(sensors: Mapping[str, Sensor], size: int, inputs: int) -> tuple[Function, list[NoiseBlock]]:

@@ -487,14 +487,14 @@ class Deviation(NamedTuple):
         return self.size <= 1.0
 
 
-def deviation(claimed: Sequence[Figure], found: Sequence[Figure]) -> Deviation:
+def deviation(claimed: Sequence[Figure], repeated: Sequence[Figure]) -> Deviation:
     """Return the largest deviation of results from a second run over the same episodes; times are not compared.
 
     Args:
         claimed: results of a file.
-        found: results of the second run.
+        repeated: results of the second run.
     """
-    stated, known = _by_name(claimed), _by_name(found)
+    stated, known = _by_name(claimed), _by_name(repeated)
     worst = Deviation(0.0, "")
     if stated.keys() != known.keys() or len(stated) != sum(f.metric != TIME for f in claimed):
         odd = sorted(stated.keys() ^ known.keys())

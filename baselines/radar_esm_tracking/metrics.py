@@ -30,7 +30,11 @@ def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
 
 
 def time_quantile(
-    bootstrap: Bootstrap, first: numpy.ndarray, chosen: numpy.ndarray, seconds: numpy.ndarray, share: float
+    bootstrap: Bootstrap,
+    first: numpy.ndarray,
+    is_counted: numpy.ndarray,
+    seconds: numpy.ndarray,
+    share: float,
 ) -> IntervalEstimate:
     """Return the time by which a condition holds in a share of the chosen episodes; infinite where too few reach it,
     NaN without any.
@@ -38,12 +42,12 @@ def time_quantile(
     Args:
         bootstrap: resamples of the episodes.
         first: index of the first time at which the condition holds, or the number of times, ``(episodes,)``.
-        chosen: whether an episode counts, ``(episodes,)`` booleans.
+        is_counted: whether an episode counts, ``(episodes,)`` booleans.
         seconds: times, s, ``(T,)``.
         share: share, such as 0.5 for the median.
     """
     times = numpy.append(seconds, math.inf)[first]
-    return bootstrap.interval(bootstrap.quantiles(times, share, chosen))
+    return bootstrap.interval(bootstrap.quantiles(times, share, is_counted))
 
 
 def _first(condition: numpy.ndarray) -> numpy.ndarray:

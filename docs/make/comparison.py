@@ -34,15 +34,15 @@ class Comparison(NamedTuple):
     figure: Any
 
 
-def compared_policies(measured: BenchmarkRecords) -> list[str]:
+def compared_policies(benchmark: BenchmarkRecords) -> list[str]:
     """Return the names of the competitors that the comparison page shows, in the order of its columns.
 
     Learned agents; the cheapest of all others in the training distribution, of any control and kind; the paper's
     algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
     are in the records. A narrow screen shows only the first columns without scrolling.
     """
-    problem, records = measured
-    known, paper = problem.baselines, measured.paper
+    problem, records = benchmark
+    known, paper = problem.baselines, benchmark.paper
     of_default = [record for record in records if record.scenario == problem.task.default_scenario]
     agents = pretrained_agents(problem.id)
     ranked = [place.policy for place in ranking(of_default or records)]
@@ -71,10 +71,10 @@ def _cells(name: str, records: Sequence[Record]) -> list[str]:
     ]
 
 
-def summary(found: Sequence[BenchmarkRecords]) -> Grid:
+def summary(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
     """Return a table of the best competitor of every origin in each environment, and the reference."""
     rows = []
-    for problem, every in found:
+    for problem, every in benchmarks:
         reference, learned = problem.baselines.score_reference, pretrained_agents(problem.id)
         records = [record for record in every if record.scenario == problem.task.default_scenario]
         values, kinds = _by_name(records), {record.policy: record.kind for record in records}
@@ -108,10 +108,10 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
     return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
 
 
-def harm(found: Sequence[BenchmarkRecords]) -> Grid:
+def harm(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
     """Return a table of the scenario in which each learned agent is worst against the paper's algorithm."""
     rows = []
-    for problem, records in found:
+    for problem, records in benchmarks:
         for name in pretrained_agents(problem.id):
             own = [r for r in records if (r.policy, r.metric) == (name, HEADLINE) and r.value is not None]
             if not own:
@@ -132,10 +132,10 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
     return Grid("Where learned agents do worst", [*header, "means, %", "ANEES", TIME_TITLE, last], rows)
 
 
-def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
+def covariances(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
     """Return a table of the ranked competitors whose covariance does not fit their errors, without random actions."""
     rows = []
-    for measured in found:
+    for measured in benchmarks:
         records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
         values = _by_name(records)
         for place in ranking(records):
@@ -149,19 +149,19 @@ def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
     return Grid(title, ["environment", "name", "ANEES, mean", "ANEES, median episode"], rows)
 
 
-def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
+def compare_environment(benchmark: BenchmarkRecords, width: int = 2) -> Comparison:
     """Return the tables of one environment: cost against the paper's algorithm, and the physical error.
 
     Args:
-        measured: the environment and its records.
+        benchmark: the environment and its records.
         width: width of the figure, 1 or 2 columns of a paper.
 
     Raises:
         ValueError: if the paper's algorithm, or its opponents, are not among the records.
     """
-    problem, records = measured
+    problem, records = benchmark
     cls, known = problem.task, problem.baselines
-    paper, columns = measured.paper, compared_policies(measured)
+    paper, columns = benchmark.paper, compared_policies(benchmark)
     if paper not in columns:
         raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
     others = [name for name in columns if name != paper]
@@ -267,7 +267,7 @@ def _two_lines(record: Record | None, scale: float) -> str:
     return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
 
 
-def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
+def overview_markdown(benchmarks: Sequence[BenchmarkRecords], which: str) -> str:
     """Return the overview table called "best", "harm" or "covariances", over all environments, in Markdown.
 
     Raises:
@@ -276,13 +276,13 @@ def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
     tables = {"best": summary, "harm": harm, "covariances": covariances}
     if which not in tables:
         raise ValueError(f"no table {which!r}: there are {', '.join(tables)}")
-    grid = tables[which](found)
+    grid = tables[which](benchmarks)
     return "\n".join([f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows)])
 
 
-def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
+def comparison_markdown(comparison: Comparison, benchmark: BenchmarkRecords, record: ResultRecord) -> str:
     """Return the sentences and tables of one environment in Markdown, with the command of the records."""
-    records, paper = measured.records, measured.paper
+    records, paper = benchmark.records, benchmark.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})
     count = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"

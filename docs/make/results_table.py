@@ -26,28 +26,28 @@ COLUMNS = ("difference", "lost", "means", "ns", "control", "cost", "rmse", "anee
 
 
 def scenario_records(
-    found: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
+    benchmark: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
 ) -> list[Record]:
     """Return the records of a benchmark in one scenario, without random actions.
 
     Args:
-        found: results in an environment.
+        benchmark: results in an environment.
         scenario: name of the scenario; default: the training distribution.
         policies: names of competitors. Default: all.
 
     Raises:
         ValueError: if there are no results.
     """
-    scenario = scenario or found.problem.task.default_scenario
+    scenario = scenario or benchmark.problem.task.default_scenario
     records = [
         record
-        for record in found.records
+        for record in benchmark.records
         if record.scenario == scenario
         and (record.policy in policies if policies else record.policy != "random")
     ]
     if not records:
         raise ValueError(
-            f"no records of {found.problem.id} in scenario {scenario!r}"
+            f"no records of {benchmark.problem.id} in scenario {scenario!r}"
             + (f" of {', '.join(policies)}" if policies else "")
             + ": make them by filtergym benchmark --full"
         )
@@ -95,9 +95,9 @@ def results_grid(
     return ["policy", *(title for title, _ in shown)], rows
 
 
-def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
+def results_markdown(benchmark: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
     """Return the table of results in Markdown, with sentences on the best competitor and on the columns."""
-    records, paper = scenario_records(found, scenario), found.paper
+    records, paper = scenario_records(benchmark, scenario), benchmark.paper
     note = (
         f"{ranking_sentence(records, paper)} Lowest cost first. {COST_NOTE} ANEES is the mean NEES over the dimension; "
         f"{INCONSISTENT} marks a covariance that is off by more than a factor of two. {TIME_NOTE}\n\n{_where(records)} "
@@ -107,7 +107,7 @@ def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: st
 
 
 def chosen_markdown(
-    found: Mapping[str, tuple[BenchmarkRecords, ResultRecord]],
+    benchmarks: Mapping[str, tuple[BenchmarkRecords, ResultRecord]],
     scenario: str = "",
     policies: Sequence[str] = (),
     columns: Sequence[str] = (),
@@ -115,7 +115,7 @@ def chosen_markdown(
     """Return one table of results in Markdown over several environments, or with some competitors or columns.
 
     Args:
-        found: records of the environments by their short names.
+        benchmarks: records of the environments by their short names.
         scenario: name of the scenario; default: the training distribution of each.
         policies: names of competitors. Default: all.
         columns: some of :data:`COLUMNS`. Default: those whose titles are the same in every environment.
@@ -126,27 +126,28 @@ def chosen_markdown(
     columns = columns or ("difference", "lost", "means", "ns", "anees", "score")
     if wrong := [column for column in columns if column not in COLUMNS]:
         raise ValueError(f"no column {wrong[0]!r}: there are {', '.join(COLUMNS)}")
-    if "rmse" in columns and len(found) > 1:
+    if "rmse" in columns and len(benchmarks) > 1:
         raise ValueError(
             "the errors of several environments are of different quantities: leave out the column rmse"
         )
     header: list[str] = []
     rows, notes = [], []
-    for name, (own, record) in found.items():
+    for name, (own, record) in benchmarks.items():
         records = scenario_records(own, scenario, policies)
         # With everybody's records, so that the front and the best are those of the whole table.
         titles, lines = results_grid(scenario_records(own, scenario), own.paper, columns)
         wanted = {f"`{record.policy}`" for record in records}
         header = [
-            title if len(found) == 1 else title.replace(f"`{own.paper}`", "the paper's") for title in titles
+            title if len(benchmarks) == 1 else title.replace(f"`{own.paper}`", "the paper's")
+            for title in titles
         ]
-        first = [name] if len(found) > 1 else []
+        first = [name] if len(benchmarks) > 1 else []
         rows += [[*first, *line] for line in lines if line[0] in wanted]
         notes.append(
-            f"{_where(records)} {record.origin}" if len(found) == 1 else f"{name} {records[0].episodes}"
+            f"{_where(records)} {record.origin}" if len(benchmarks) == 1 else f"{name} {records[0].episodes}"
         )
-    table = markdown_table([*(["environment"] if len(found) > 1 else []), *header], rows)
-    if len(found) > 1:
+    table = markdown_table([*(["environment"] if len(benchmarks) > 1 else []), *header], rows)
+    if len(benchmarks) > 1:
         notes = [
             f"Episodes: {', '.join(notes)}; with 95 % bootstrap intervals, from the records of the benchmark."
         ]

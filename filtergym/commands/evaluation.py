@@ -244,20 +244,26 @@ def has_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
 
 def tables_of(
     problem: Problem,
-    found: Evaluation,
+    evaluation: Evaluation,
     width: int,
-    own: Sequence[str] = (),
+    user_names: Sequence[str] = (),
 ) -> list[Table]:
     """Return an evaluation's tables, at most ``width`` columns wide; rows of the user's competitors are marked."""
-    tables = [flights_table(found.dataset, found.flights, found.records, width)] if found.flights else []
-    if found.has_truth:
-        paper = found.dataset.attrs["paper"]
-        compared = results_tables(found.records, problem.knows, width, paper, own)
-        if paper not in {record.policy for record in found.records}:
+    tables = (
+        [flights_table(evaluation.dataset, evaluation.flights, evaluation.records, width)]
+        if evaluation.flights
+        else []
+    )
+    if evaluation.has_truth:
+        paper = evaluation.dataset.attrs["paper"]
+        compared = results_tables(evaluation.records, problem.knows, width, paper, user_names)
+        if paper not in {record.policy for record in evaluation.records}:
             compared[-1].caption = f"{_missing_comparison(problem)}\n{compared[-1].caption}"
         tables += compared
-    if found.recorded:
-        tables += recording_tables(found.records, found.differences, found.has_truth, width, own)
+    if evaluation.recorded:
+        tables += recording_tables(
+            evaluation.records, evaluation.differences, evaluation.has_truth, width, user_names
+        )
     return tables
 
 
@@ -329,56 +335,60 @@ def run(
     return found, refusal, failures
 
 
-def check_explained(wanted: Sequence[str], names: Sequence[str]) -> None:
+def check_explained(explained: Sequence[str], names: Sequence[str]) -> None:
     """Raise ValueError if a competitor whose cost is to be explained is not among the evaluated ones."""
-    for name in wanted:
+    for name in explained:
         if name not in names:
             raise nearest("competitor to explain", name, names)
 
 
 def write(
     problem: Problem,
-    found: Evaluation,
+    evaluation: Evaluation,
     refusal: str,
     outputs: Outputs,
     learned: list[str],
     worst: Mapping[str, Sequence[WorstTrack]],
-    own: Sequence[str],
+    user_names: Sequence[str],
 ) -> None:
-    """Write the requested files; print sentences on the user's own competitors, the tables, the largest reasons, and
-    the paths of the files.
+    """Write the requested files of an evaluation, and print its tables, sentences and the files' paths.
 
     Args:
         problem: the evaluated problem.
-        found: the evaluation of :func:`run`.
+        evaluation: the evaluation of :func:`run`.
         refusal: why the whole of it is not written, from :func:`run`.
         outputs: files to write.
         learned: names of learned agents.
         worst: worst episodes of the competitors whose cost is explained, by name.
-        own: names of the user's own.
+        user_names: names of the user's own competitors.
     """
     printed, in_file = (
-        tables_of(problem, found, width, marked)
-        for width, marked in ((console.width, own), (LATEX_WIDTH, ()))
+        tables_of(problem, evaluation, width, marked)
+        for width, marked in ((console.width, user_names), (LATEX_WIDTH, ()))
     )
-    sentences = own_sentences(found.records, own, found.dataset.attrs["paper"]) if found.has_truth else []
+    sentences = (
+        own_sentences(evaluation.records, user_names, evaluation.dataset.attrs["paper"])
+        if evaluation.has_truth
+        else []
+    )
     for sentence in sentences:  # before anything is written, which can fail
         print_sentence(sentence.replace("`", ""), bold=sentence.rindex(": ") - 2)
     if sentences:
         console.print()
     for table in printed:
         print_table(table)
-    records = [*found.records, *found.flights]
+    records = [*evaluation.records, *evaluation.flights]
     if outputs.records is not None:
         write_records(outputs.records, records)
     if outputs.estimates is not None:
-        write_estimates(outputs.estimates, found.dataset)
+        write_estimates(outputs.estimates, evaluation.dataset)
     results: list[Result] = []
-    if outputs.folder is not None and found.curves is not None:
-        if found.has_truth:
+    if outputs.folder is not None and evaluation.curves is not None:
+        if evaluation.has_truth:
             settings = settings_of(command_line())
-            results = [result_of(problem, found, learned, worst, own)]
-        whole = found.dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
+            results = [result_of(problem, evaluation, learned, worst, user_names)]
+        # The track is for the report alone.
+        whole = evaluation.dataset.drop_dims("drawn_episode", errors="ignore")
         if not refusal:  # a summary has no variables
             largest = max(v.nbytes for v in whole.data_vars.values())
             refusal = _size_warning(whole.nbytes, largest, outputs.netcdf)
@@ -388,21 +398,23 @@ def write(
             write_text(place / "table.tex", "\n".join(map(latex_table, in_file)))
             if not refusal:
                 write_dataset(place / "results.nc", whole)
-            points = points_of_records(found.records)
-            for name, figure in evaluation_figures(found.curves, outputs.columns, None, learned, own, points):
+            points = points_of_records(evaluation.records)
+            for name, figure in evaluation_figures(
+                evaluation.curves, outputs.columns, None, learned, user_names, points
+            ):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
-            for name, figure in worst_figures(worst, phrases_of(found.dataset), outputs.columns):
+            for name, figure in worst_figures(worst, phrases_of(evaluation.dataset), outputs.columns):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
             if results:
                 write_results(place / RESULTS, results, settings)
-    phrases = phrases_of(found.dataset)
+    phrases = phrases_of(evaluation.dataset)
     console.print()
     for name in worst:
-        for sentence in reason_sentences(found.records, phrases, name):
+        for sentence in reason_sentences(evaluation.records, phrases, name):
             print_sentence(sentence)
-    for note in [*notes_of(found.dataset), *missing_rows(found.records)]:
+    for note in [*notes_of(evaluation.dataset), *missing_rows(evaluation.records)]:
         print_sentence(note, bold=len(note) if note.startswith(WARNING_PREFIX) else 0)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"

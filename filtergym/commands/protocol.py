@@ -81,16 +81,16 @@ def evaluate_protocol(
     console.print(bib_entry(found, __version__), soft_wrap=True)
 
 
-def quoted_row(found: ProtocolResult) -> list[str]:
+def quoted_row(result: ProtocolResult) -> list[str]:
     """Return the lines of a Markdown table with one row, the result to quote; its last column is the time."""
     cells = {
-        found.protocol.name: found.title,
-        "cost against the papers, %": _percent(found.cost),
-        "lost tracks, %": "-" if found.lost is None else f"{100.0 * found.lost:.2g}",
-        "environments": f"{len(found.environments)} of {len(found.protocol.environments)}",
-        "protocol SHA-256": found.digest[:12],
+        result.protocol.name: result.title,
+        "cost against the papers, %": _percent(result.cost),
+        "lost tracks, %": "-" if result.lost is None else f"{100.0 * result.lost:.2g}",
+        "environments": f"{len(result.environments)} of {len(result.protocol.environments)}",
+        "protocol SHA-256": result.digest[:12],
         "filtergym": __version__,
-        "ns here": time_text(found.time),
+        "ns here": time_text(result.time),
     }
     return [f"| {' | '.join(words)} |" for words in (cells, ["---"] * len(cells), cells.values())]
 

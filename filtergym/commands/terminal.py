@@ -34,14 +34,14 @@ def complete_environment(incomplete: str) -> list[str]:
     return found or [short for id in ids if (short := id.removeprefix("filtergym/")).startswith(incomplete)]
 
 
-def import_environments(given: Any) -> Any:
+def import_environments(value: Any) -> Any:
     """Import the module of each environment given as ``module:id``; return the argument unchanged."""
     from ..envs.engine.catalogue import import_task
 
-    for word in [given] if isinstance(given, str) else given or ():
+    for word in [value] if isinstance(value, str) else value or ():
         if ":" in word:
             import_task(word)
-    return given
+    return value
 
 
 def _environments_of(ctx: typer.Context) -> list[str]:

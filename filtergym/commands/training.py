@@ -98,25 +98,25 @@ def _training(run: TrainingRun, session: Session) -> Training:
     return Training(session.folder, run, replace(session, folder=session.folder.absolute()))
 
 
-def train_runs(opened: Sequence[Training], trainer: Trainer, workers: Workers) -> list[TrainingRun]:
+def train_runs(trainings: Sequence[Training], trainer: Trainer, workers: Workers) -> list[TrainingRun]:
     """Train the unfinished runs, and return the final state of all runs.
 
     Args:
-        opened: runs of one algorithm.
+        trainings: runs of one algorithm.
         trainer: of the algorithm.
         workers: processes that share the runs.
     """
     waiting = []
-    for training in opened:
+    for training in trainings:
         if training.session.resume and training.run.is_complete:
             console.print(f"{training.folder} is finished: {training.run.steps_done:,} steps")
         else:
             waiting.append(training)
     if workers.alone:
         _train_one_by_one(waiting, trainer)
-        return [training.run for training in opened]
+        return [training.run for training in trainings]
     trained = _train_side_by_side(waiting, workers)
-    return [trained.get(training.folder, training.run) for training in opened]
+    return [trained.get(training.folder, training.run) for training in trainings]
 
 
 def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
@@ -176,19 +176,19 @@ def _print_done(folder: Path, run: TrainingRun) -> None:
     console.print(f"{run.steps_done:,} steps done; best agent in {folder / 'best'}, checkpoint beside it")
 
 
-def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> None:
+def print_standing(trainings: Sequence[Training], runs: Sequence[TrainingRun]) -> None:
     """Print how the best agents of runs that differ in their seed compare with untrained competitors.
 
     Args:
-        opened: of :func:`open_run`.
+        trainings: of :func:`open_run`.
         runs: of :func:`train_runs`.
     """
-    agents = [best_agent(training.folder) for training in opened]
-    trust = opened[0].session.trust
+    agents = [best_agent(training.folder) for training in trainings]
+    trust = trainings[0].session.trust
     if any(agent.suffix != ".safetensors" for agent in agents) and not trust:
         console.print("an agent that is not stored as plain arrays is compared with --trust only")
         return
-    names = [str(training.folder) for training in opened]
+    names = [str(training.folder) for training in trainings]
     found = standing.measure_standing(runs[0], dict(zip(names, agents, strict=True)), trust)
     print_table(
         standing.standing_table(found, {name: run.beat_paper for name, run in zip(names, runs, strict=True)})

@@ -112,12 +112,12 @@ class LogText(FilterText):
         kinds = {"values": "received", "available": "there", "inputs": "held", "interval": "interval"}
         return (kinds[kind], int(place)) if kind in kinds else ("other", 0)
 
-    def fill(self, received: str, held: str, interval: str, others: Sequence[str] = ()) -> str:
+    def fill(self, received: str, inputs: str, interval: str, others: Sequence[str] = ()) -> str:
         """Return the C statements that fill the measurement ``given`` from a row of a log.
 
         Args:
             received: expression of the first received number; the others follow it.
-            held: expression of the first input; the others follow it.
+            inputs: expression of the first input; the others follow it.
             interval: expression of the interval.
             others: expressions of all other numbers, in their order; default: zero.
         """
@@ -128,7 +128,7 @@ class LogText(FilterText):
             value = {
                 "received": f"{cell} == {cell} ? {cell} : 0.0",
                 "there": f"{cell} == {cell} ? 1.0 : 0.0",
-                "held": f"{held}[{place}]",
+                "held": f"{inputs}[{place}]",
                 "interval": interval,
             }.get(kind) or next(rest, "0.0")
             lines.append(f"given[{row}] = {value};")

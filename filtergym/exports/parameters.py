@@ -68,19 +68,19 @@ class Declaration(NamedTuple):
         return [*self.tuned, *self.own]
 
 
-def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str) -> Declaration:
+def declaration(task: Task, maker: Any, tunables: Mapping[str, Tunable], name: str) -> Declaration:
     """Return the parameters of an exported competitor that its user can set.
 
     Args:
         task: task with the current parameters.
         maker: maker of the competitor.
-        known: tunable parameters by the names of competitors.
+        tunables: tunable parameters by the names of competitors.
         name: name of the competitor.
     """
     if isinstance(maker, TunedPolicy):
         tunable, values = maker.tunable, maker.values
     else:
-        tunable = known.get(name)
+        tunable = tunables.get(name)
         values = tunable.start if tunable is not None else {}
     tuned, taken = [], set()
     arguments = _arguments(maker.make if isinstance(maker, TunedPolicy) else maker)
@@ -308,16 +308,16 @@ def traced_functions(graph: ParameterGraph) -> Iterator[None]:
             setattr(math, name, compute)
 
 
-def expressions(declared: Declared, first: int, graph: Graph) -> Any:
+def expressions(parameter: Declared, first: int, graph: Graph) -> Any:
     """Return a parameter as nested tuples of traced inputs, whose rows begin at ``first``."""
-    nodes = [graph.input(PARAMETER, first + i) for i in range(len(declared.values))]
+    nodes = [graph.input(PARAMETER, first + i) for i in range(len(parameter.values))]
 
     def nested(part: numpy.ndarray) -> Any:
         if part.ndim == 0:
             return Traced(part, numpy.float64)
         return tuple(nested(inner) for inner in part)
 
-    return nested(numpy.array(nodes, dtype=numpy.int64).reshape(declared.shape))
+    return nested(numpy.array(nodes, dtype=numpy.int64).reshape(parameter.shape))
 
 
 def with_parameters(parameters: Any, values: Mapping[str, Any]) -> Any:

@@ -394,7 +394,7 @@ def trace_filter(
     name: str,
     plain: Model,
     template: tuple[Any, Any],
-    known: Mapping[str, Tunable] = MappingProxyType({}),
+    tunables: Mapping[str, Tunable] = MappingProxyType({}),
 ) -> TracedFilter:
     """Return a competitor as two straight-line programs, with as many free parameters as possible.
 
@@ -405,13 +405,13 @@ def trace_filter(
         name: name of the competitor, in errors.
         plain: model of the control on NumPy, with the parameters of the export.
         template: initial estimate and measurement, any numbers of any width.
-        known: tunable parameters by the names of competitors; these and the task's are free.
+        tunables: tunable parameters by the names of competitors; these and the task's are free.
 
     Raises:
         ValueError: for a competitor that is neither estimator nor policy, or no straight line of arithmetic.
     """
     check_kind(name, maker)
-    found = declaration(plain.task, maker, known, name)
+    found = declaration(plain.task, maker, tunables, name)
     arguments = task, control, maker, plain, template, found
     try:
         fixed = _trace_free(*arguments, [])

@@ -29,16 +29,18 @@ def outcome_sentences(results: Sequence[Result]) -> list[str]:
     return [sentence_of(result) for result in usual if ranking(result.records)]
 
 
-def own_sentences(records: Sequence[Record], own: Sequence[str], paper: str) -> list[str]:
+def own_sentences(records: Sequence[Record], user_names: Sequence[str], paper: str) -> list[str]:
     """Return a sentence for each of the user's competitors: cost against the paper's algorithm and the best, ANEES.
 
     Args:
         records: records of one environment and scenario with a truth.
-        own: names of the user's competitors.
+        user_names: names of the user's competitors.
         paper: name of the paper's algorithm; it may be missing in the records.
     """
     return [
-        _own_sentence(records, name, paper) for name in own if find_record(records, name, "geometric_cost")
+        _own_sentence(records, name, paper)
+        for name in user_names
+        if find_record(records, name, "geometric_cost")
     ]
 
 

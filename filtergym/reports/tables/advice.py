@@ -269,16 +269,16 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     yield from _agents(advice, learned)
 
 
-def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
+def parameter_lines(tunable: Tunable, fit: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
     """Yield a line for each fitted parameter, with unit and interval.
 
     Args:
         tunable: the fitted filter.
-        found: its fit.
+        fit: its fit.
         intervals: intervals of the parameters.
     """
-    for name, value in found.values.items():
-        text = parameter_text(name, value, intervals.get(name), tunable, name in found.at_limit)
+    for name, value in fit.values.items():
+        text = parameter_text(name, value, intervals.get(name), tunable, name in fit.at_limit)
         line = " ".join(part for part in (parameter_name(name), *text[:3]) if part)
         yield line + (f": {text.remark}" if text.remark else "")
 

@@ -153,7 +153,7 @@ def result_of(
     evaluation: Evaluation,
     learned: Sequence[str],
     worst: Mapping[str, Sequence[WorstTrack]] | None = None,
-    own: Sequence[str] = (),
+    user_names: Sequence[str] = (),
 ) -> Result:
     """Return an evaluation as a :class:`Result`, the content of a file of results.
 
@@ -164,7 +164,7 @@ def result_of(
         learned: names of learned competitors.
         worst: worst episodes of the competitors whose cost is explained, by name; default: the paper's algorithm,
             without episodes.
-        own: names of the user's own competitors.
+        user_names: names of the user's own competitors.
     """
     dataset, records, curves = evaluation.dataset, evaluation.records, evaluation.curves
     assert curves is not None
@@ -172,7 +172,7 @@ def result_of(
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
     worst = worst or {name: [] for name in [paper] if name in names}
-    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned, own), *worst]))
+    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned, user_names), *worst]))
     components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
     named = cls.scenarios.get(scenario)
     return Result(
@@ -192,7 +192,7 @@ def result_of(
         phrases_of(dataset),
         list(worst),
         [one for episodes in worst.values() for one in episodes],
-        list(own),
+        list(user_names),
     )
 
 

@@ -114,15 +114,15 @@ def _times(record: Record) -> str:
     return f"{value} times {record.component}" + (f" {interval}" if interval else "")
 
 
-def default_explained(records: Sequence[Record], named: Sequence[str], paper: str) -> list[str]:
+def default_explained(records: Sequence[Record], names: Sequence[str], paper: str) -> list[str]:
     """Return the name of the competitor whose cost is explained by default, in a list of at most one.
 
     Args:
         records: records of one environment and scenario.
-        named: names from the command line; the first ranked one is taken, else the paper's algorithm, else the
+        names: names from the command line; the first ranked one is taken, else the paper's algorithm, else the
             cheapest.
         paper: name of the paper's algorithm.
     """
     ranked = [name for name, kind, _ in rank_competitors(records) if kind in RANKED]
-    wanted = [name for name in [*named, paper, *ranked] if name in ranked]
+    wanted = [name for name in [*names, paper, *ranked] if name in ranked]
     return wanted[:1]

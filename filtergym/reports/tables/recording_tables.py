@@ -25,7 +25,7 @@ def recording_tables(
     differences: Mapping[str, Any],
     has_truth: bool,
     width: int,
-    own: Collection[str] = (),
+    user_names: Collection[str] = (),
 ) -> list[Table]:
     """Return tables that compare competitors by their predictions of a recording's measurements.
 
@@ -35,7 +35,7 @@ def recording_tables(
             stretches of measurements.
         has_truth: whether other tables contain errors and costs.
         width: columns of the terminal; columns that do not fit stand below.
-        own: names of the user's own competitors, whose rows are marked.
+        user_names: names of the user's own competitors, whose rows are marked.
     """
     found = {(r.policy, r.metric, r.component): r for r in records if r.window == "all"}
 
@@ -52,7 +52,7 @@ def recording_tables(
         _prediction_columns(records, found),
     ]
     parts = [part for part in parts if part]
-    tables = _beside(functools.partial(competitors_table, names, own=own), parts, width)
+    tables = _beside(functools.partial(competitors_table, names, user_names=user_names), parts, width)
     first = records[0]
     episodes = f"{first.episodes} episode{'s' if first.episodes > 1 else ''}"
     tables[0].title = f"{first.environment}, recording {first.scenario} ({episodes}; 95 % intervals)"

@@ -119,7 +119,11 @@ def settings_of(command: str) -> Settings:
 
 
 def select_competitors(
-    records: Sequence[Record], paper: str, reference: str, learned: Sequence[str], own: Sequence[str] = ()
+    records: Sequence[Record],
+    paper: str,
+    reference: str,
+    learned: Sequence[str],
+    user_names: Sequence[str] = (),
 ) -> list[str]:
     """Return the names of the competitors whose curves a file of results contains, at most ``MOST_SHOWN``.
 
@@ -136,7 +140,15 @@ def select_competitors(
     classical = [name for name in by_cost if name not in learned and name != paper]
     first = [name for kind in RANKED for name in [n for n in classical if kinds[n] == kind][:2]]
     bounds = [name for name in kinds if kinds[name] == "bound"]
-    wanted = [paper, reference, *own, *first, *(n for n in by_cost if n in learned), *bounds[:1], *by_cost]
+    wanted = [
+        paper,
+        reference,
+        *user_names,
+        *first,
+        *(n for n in by_cost if n in learned),
+        *bounds[:1],
+        *by_cost,
+    ]
     return list(dict.fromkeys(name for name in wanted if name in kinds))[:MOST_SHOWN]
 
 

@@ -53,10 +53,10 @@ HEADLINE = "geometric_cost_difference"
 """Metric of the first column: geometric mean of the ratios of the episodes' costs to the paper's, less one."""
 
 
-def paper_cells(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
+def paper_cells(records: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
     """Return two cells: share of lost tracks with interval, %, and difference of mean cost to the paper's, %."""
     lost, means = (
-        found.get((*scenario, name, metric, "", "all"))
+        records.get((*scenario, name, metric, "", "all"))
         for metric in ("lost_tracks", "relative_cost_difference")
     )
     shares = with_interval(lost, 100.0, digits=2, negligible=0.005)
@@ -142,7 +142,7 @@ def results_tables(
     knows: Mapping[str, str],
     width: int,
     paper: str = "",
-    own: Collection[str] = (),
+    user_names: Collection[str] = (),
 ) -> list[Table]:
     """Return tables of all competitors, lowest cost first: cost against the paper's, consistency, score, errors.
 
@@ -152,12 +152,12 @@ def results_tables(
         width: columns of the terminal; errors that do not fit stand below in tables of their own, so that no number
             is cut.
         paper: name of the paper's algorithm, with which costs are compared.
-        own: names of the user's own competitors, whose rows are marked.
+        user_names: names of the user's own competitors, whose rows are marked.
     """
     first = records[0]
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     names = rank_competitors(records)
-    draw = functools.partial(competitors_table, names, own=own)
+    draw = functools.partial(competitors_table, names, user_names=user_names)
     costs, notes = _cost_columns(records, found, paper)
     exact, rounded = (_error_columns(records, found, intervals) for intervals in (True, False))
     fitting = [
@@ -174,7 +174,7 @@ def results_tables(
         f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)"
     )
     notes += more
-    notes += [f"{OWN_ROW} marks your own."] if any(name in own for name, *_ in names) else []
+    notes += [f"{OWN_ROW} marks your own."] if any(name in user_names for name, *_ in names) else []
     smoothers = [name for name, kind, _ in names if kind == "smoother"]
     notes += [f"{NOT_CAUSAL}: {', '.join(smoothers)}."] if smoothers else []
     notes += [f"{name} knows {knows[name]}." for name, *_ in names if name in knows]
@@ -291,7 +291,7 @@ def competitors_table(
     columns: Columns,
     control: bool,
     compact: bool = False,
-    own: Collection[str] = (),
+    user_names: Collection[str] = (),
 ) -> Table:
     """Return a table of the competitors, with unranked ones in sections of their own, and marks on the user's rows."""
     table = plain_table()
@@ -306,12 +306,12 @@ def competitors_table(
             table.add_section()
             section = kind
         control_column = steered if kind == "policy" else f"({kind})"
-        marked = f"{OWN_ROW}\xa0{name}" if name in own else name  # no line holds the mark alone
+        marked = f"{OWN_ROW}\xa0{name}" if name in user_names else name  # no line holds the mark alone
         table.add_row(
             "\n".join(textwrap.wrap(marked, NARROW if compact else WIDE)).replace("\xa0", " "),
             *([control_column] if control else []),
             *(column(name) for column in columns.values()),
-            style="bold" if name in own else None,
+            style="bold" if name in user_names else None,
         )
     return table
 
