@@ -368,7 +368,7 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
         return self.bank.act(predicted, measurement, 0.0 * predicted.action)
 
     def records(self, state: Any, measurement: StateSpaceMeasurement) -> dict[str, Array]:
-        """Return log-likelihood and NIS of the last measurement, by name."""
+        """Return the log-likelihood of the last measurement, by name."""
         own = state.now if isinstance(state, Buffered) else state
         return {"log_likelihood": self.bank.records(own, measurement)["log_likelihood"]}
 

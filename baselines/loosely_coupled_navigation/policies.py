@@ -26,7 +26,7 @@ from .references import Matched, MatchedCovariance
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Return the :class:`GainBank` of a model; raise ValueError for another control."""
+    """Return the :class:`GainBank` inside a model, whose control must be ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 

@@ -311,7 +311,7 @@ def _all_columns(first: list[str], columns: Mapping[str, str]) -> list[str]:
 
 
 def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading:
-    """Return the reading of positions by an INS and a receiver; without a column of its deviation: ``usual``, m."""
+    """Return the reading of a log of INS and receiver positions; ``usual`` is the receiver's default deviation, m."""
     ends = [""] if "ins" in columns else sorted(name[3:] for name in columns if name.startswith("ins_"))
     A, stated = len(ends), int("sigma" in columns)
     first = [*(f"ins{end}" for end in ends), *["sigma"] * stated, *(f"fix{end}" for end in ends)]
