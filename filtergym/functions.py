@@ -39,7 +39,7 @@ def evaluate(
     trust: bool = False,
     **keywords: Any,
 ) -> xarray.Dataset:
-    """Run policies, estimators, references and bounds over the same episodes.
+    """Run policies, estimators, references and bounds over the same episodes, and return costs and errors.
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
@@ -83,7 +83,7 @@ def record(
     backend: str = "auto",
     **keywords: Any,
 ) -> Recording:
-    """Record the measurements of simulated episodes, and the truth.
+    """Simulate episodes, and return their measurements and truth as a recording.
 
     They are the episodes of an evaluation with the same scenario, seed and split. Replayed on the same backend,
     observations, estimates and costs are the same, bit for bit.
@@ -136,7 +136,7 @@ def make_policy(
     trust: bool = False,
     **keywords: Any,
 ) -> SteppingPolicy:
-    """Make a policy to step an environment with: the paper's, a tuned one, an agent, or one of your own.
+    """Return a policy that acts in an environment: the paper's, a tuned one, an agent, or one of your own.
 
     It has Stable-Baselines3's ``predict(observation, state, episode_start, deterministic)``, for one observation as for
     a batch, and acts in a loop of your own as in an evaluation.
@@ -242,7 +242,7 @@ def _model_of(env: Any) -> Any:
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:
-    """Return every metric of every policy with its interval, the metrics of the environment included.
+    """Return a record of every metric of every policy, with its interval, the environment's metrics included.
 
     Args:
         dataset: from :func:`evaluate`; see :func:`.evaluation.running.metrics.tidy_records`.

@@ -84,7 +84,7 @@ def write_datasets(
     trust: bool = False,
     **keywords: Any,
 ) -> list[DatasetSummary]:
-    """Write the episodes of policies as Minari data sets, one for each policy.
+    """Write the episodes of policies as Minari data sets, one for each policy, and return summaries.
 
     The environment of a policy is made with the policy's own control and parameters. One that has no
     control of its own, such as ``random``, acts in the environment of the policy named before it: these two data sets

@@ -70,7 +70,7 @@ def state_space(
     registered: bool = True,
     **parameters: Any,
 ) -> type[StateSpace]:
-    """Make an environment of a state-space model and register it: ``x = f(x) + w``, ``z = h(x) + v``.
+    """Return a new environment's task of a state-space model ``x = f(x) + w``, ``z = h(x) + v``, registered.
 
     Call it where your module is imported, as :func:`filtergym.register_task`. The class is also stored in your module,
     under the name in its id, where other processes find it.

@@ -274,7 +274,7 @@ def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
 
 
 def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = False) -> Any:
-    """Return the maker of a submission's competitor.
+    """Return the maker of the competitor in a submission: agent, source code or shipped filter.
 
     Args:
         problem: problem of the submission.

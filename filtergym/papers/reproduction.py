@@ -149,7 +149,7 @@ class Reproduction:
             lines += [f"Made by `{self.command}`.", ""]
         lines += [UNCERTAINTY, "", "## Claims", ""]
         lines += markdown_table(
-            ("claim", "what was measured", "how", "verdict"),
+            ("claim", "measured", "method", "verdict"),
             [(f"**{c.key}.** {c.statement}", c.measured, c.method, f"**{c.verdict}**") for c in self.claims],
         )
         for table in self.tables:
@@ -171,7 +171,7 @@ class Reproduction:
 
     def __rich__(self) -> Table:
         """Return a table of claims, measured quantities and verdicts for the terminal."""
-        table = Table("claim", "what was measured", "verdict", title=self.title, show_lines=True)
+        table = Table("claim", "measured", "verdict", title=self.title, show_lines=True)
         for claim in self.claims:
             table.add_row(f"{claim.key}. {claim.statement}", claim.measured, claim.verdict)
         return table

@@ -10,13 +10,13 @@ from rich.table import Table
 from .terminal_tables import competitors_table, first_fitting, with_interval
 
 LIKELIHOOD = (
-    "log-likelihood: of what was measured, as it was predicted, nats a measurement; the higher the better, if errors "
-    "are white; less: than the best's, paired. Mean NIS: normalised innovation squared over its dimension; in the band "
-    "if innovations are as large as predicted; - : it reports none."
+    "log-likelihood: of a measurement under its prediction, mean, nats; the higher the better, if errors are white; "
+    "less: paired difference from the best. Mean NIS: normalised innovation squared over its dimension; in the band if "
+    "innovations are as large as predicted; - : not reported."
 )
 PREDICTIONS = (
-    "Error of prediction: of the measurement by the estimate before it, RMSE. Correlation: of successive innovations, "
-    "0 where they are white."
+    "Error of prediction: RMSE of a measurement's prediction from the estimate before it. Correlation: of successive "
+    "innovations, 0 where they are white."
 )
 
 

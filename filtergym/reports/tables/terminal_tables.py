@@ -269,7 +269,7 @@ def _tables_below_each_other(
 
 
 def first_fitting(tables: Iterable[Table], width: int) -> Table | None:
-    """Return the first table that fits into the available columns."""
+    """Return the first of some tables that fits into ``width`` columns; None if none does."""
     return next((table for table in tables if _widest(table) <= width), None)
 
 
