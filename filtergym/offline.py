@@ -209,7 +209,7 @@ def plan_datasets(
         try:
             training_scenarios(cls, cls.default_scenario if scenario is None else scenario)
         except ValueError as error:
-            raise ValueError(f"{error}, or take the split test for data to be judged on") from error
+            raise ValueError(f"{error}, or take the split test for evaluation data") from error
     parameters = dict(experiment.keywords)
     environment_keywords = {name: parameters.pop(name) for name in ENVIRONMENT_KEYWORDS if name in parameters}
     check_names(cls, parameters, ENVIRONMENT_KEYWORDS)

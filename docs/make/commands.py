@@ -58,7 +58,7 @@ from filtergym.reports.tables.results import read_results, settings_of
 PROGRAM = "python docs/make"
 
 
-Note = Annotated[str, typer.Option(help="What a reader must know before they use the numbers.")]
+Note = Annotated[str, typer.Option(help="Note on the use of the numbers.")]
 Folder = Annotated[Path, typer.Option("--into", help="Folder of the records.")]
 
 
@@ -111,7 +111,7 @@ def table(
     tables = markdown_tables(text.read_text(encoding="utf-8")) if text.is_file() else []
     if len(tables) != len(name):
         raise ValueError(
-            f"{text} holds {len(tables)} tables, and there are {len(name)} names: say --name for each"
+            f"{text} holds {len(tables)} tables, and there are {len(name)} names: give --name for each"
         )
     for own, data in zip(name, tables, strict=True):
         made = ResultRecord(command, today(), settings_of(command).versions, note, data)
@@ -125,7 +125,7 @@ def readme(
     ] = Path("docs/images/front.png"),
     columns: Columns = 2,
     printed: Annotated[
-        bool, typer.Option("--printed", help="Run the page's commands, and put in what they print.")
+        bool, typer.Option("--printed", help="Run the page's commands, and insert their output.")
     ] = False,
 ) -> None:
     """Put the numbers into README, which is not rendered, and draw its picture, both from the records.
@@ -182,7 +182,7 @@ def seeds(
     ] = None,
     add: Annotated[
         bool,
-        typer.Option(help="Keep the other algorithms of the record that there is, of the same episodes."),
+        typer.Option(help="Keep the other algorithms of the existing record, of the same episodes."),
     ] = False,
     note: Note = "",
     curves: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF file for the learning curves.")] = None,
@@ -241,7 +241,7 @@ def _algorithm(seed: training_seeds.SeedRun) -> str:
 
 def ship(
     runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
-    into: Annotated[Path, typer.Option(help="Folder of what is shipped.")] = Path("agents/pretrained"),
+    into: Annotated[Path, typer.Option(help="Folder of the shipped agents.")] = Path("agents/pretrained"),
     trust: Trust = False,
 ) -> None:
     """Export the run of lowest validation cost of every algorithm, in place of the shipped one.

@@ -152,7 +152,7 @@ def verify_file(
             f"{found.fresh_deviation.sentence} ({versions})"
         )
     fresh = (
-        "the episodes are those of the file, and stored answers would hold, too"
+        "the episodes are those of the file, so stored results would pass, too"
         if found.fresh is None
         else f"on fresh ones they differ by {found.fresh_deviation.size:.2g} of what chance explains"
     )

@@ -119,9 +119,7 @@ def replay(
         kept["mean"].append(numpy.array(found["mean"][..., :episodes]))
         kept["covariance"].append(numpy.array(found["covariance"][..., :episodes]))
     if lost.all():
-        raise ValueError(
-            f"{name!r} lost every episode that it was to be compared on: its estimates are not valid"
-        )
+        raise ValueError(f"{name!r} lost every episode of the comparison: its estimates are not valid")
     measured, mean, covariance = (numpy.stack(values)[..., ~lost] for values in kept.values())
     components = [(component.name, component.unit) for component in plain.task.components]
     initial = _rows(started[0], episodes)[:, ~lost]

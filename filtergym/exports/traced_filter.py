@@ -211,8 +211,8 @@ def check_kind(name: str, maker: Any) -> None:
     kind = kind_of(maker)
     if kind not in RANKED:
         raise ValueError(
-            f"{name!r} is of kind {kind}: an estimator or a policy can be exported, which know nothing but what is "
-            "measured, when it is measured"
+            f"{name!r} is of kind {kind}: only estimators and policies can be exported, which use past and present "
+            "measurements alone"
         )
 
 
@@ -245,7 +245,7 @@ def steps_of(
     if kind_of(maker) == "estimator":
         own = as_filter(traced, make_competitor(maker, traced))
         if own.in_python:
-            raise NotTraceable("it does not say that it is traceable")
+            raise NotTraceable("its class does not set traceable = True")
         return FilterSteps(own, traced.world.mask_missing), None
     acting = plain if traced.parameters is plain.task.parameters else Model(traced, control)
     policy, network = replace_network(make_competitor(maker, acting), graph)

@@ -114,9 +114,9 @@ def _log_lines(advice: Advice) -> Iterator[str]:
         sum(span.last - span.first for span in spans) for spans in (share.fitted, share.chosen, share.judged)
     ]
     yield (
-        "Measurements that are fitted, that choose, that judge: {:,} / {:,} / {:,}.".format(*counts)
+        "Measurements for fit, choice and judgement: {:,} / {:,} / {:,}.".format(*counts)
         if share.apart
-        else "Too few measurements to be shared out: all are fitted, choose and judge."
+        else "Too few measurements to divide: all serve fit, choice and judgement."
     )
 
 

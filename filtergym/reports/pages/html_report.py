@@ -348,8 +348,8 @@ def _figures(result: Result) -> Iterator[Figure]:
         yield Figure(
             "track",
             "A track to look at",
-            f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, what was "
-            "measured, estimates, and their covariances at two standard deviations. Move the slider.",
+            f"The first episode (seed {result.track.attrs.get('seed', '?')}), not selected: truth, "
+            "measurements, estimates, and their covariances at two standard deviations. Move the slider.",
             "An animation of one episode; its numbers are in the table above, over all episodes.",
         )
     if any(one.track is not None for one in result.worst):

@@ -60,7 +60,7 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
     has_truth = recording.truth is not None
     judged = sum(span.last - span.first for span in advice.share.judged)
     table = Table(
-        title=f"{recording.name}: {judged:,} measurements that judge (95 % intervals)", title_justify="left"
+        title=f"{recording.name}: {judged:,} test measurements (95 % intervals)", title_justify="left"
     )
     table.add_column("filter", no_wrap=True)
     for title, width in advice_columns(advice).items():
@@ -70,9 +70,9 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
     what = "estimates" if has_truth else "predictions"
     table.caption = (
         "nats: log-likelihood per measurement where filters were chosen, less one nat in all for each fitted parameter."
-        f"\nless, against: paired with {advice.rival}, the rival: what one would take of the shipped ones by the "
-        f"measurements that chose, on those that judge; RMSE: of {what}.\nNIS: mean, 1 where innovations are as large "
-        "as predicted; correlation: of successive prediction errors, 0 where they are white."
+        f"\nless, against: paired with {advice.rival}, the rival (the shipped filter chosen on the same measurements), "
+        f"on the test measurements; RMSE: of {what}.\nNIS: mean, 1 where innovations are as large as predicted; "
+        "correlation: of successive prediction errors, 0 where they are white."
     )
     if advice.onboard is not None:
         table.caption += f"\nwithheld: RMSE at {advice.onboard.fixes:,} withheld fixes, m."
@@ -364,9 +364,9 @@ def _onboard(advice: Advice) -> Iterator[str]:
         return
     name, relative = advice.advised.name, _interval(_percent(found.relative), "+.1f")
     yield (
-        f"One in {ONE_IN} of the fixes was withheld. On {found.fixes:,} that judge, the estimates of {name} lie "
-        f"{found.errors[name]:.3g} m from them, and those of the vehicle's own filter ({found.source}), "
-        f"{found.delay:.2f} s before, {found.errors[ONBOARD]:.3g} m: {relative} %. That filter has seen the earlier "
+        f"One in {ONE_IN} of the fixes was withheld. At {found.fixes:,} of these, among the test measurements, the estimates "
+        f"of {name} are off by {found.errors[name]:.3g} m, and those of the vehicle's own filter ({found.source}), "
+        f"{found.delay:.2f} s before, by {found.errors[ONBOARD]:.3g} m: {relative} %. That filter has used the earlier "
         "withheld fixes, which the others have not, and an inertial sensor: its row is an optimistic bound. Where "
         "errors of fixes last, filters that follow them come closer to the fixes, and no closer to the truth."
     )

@@ -62,7 +62,9 @@ def recording_tables(
     notes += [f"{PREDICTIONS} Intervals are over stretches of measurements."] if len(parts) > 2 else []
     notes += [f"95 % band of the mean NIS: {bands.pop()}."] if len(bands) == 1 else []
     if any(record.kind == "smoother" for record in records) and not has_truth:
-        notes.append("A smoother predicts nothing: --estimates writes what it has found, with its deviation.")
+        notes.append(
+            "A smoother makes no predictions: --estimates writes its estimates, with their deviations."
+        )
     tables[-1].caption = "\n".join(notes)
     return tables
 

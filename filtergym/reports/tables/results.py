@@ -312,7 +312,7 @@ def _restore(fields: Any) -> Result:
     for part, found in datasets.items():
         _check_dataset(part, found)
     if result.curves is not None and "rmse" in result.curves and not result.curves.sizes.get("quantity"):
-        raise ValueError("the curves of a result hold errors of nothing")
+        raise ValueError("the curves of a result contain no errors")
     if any((r.environment, r.scenario) != (result.environment, result.scenario) for r in records):
         raise ValueError("a result holds records of another environment or scenario")
     return result
