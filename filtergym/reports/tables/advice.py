@@ -366,9 +366,10 @@ def _onboard(advice: Advice) -> Iterator[str]:
     yield (
         f"One in {ONE_IN} of the fixes was withheld. At {found.fixes:,} of these, among the test measurements, the "
         f"estimates of {name} are off by {found.errors[name]:.3g} m, and those of the vehicle's own filter "
-        f"({found.source}), {found.delay:.2f} s before, by {found.errors[ONBOARD]:.3g} m: {relative} %. That filter has used the "
-        "earlier withheld fixes, which the others have not, and an inertial sensor: its row is an optimistic bound. Where "
-        "errors of fixes last, filters that follow them come closer to the fixes, and no closer to the truth."
+        f"({found.source}), {found.delay:.2f} s before, by {found.errors[ONBOARD]:.3g} m: {relative} %. That filter "
+        "has used the earlier withheld fixes, which the others have not, and an inertial sensor: its row is an "
+        "optimistic bound. Where errors of fixes last, filters that follow them come closer to the fixes, and no "
+        "closer to the truth."
     )
 
 
