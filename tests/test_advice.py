@@ -269,7 +269,7 @@ def test_it_ends_in_sentences(advice):
     lines = list(advice_lines(advice, ["fixed-low"]))
     text = "\n".join(lines)
     assert lines[0].startswith("Take constant-velocity, with the parameters below: ")
-    assert f"than {advice.rival}, the shipped filter that one would take" in lines[0]
+    assert f"than {advice.rival}, the shipped filter chosen on the same" in lines[0]
     assert "times as large as stated, if they are white" in text
     assert "The learned agents were never trained on such data: fixed-low" in text
 
