@@ -17,7 +17,7 @@ from ..envs.engine.catalogue import nearest, parameter_names
 SCIENTIFIC = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 """Numbers such as 1e-3, which YAML 1.1 parses as strings."""
 OPTIONS = ("control", "scenario", "backend")
-"""Keywords of an environment that are also options of a run."""
+"""Keywords of an environment that are also options of a training run."""
 SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training accepts."""
 ESTIMATORS = ("kalman-net", "student")
@@ -42,7 +42,7 @@ def convert_numbers(value: Any) -> Any:
 
 
 def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge two mappings recursively; the second overrides the first."""
+    """Return two nested mappings merged; the second overrides the first."""
     both = dict(first)
     for name, value in then.items():
         own = both.get(name)
@@ -53,7 +53,7 @@ def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[st
 
 
 def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parse ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
+    """Parse words ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
 
     Returns:
         Keywords of the environment, and hyperparameters.
@@ -82,7 +82,7 @@ def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]
 
 
 def _read_table(path: Path, needs: str) -> dict[str, Any]:
-    """Read a YAML file of sections.
+    """Return the mapping in a YAML file.
 
     Raises:
         ValueError: if it cannot be read, or is not a mapping; ``needs`` describes the expected form.
@@ -98,7 +98,7 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
 
 
 def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
-    """Return the section of an environment, or the default one.
+    """Return the section of an environment in a table of settings, or the section ``default``.
 
     Raises:
         ValueError: if there is none.
@@ -112,7 +112,7 @@ def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
 
 
 def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read a file of settings.
+    """Return the settings of an environment in a user's YAML file: its keywords, and hyperparameters.
 
     Args:
         path: YAML file with hyperparameters in sections by environment id or ``default``, as in rl-zoo3, with

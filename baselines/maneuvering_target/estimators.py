@@ -1,6 +1,6 @@
-"""Estimators of ManeuveringTarget that no action steers.
+"""Estimators of ManeuveringTarget: Kalman filters and IMMs without actions.
 
-They predict over the actual time between two scans; for a scan that missed the target they only predict.
+They predict over the actual time between two scans, and do not update for a scan that missed the target.
 """
 
 from collections.abc import Sequence
@@ -29,14 +29,14 @@ class ConstantVelocity(KalmanModel):
         self.variance: float = acceleration**2
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Predict and update."""
+        """Predict to a scan, update with its measurement, and return the state."""
         F, Q = self.motion(given.measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
         return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
 
 
 class KalmanMixture(NamedTuple):
-    """State of the IMM over Kalman filters."""
+    """State of the IMM over Kalman filters: their estimates and mode probabilities."""
 
     mean: Array
     covariance: Array
@@ -72,13 +72,13 @@ class KalmanInteractingMultipleModel(KalmanModel):
         self.probabilities: Array = task.constant([scans / sum(lasting) for scans in lasting])
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Extend an estimate of position and velocity to the state in which the filters are mixed."""
+        """Return an estimate of position and velocity extended to the common state of all filters, ``(n, N)``."""
         return mean, covariance
 
     def predict_and_update(
         self, mean: Array, covariance: Array, measurement: Measurement
     ) -> list[kalman.Update]:
-        """Predict and update every filter from its mixed state ``(n, M, N)``."""
+        """Predict and update every filter from its mixed state ``(n, M, N)``; return the updates."""
         F, Q = self.motion(measurement.interval)
         return [
             self.update_estimate(
@@ -88,7 +88,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         ]
 
     def start(self, initial: Initial) -> KalmanMixture:
-        """Start all filters from the initial estimate."""
+        """Return the state at the start of a track: all filters at the initial estimate, with prior probabilities."""
         xp, M = self.xp, self.probabilities.shape[0]
         mean, covariance = self.augment(initial.mean, initial.covariance)
         return KalmanMixture(
@@ -100,7 +100,10 @@ class KalmanInteractingMultipleModel(KalmanModel):
         )
 
     def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
-        """Run one IMM cycle. Its normalised innovation squared is the filters' mean by their posterior weights."""
+        """Run one IMM cycle (mix, predict, update) with a scan, and return the state.
+
+        The normalised innovation squared is the filters' mean by their posterior weights.
+        """
         xp, measurement = self.xp, given.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
         mixed = imm.mix(state.means, state.covariances, prediction.mixing)
@@ -146,13 +149,13 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Add the turn rate of straight flight."""
+        """Return an estimate with the turn rate of straight flight as fifth component."""
         return coordinated_turn.augment_turn_rate(mean, covariance, self.turn_variance)
 
     def predict_and_update(
         self, mean: Array, covariance: Array, measurement: Measurement
     ) -> list[kalman.Update]:
-        """Predict and update every filter from its mixed state ``(5, 3, N)``."""
+        """Predict and update every filter from its mixed state ``(5, 3, N)``; return the updates."""
         results = []
         for straight in super().predict_and_update(mean[:4], covariance[:4, :4], measurement):
             mean5, covariance5 = self.augment(straight.mean, straight.covariance)
