@@ -14,7 +14,7 @@ Companion = TypeVar("Companion")
 
 
 def find_companion(task: Any, kind: type[Companion]) -> Companion | None:
-    """Return the first companion of a type; None where the problem has none.
+    """Return the first companion object of a task that is an instance of a type; None without one.
 
     Args:
         task: a task, or a class of tasks.
@@ -34,15 +34,16 @@ class Actions(NamedTuple):
     """Meanings of actions."""
 
     meanings: Mapping[str, str]
-    """Return the meaning of an action under each control, in words."""
+    """Meaning of an action in words, by the name of the control."""
     reach: Mapping[str, tuple[str, ...]] = {}
     """Parameters that fix the range of an action, or its duration, by control or trained bank. A learned policy runs
     with those that it was trained with: with others the same numbers would be other actions."""
 
 
 class TrainedBanks(NamedTuple):
-    """Filters that a network of their own steers: learned estimators. An environment steers them like any bank, to
-    train them; no other policy acts in them.
+    """Banks of filters that a trained network steers: learned estimators.
+
+    Training treats them as any other bank. No other policy acts in them.
     """
 
     banks: Mapping[str, type]
@@ -92,31 +93,29 @@ class LoopRecords(NamedTuple):
 
 
 def trained_banks(task: Any) -> Mapping[str, type]:
-    """Return the trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
+    """Return the classes of the trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
     found = find_companion(task, TrainedBanks)
     return {} if found is None else found.banks
 
 
 def action_reach(task: Any, control: str) -> tuple[str, ...]:
-    """Return the names of the parameters that fix the range or duration of an action of a control, see
-    :class:`Actions`.
-    """
+    """Return the names of the task parameters that set the range or duration of an action of a control."""
     found = find_companion(task, Actions)
     return () if found is None else found.reach.get(control, ())
 
 
 def action_meanings(task: Any) -> Mapping[str, str]:
-    """Return the meaning of an action under each control, in words."""
+    """Return a description of the actions of a task, by the name of the control."""
     found = find_companion(task, Actions)
     return {} if found is None else found.meanings
 
 
 def lost_cost(task: Any) -> float | None:
-    """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
+    """Return the mean cost of an episode above which its track counts as lost; None where a task declares none."""
     found = find_companion(task, LostTracks)
     return None if found is None else found.cost
 
 
 def array_meanings(task: Any) -> ArrayMeanings:
-    """Return the meanings of arrays of a task, in words that may be empty."""
+    """Return the descriptions of a task's measurement and feedback arrays; empty texts where it declares none."""
     return find_companion(task, ArrayMeanings) or ArrayMeanings()

@@ -13,7 +13,7 @@ PYTHON = str(Path(traceback.__file__).parent)
 
 
 def own_line(error: BaseException) -> str:
-    """Return the last line of a user's own code that an error came through, such as " (mine.py, line 12)", or "".
+    """Return the last line of the user's code in a traceback, as " (mine.py, line 12)"; "" if there is none.
 
     Code of this package and of installed libraries is not the user's own.
     """
@@ -29,7 +29,7 @@ def own_line(error: BaseException) -> str:
 
 @contextmanager
 def explain_errors(what: str) -> Iterator[None]:
-    """Turn an error of a user's code into one sentence with the line that raised it.
+    """Context manager that re-raises errors of a user's code as a ValueError that names the line of that code.
 
     Args:
         what: beginning of the sentence.
