@@ -1,4 +1,4 @@
-"""Backends, which compute the steps of a task: code compiled for the processor, NumPy, or torch on a device."""
+"""Choice of the backend that computes the steps of a task: compiled code, NumPy, or torch on a device."""
 
 from types import ModuleType
 from typing import Any
@@ -27,7 +27,7 @@ def make_model(
     threads: int = 1,
     **keywords: Any,
 ) -> Model:
-    """Make a task with the bank of a control in the loop; ``model.backend`` names the code that computes its steps.
+    """Return a :class:`Model` of a task under a control, on the chosen backend (``model.backend`` names it).
 
     Args:
         cls: the task.
@@ -62,7 +62,7 @@ def make_model(
 
 
 def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
-    """Return the array namespace of a backend, and its device.
+    """Return the array namespace (NumPy or torch) and the device of a backend.
 
     Torch is imported only for its own backend.
 

@@ -72,7 +72,7 @@ class ExtendedKalmanState(NamedTuple):
 
 
 class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalmanState]):
-    """Base of the banks with one filter."""
+    """Base class of the banks with one extended Kalman filter."""
 
     parameters: StateSpaceParameters
 
@@ -85,17 +85,17 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return a box from -1 to 1 for each entry of the action."""
+        """Gymnasium box [-1, 1] with one number for each entry of the action."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 
     @property
     def answers(self) -> Sequence[str]:
-        """Return the names of the entries of the action."""
+        """Names of the entries of the action."""
         raise NotImplementedError
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the observation blocks of a filter with one model."""
+        """Observation blocks of a filter with one model."""
         parts = tuple(map(str, range(1, self.sensors + 1))) if self.sensors > 1 else ()
         return (
             innovation_block(parts, text="innovations over their sigma"),
@@ -111,7 +111,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Return the filter at the initial estimate."""
+        """Return the filter's state at the start of the track."""
         zero = 0.0 * initial.mean[0]
         return ExtendedKalmanState(
             initial.mean,
@@ -132,12 +132,12 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         return self.equations.sensor_noise(mean, measurement)
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Predict, and compute the innovation statistics under the noises of the last action."""
+        """Predict to a measurement, and compute the innovation statistics with the noises of the last action."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def compare(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Compute the innovation, NIS and log-likelihood of the measurement under its prediction."""
+        """Return the state with the innovation, NIS and log-likelihood of a measurement under its prediction."""
         xp = self.xp
         received = self.receive(state, measurement, state.action)
         P = state.covariance + self.process_noise(state.mean, measurement, state.action)
@@ -173,7 +173,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
 
 class StateSpaceNoiseBank(StateSpaceBank):
-    """Control ``noise``: the action scales Q and R."""
+    """Bank of the control ``noise``: the action scales Q and R."""
 
     answers: Sequence[str] = ("process", "measurement")
 
@@ -191,7 +191,7 @@ class StateSpaceNoiseBank(StateSpaceBank):
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the noises of the action."""
+        """Update with Q and R scaled by the action."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
@@ -200,17 +200,17 @@ class StateSpaceNoiseBank(StateSpaceBank):
 
 
 class StateSpaceGainBank(StateSpaceBank):
-    """Control ``gain``: the action multiplies the gain of each component."""
+    """Bank of the control ``gain``: the action multiplies the Kalman gain of each component."""
 
     @property
     def answers(self) -> Sequence[str]:
-        """Return the names of the components."""
+        """Names of the components, one for each entry of the action."""
         return tuple(component.name for component in self.task.components)
 
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the gain of the action."""
+        """Update with the Kalman gain multiplied by the factors of the action."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
@@ -244,14 +244,14 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
     @property
     def answers(self) -> Sequence[str]:
-        """Return the names of the noises, their factors in the gain alone, and the offset."""
+        """Names of the action's entries: noises, their factors in the gain alone, and offsets."""
         counts = {"process": self.states, "sensor": self.sensors, "agility": self.states}
         counts |= {"caution": self.sensors, "offset": self.states}
         return tuple(f"{name}_{i + 1}" for name, count in counts.items() for i in range(count))
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of one filter, with the state, the last correction and the log-deviation of the state."""
+        """Observation blocks: those of one filter, the state, the last correction, and the log-deviations."""
         names = tuple(component.name for component in self.task.components)
         names = names if len(names) > 1 else ()
         xp = self.xp
@@ -286,11 +286,11 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Return the filter at the initial estimate."""
+        """Return the filter's state at the start of the track."""
         return super().start(initial)._replace(correction=0.0 * initial.mean)
 
     def _part(self, action: Array, place: int) -> Array:
-        """Return a part of an action: 0 process, 1 sensor, 2 agility, 3 caution, 4 offset."""
+        """Return a part of the action by its number: 0 process, 1 sensor, 2 agility, 3 caution, 4 offset."""
         n, m = self.states, self.sensors
         ends = numpy.cumsum([0, n, m, n, m, n]).tolist()
         return action[ends[place] : ends[place + 1]]
@@ -318,7 +318,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the noises, gain factors and offset of the network."""
+        """Update with the noises, gain factors and offset that the network's action sets."""
         action = self.xp.clip(action, -1.0, 1.0)
         Q = self.process_noise(state.mean, measurement, action)
         received = self.receive(state, measurement, action)
@@ -358,7 +358,7 @@ class Mixture(NamedTuple):
 
 
 class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture]):
-    """Control ``evidence``: an interacting multiple model of extended Kalman filters, see :mod:`..filters.imm`.
+    """Bank of the control ``evidence``: an interacting multiple model (IMM) of extended Kalman filters.
 
     Args:
         task: the problem.
@@ -388,12 +388,12 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return the space of the evidence, one number for each hypothesis."""
+        """Gymnasium space of the evidence, one number for each hypothesis."""
         return bank_action_space(self.control, self.count)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of probabilities, likelihoods, availability and the last action."""
+        """Observation blocks of probabilities, likelihoods, availability and the last action."""
         xp, modes = self.xp, self.task.modes
         parts = tuple(map(str, range(1, self.task.definition.filters[0].h.size + 1)))
         return (
@@ -418,7 +418,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def start(self, initial: Initial) -> Mixture:
-        """Return all hypotheses at the initial estimate, equally probable."""
+        """Return the state with all hypotheses at the initial estimate, equally probable."""
         xp, zero = self.xp, 0.0 * initial.mean[0]
         one = xp.stack([zero] * self.count)
         return Mixture(
@@ -434,7 +434,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def predict(self, state: Mixture, measurement: StateSpaceMeasurement) -> Mixture:
-        """Mix, predict and update every hypothesis; none of that depends on the action."""
+        """Mix, predict and update every hypothesis (IMM); none of that depends on the action."""
         xp = self.xp
         chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
         means, covariances = imm.mix(self._align(state.means), state.covariances, chain.mixing)
@@ -454,11 +454,11 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def _align(self, means: Array) -> Array:
-        """Return the means ``(n, M, N)`` with angles on the turn of the first hypothesis."""
+        """Return the means ``(n, M, N)`` with angles shifted by whole turns next to the first hypothesis."""
         return unwrap(means, means[:, :1], self.task.periods)
 
     def act(self, state: Mixture, measurement: StateSpaceMeasurement, action: Array) -> Mixture:
-        """Weight the hypotheses with the evidence of the action, and combine them."""
+        """Weight the hypotheses with the evidence of the action, and combine them into one estimate."""
         probabilities = bank_probabilities(
             self.control,
             action,
@@ -472,7 +472,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         return state._replace(mean=mean, covariance=covariance, probabilities=probabilities, action=action)
 
     def records(self, state: Mixture, measurement: StateSpaceMeasurement) -> dict[str, Array]:
-        """Return the log-likelihood of the measurement and the probabilities of the hypotheses."""
+        """Return the log-likelihood of the measurement and the hypotheses' probabilities, by name."""
         there = ordered_sum(measurement.available) > 0.0
         density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
         return {
@@ -482,7 +482,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
 
 def bank_tables(count: int) -> tuple[Mapping[str, Any], Mapping[str, str]]:
-    """Return banks and descriptions of actions by control, the default first, for a number of hypotheses."""
+    """Return the bank classes and the descriptions of actions, each by control, the default control first."""
     banks: dict[str, Any] = {"noise": StateSpaceNoiseBank, "gain": StateSpaceGainBank}
     actions = {
         "noise": "times `noise_decades` decades: factors on Q and R; **0 is the filter as written**",
