@@ -212,8 +212,6 @@ def find_invalid_noise(
 
     Sensors whose R depends on the state are skipped.
 
-    The function returns None where there is none. It skips sensors whose R depends on the state.
-
     Args:
         definition: the models.
         available: above zero where a number was received, ``(m, K)``.
@@ -505,7 +503,7 @@ class Equations:
         return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
 
     def gain(self, covariance: Array, received: Received) -> Array:
-        """Return the Kalman gain, ``(n, m, N)``, for a covariance ``(n, n, N)``; zero for sensors beyond their
+        """Return the Kalman gain, ``(n, m, N)``, for a covariance ``(n, n, N)``; zero for sensors outside their
         gates.
         """
         if self.gated:
