@@ -34,7 +34,7 @@ GAINS = ("caution", "drift_gain", "coloured_gain")
 
 
 class KalmanNetBank(NoiseBank):
-    """The augmented filter, whose noises and gain the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the augmented filter, whose noises and gain the action sets."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(
         -1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32
@@ -43,7 +43,7 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation of control ``noise``, and the estimated rate errors."""
+        """Observation blocks of control ``noise``, and the estimated rate errors."""
         p = self.parameters
         unit = 1.0 / math.hypot(p.drift, p.coloured)
         return (
@@ -65,11 +65,11 @@ class KalmanNetBank(NoiseBank):
         )
 
     def last_action(self) -> Block:
-        """Block of the action applied before."""
+        """Return the observation block of the previous action."""
         return Block("last_action", lambda f, _: f.action, "action applied before", (*NOISES, *GAINS))
 
     def start(self, initial: Initial) -> Augmented:
-        """Start where INS and reference agree, with the modelled prior of the rate errors."""
+        """Return the state at the start: INS and reference agree, the rate errors have their modelled prior."""
         state = super().start(initial)
         return state._replace(action=self.xp.concat([state.action, state.action]))
 
@@ -79,7 +79,7 @@ class KalmanNetBank(NoiseBank):
         return predicted._replace(action=state.action)
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
-        """Update by the gain that was answered."""
+        """Update with the noises and the gain that the action sets."""
         xp, innovation = self.xp, state.seen.innovation
         a = xp.clip(action, -1.0, 1.0)
         P = self.predict_covariance(state, a[: len(NOISES)])

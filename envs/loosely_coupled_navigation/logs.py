@@ -1,7 +1,7 @@
-"""Positions by an INS and by a receiver as measurements of LooselyCoupledNavigation.
+"""Tables of positions by an INS and by a receiver, read as measurements of LooselyCoupledNavigation.
 
-The first row is the start of the track: there the position of the INS is taken for the true one, as the environment has
-it. Every further row is a measurement.
+The first row is the start of the track: there the position of the INS is taken for the true one, as in the environment.
+Every further row is a measurement.
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,9 @@ def measure(
     sigma: numpy.ndarray,
     p: Any,
 ) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a measurement, of n rows of a table or of n tracks; a fix of some axes is none.
+    """Return the arrays of a ``Measurement`` from n rows of a table or from n tracks, by name.
+
+    A fix without all axes counts as missing.
 
     Args:
         number: of the measurement, ``(n,)``.
@@ -62,14 +64,14 @@ def measure(
 def start_track(
     measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
 ) -> TrackStart:
-    """Start every episode where its INS was before the first increment."""
+    """Return the start of every episode, at the INS position before the first increment."""
     mean = measurements["ins"][:, 0] - measurements["increment"][:, 0]
     covariance = numpy.zeros((*mean.shape, mean.shape[-1]))
     return TrackStart(measurements, {"mean": mean, "covariance": covariance}, 0)
 
 
 def read_log(columns: Columns) -> TrackLog:
-    """Make measurements of one track.
+    """Return the measurements of one track from the columns of a table.
 
     Raises:
         ValueError: for what lacks or cannot be.
@@ -106,7 +108,7 @@ def read_log(columns: Columns) -> TrackLog:
 
 
 def predict_fix(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Fix that an estimate predicts by the increment of the INS, and the fix, m, ``(axes, N)`` each."""
+    """Return the position that an estimate and the INS increment predict, and the fix, m, ``(axes, N)`` each."""
     return mean + measurement.increment, numpy.where(measurement.available > 0.0, measurement.fix, numpy.nan)
 
 
