@@ -72,12 +72,6 @@ class StateSpaceModel:
         Args:
             mean: centre of the states that are checked, ``(n,)``.
             inputs: typical inputs, ``(p,)``.
-
-        Measurements may then be simultaneous. The method checks this numerically at a few states.
-
-        Args:
-            mean: centre of the states that are checked, ``(n,)``.
-            inputs: usual inputs, ``(p,)``.
         """
         if not isinstance(self.Q, VectorFunction):
             return False

@@ -6,9 +6,9 @@ from ..contract.observation import Array
 from .disturbances import DISTURBANCES
 
 AFTERMATH = 5.0
-"""Scans in which a filter recovers from a manoeuvre."""
+"""Number of scans in which a filter recovers from a manoeuvre."""
 RANGE_EDGES = (30.0, 60.0, 120.0)
-"""km from the radar, whose error across the beam grows with the range."""
+"""Limits of range classes, km; the error across the beam grows with the range."""
 
 
 def _recovers(moment: Moment) -> Array | None:

@@ -1,7 +1,7 @@
-"""Disturbances of the radar of ManeuveringTarget, without those of its scan times: a class for each.
+"""Disturbances of the radar of ManeuveringTarget, except those of its scan times: one class each.
 
 Errors are along x and y, or, where measurements are polar, of range and azimuth, in units of the white ones' standard
-deviations. None of it is reported.
+deviations. A measurement reports none of them.
 """
 
 from typing import NamedTuple
@@ -17,15 +17,15 @@ class ColouredScanErrorsState(NamedTuple):
     """State of :class:`ColouredScanErrors`."""
 
     deviation: Array
-    """``(N,)``."""
+    """Stationary standard deviation, ``(N,)``."""
     correlation_time: Array
-    """s, ``(N,)``."""
+    """Correlation time, s, ``(N,)``."""
     level: Array
-    """In this scan, ``(2, N)``."""
+    """Errors in this scan, ``(2, N)``."""
 
 
 class ColouredScanErrors(Disturbance):
-    """Errors that last from scan to scan, beside the white ones."""
+    """Errors that are correlated from scan to scan, added to the white ones."""
 
     name = "coloured"
     initial_normals = 2
@@ -33,11 +33,11 @@ class ColouredScanErrors(Disturbance):
 
     @classmethod
     def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
-        """Return whether there may be coloured errors."""
+        """Return whether the parameters allow coloured errors."""
         return parameters.coloured
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ColouredScanErrorsState:
-        """Draw how large they are and how long they last; they are stationary from the start."""
+        """Draw standard deviation, correlation time and the stationary initial errors."""
         p = self.parameters
         deviation = draws.uniform("coloured_sigma", p.coloured_sigma)
         calm = undisturbed(draws, p)
@@ -48,41 +48,42 @@ class ColouredScanErrors(Disturbance):
         )
 
     def advance(self, state: ColouredScanErrorsState, step: DisturbanceInput) -> ColouredScanErrorsState:
-        """Advance the errors by a scan."""
+        """Return the state with the errors of the next scan."""
         process = GaussMarkov.sampled(state.deviation, state.correlation_time, step.interval, self.xp)
         return state._replace(level=process.advance(state.level, step.normals))
 
     def change_errors(self, state: ColouredScanErrorsState, errors: Array) -> Array:
-        """Add them."""
+        """Return the errors with the coloured ones added."""
         return errors + state.level
 
     def context(self, state: ColouredScanErrorsState) -> dict[str, Array]:
-        """Their standard deviation."""
+        """Return the standard deviation of the coloured errors, by name."""
         return {"coloured_sigma": state.deviation}
 
 
 class Bias(Disturbance):
-    """Errors that are the same in all scans of an episode; its state, ``(2, N)``."""
+    """Constant errors in all scans of an episode; they are its state, ``(2, N)``."""
 
     name = "bias"
 
     @classmethod
     def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
-        """Return whether there is a bias."""
+        """Return whether the parameters allow a bias."""
         return parameters.bias > 0.0
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Draw them."""
+        """Draw the constant errors, ``(2, N)``."""
         return draws.uniform("bias", (-self.parameters.bias, self.parameters.bias), 2)
 
     def change_errors(self, state: Array, errors: Array) -> Array:
-        """Add them."""
+        """Return the errors with the bias added."""
         return errors + state
 
     def context(self, state: Array) -> dict[str, Array]:
-        """All of it."""
+        """Return the bias, by name."""
         return {"bias": state}
 
 
 DISTURBANCES: tuple[type[Disturbance], ...] = (Glint, ColouredScanErrors, Bias, Clutter)
-"""In the order in which they take random numbers and act; a further one comes last, so that episodes stay."""
+"""Disturbances in the order in which they use random numbers and act. New ones are appended, so that episodes do not
+change."""

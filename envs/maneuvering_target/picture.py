@@ -1,4 +1,4 @@
-"""Picture of ManeuveringTarget: the track, a close-up of the estimate, and strips of what the filter does."""
+"""Picture of ManeuveringTarget: the track, a close-up of the estimate, and time series of the filter."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,9 +32,9 @@ from .problem import TargetProblem
 ELLIPSE_SIGMAS = 2.0
 """Half axes of the covariance ellipse, standard deviations."""
 RECENT = 15
-"""Scans whose errors the close-up keeps."""
+"""Number of scans whose errors the close-up shows."""
 CLOSE_UP_SIGMAS = 4.0
-"""Half width of the close-up at the start, in the largest measurement sigma of the flight."""
+"""Half width of the close-up at the start, in multiples of the largest measurement sigma of the flight."""
 TRACK = (0.06, 0.475, 0.43, 0.425)
 CLOSE_UP = (0.06, 0.075, 0.19, 0.19 * FIGURE_SIZE[0] / FIGURE_SIZE[1])
 """Left, bottom, width, height of the panels as shares of the figure; the close-up is square."""
@@ -61,7 +61,7 @@ def ellipse_axes(covariance: numpy.ndarray) -> tuple[float, float, float]:
 
 
 class ManeuveringTargetPicture(Picture):
-    """Track, close-up, normalised innovation, gain or weights, position error."""
+    """Picture of the track, a close-up, normalised innovation, gain or weights, and position error."""
 
     clock = "scan"
     strips_left: float = 0.545
@@ -78,7 +78,7 @@ class ManeuveringTargetPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Return the positions in km, innovation, gain or weights, position error with its reported sigma."""
+        """Return the values that the time series and the track show at a scan, by name; positions in km."""
         estimator = state.filter
         true, measured = state.truth.position[:, 0], state.measurement.position[:, 0]
         if not state.measurement.available[0]:
@@ -117,7 +117,7 @@ class ManeuveringTargetPicture(Picture):
         return {**values, "innovation_x": normalised[0], "innovation_y": normalised[1]}
 
     def begin(self, state: Episode) -> None:
-        """Fly the whole episode ahead, for limits that need not move; the truth does not depend on noise."""
+        """Simulate the truth of the whole episode in advance, so that axis limits need not move."""
         world, truth, measurement = self.task.world, state.truth, state.measurement
         still = numpy.zeros((world.normals + world.row_uniforms, truth.position.shape[-1]))
         positions, velocities, sigmas = [], [], []
@@ -136,7 +136,7 @@ class ManeuveringTargetPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Return the innovation, what is steered, error."""
+        """Return the time series of innovation, action and error."""
         axes: Sequence[str] = "xy"
         if self.model.control == "gain":
             steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
@@ -166,17 +166,17 @@ class ManeuveringTargetPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """No: the strips say it in the filter's terms."""
+        """Return False: the time series show the filter's quantities instead of the observation."""
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return the scans of the manoeuvres."""
+        """Return the first and last scan of each manoeuvre, which are shaded."""
         return self.maneuvers
 
     # --- panels
 
     def open(self, figure: Figure) -> None:
-        """Make the track, the close-up and one legend for both."""
+        """Create the panels of track and close-up, and one legend for both."""
         track = self.track = figure.add_axes(TRACK)
         close_up = self.close_up = figure.add_axes(CLOSE_UP)
         for axes in (track, close_up):
@@ -235,7 +235,7 @@ class ManeuveringTargetPicture(Picture):
         )  # fmt: skip
 
     def arrange(self) -> None:
-        """Limits that hold the flight of this episode, in the shape of the panel."""
+        """Set the axis limits of the track to the whole flight of the episode, in the shape of the panel."""
         low, high = self.flight.min(axis=1), self.flight.max(axis=1)
         width, height = FIGURE_SIZE[0] * TRACK[2], FIGURE_SIZE[1] * TRACK[3]
         middle, half = 0.5 * (low + high), 0.5 * (high - low) + CLOSE_UP_SIGMAS * self.largest_sigma
@@ -252,7 +252,7 @@ class ManeuveringTargetPicture(Picture):
         self.close_up.set_ylim(-reach, reach)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Move everything to where it is now."""
+        """Update all artists to the current scan."""
         seen = int(state.measurement.available[0])
         self.arrived.set_data(*(state.measurement.position[:, :seen] / 1e3))
         pairs = {name: _pair(history, name) for name in ("true", "measured", "estimated")}

@@ -27,7 +27,7 @@ from .world import RadarWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return what draws an episode; imported here, because it brings matplotlib."""
+    """Return the object that draws an episode; imported here, because it needs matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
@@ -160,7 +160,7 @@ class ManeuveringTarget(TargetProblem):
     )
 
     def set_up(self) -> None:
-        """Name the hypotheses and the paper's action."""
+        """Name the hypotheses, and set the paper's action."""
         super().set_up()
         count = len(self.parameters.gains)
         self.flights: tuple[int, ...] = self.parameters.track_scans
@@ -169,7 +169,7 @@ class ManeuveringTarget(TargetProblem):
         self.closes_loop: bool = self.parameters.cluttered
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> ReportedTrack:
-        """Track about which the radar looks for plots."""
+        """Return the track around which the radar returns plots, in clutter."""
         return ReportedTrack(mean, covariance)
 
 
