@@ -8,7 +8,7 @@ from ..contract.observation import Array
 from .world import DISTURBANCES
 
 AFTERMATH = 20.0
-"""Scans that count as after a change of class: 10 s."""
+"""Number of scans that count as after a change of class: 10 s."""
 RANGE_EDGES = (50.0, 100.0)
 """Edges of the classes of range, km."""
 
@@ -36,7 +36,7 @@ def _has_second_emitter(moment: Moment) -> Array | None:
 
 
 def causes_of(classes: Sequence[str]) -> tuple[Cause, ...]:
-    """Return the causes, with one for each class.
+    """Return the causes of costs of the task as one tuple, with one for each class.
 
     Args:
         classes: names of the classes.

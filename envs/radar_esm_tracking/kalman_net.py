@@ -38,12 +38,14 @@ NOISE_RANGE = 3.0
 CAUTION = 3.0
 """Largest factor and divisor of these deviations in the gain alone."""
 MEASURED = (0, 1)
-"""Range and range rate."""
+"""Names of the measured components: range and range rate."""
 NOISES = ("acceleration", "range", "range_rate")
 
 
 class NetFilters(NamedTuple):
-    """Fields of :class:`~.banks.Filters` with packed covariances, the covariance of the gain and the last output."""
+    """State of the bank: :class:`~.banks.Filters` with packed covariances, the gain's covariance and the last
+    output.
+    """
 
     mean: Array
     """Means, ``(3, M, N)``; between :meth:`KalmanNetBank.predict` and the action predicted."""
@@ -69,7 +71,7 @@ class NetFilters(NamedTuple):
 
 
 class KalmanNetBank(ClassBank):
-    """Bank of the paper's filters with noises, gains and weights from the action."""
+    """Bank of ``kalman-net``: the paper's filters, whose noises, gains and weights the action sets."""
 
     def __init__(self, task: RadarEsmProblem, control: str) -> None:
         super().__init__(task, control)
@@ -87,12 +89,14 @@ class KalmanNetBank(ClassBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return the space of evidence, noises, and their factors in the gain alone."""
+        """Gymnasium box of evidence, noises, and their factors in the gain alone."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of the bank, with the predicted deviation of the range and the last output."""
+        """Observation blocks: those of :class:`ClassBank`, the predicted deviation of the range, and the last
+        output.
+        """
         unit, place = 1.0 / self.radar_variances[0], packed_covariance.position(3, 0, 0)
         return (
             *super().blocks,
@@ -107,20 +111,22 @@ class KalmanNetBank(ClassBank):
         )
 
     def start(self, initial: Start) -> Any:
-        """Return the initial state of the paper's algorithm as :class:`NetFilters`."""
+        """Return the paper's algorithm at the start of the track, as :class:`NetFilters`."""
         fields = super().start(initial)._asdict()
         fields["covariance"] = covariance = packed_covariance.pack(fields["covariance"])
         action = self.xp.stack([0.0 * initial.mean[0]] * len(self.answers))
         return NetFilters(**fields, gain_covariance=covariance, action=action)
 
     def noises(self, action: Array) -> tuple[Array, list[Array]]:
-        """Return the factor on the process noise, and the variances of range and range rate, ``(N,)`` each."""
+        """Return the factor on the process noise, and the variances of range and range rate under an action, ``(N,)``
+        each.
+        """
         classes = self.task.classes
         scale = self.xp.exp(2.0 * math.log(NOISE_RANGE) * action[classes : classes + len(NOISES)])
         return scale[0], [scale[1 + i] * variance for i, variance in enumerate(self.radar_variances)]
 
     def predict(self, state: Any, measurement: Measurement) -> Any:
-        """Predict by one scan, and compute the innovation statistics of the radar measurement."""
+        """Predict the filters by one scan, and compute the innovation statistics of the radar measurement."""
         xp, f = self.xp, state
         mean = apply(self.task.models.Phi[..., None], f.mean)
         covariance = apply(self.propagator, f.covariance)
@@ -153,7 +159,7 @@ class KalmanNetBank(ClassBank):
         )
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
-        """Update with the gains of the output, apply the class transition, and weight the filters."""
+        """Update the filters with the gains of the action, apply the class transition, and weight the filters."""
         xp, classes, f = self.xp, self.task.classes, state
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         process, radar = self.noises(a)
@@ -195,6 +201,6 @@ class KalmanNetBank(ClassBank):
         )
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance (12), including the spread of the filters, ``(3, 3, N)``."""
+        """Return the covariance of the weighted mean with the spread of the filters, equation (12), ``(3, 3, N)``."""
         each = packed_covariance.unpack(state.covariance, 3)
         return imm.combine(state.mean, each, state.probabilities)[1]

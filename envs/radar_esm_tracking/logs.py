@@ -1,4 +1,4 @@
-"""Log format of RadarEsmTracking: ranges, range rates, bearings and type decisions.
+"""Tables of ranges, range rates, bearings and type decisions, read as measurements of RadarEsmTracking.
 
 The first row is scan 0, which starts the track. A decision is the number of an emitter type, empty where the ESM
 received nothing. A row with a decision contains both bearings, or their difference.
@@ -30,7 +30,7 @@ COLUMNS = {
 
 
 def read_log(columns: Columns) -> TrackLog:
-    """Return the measurements of one track.
+    """Return the measurements of one track from the columns of a table.
 
     Raises:
         ValueError: if a column is missing or a value is not possible.
@@ -59,7 +59,7 @@ def read_log(columns: Columns) -> TrackLog:
 
 
 def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, p: Any) -> TrackStart:
-    """Start every episode on its first measurement.
+    """Return the start of every episode, on its first measurement.
 
     Args:
         measurements: ``(E, T, ...)``.
@@ -84,7 +84,7 @@ def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarra
 
 
 def _start_variances(p: Any) -> list[float]:
-    """Return the initial variances of range, range rate and acceleration; the last as in (12) for an unknown class."""
+    """Return the initial variances of range, range rate and acceleration, the last one of an unknown class (12)."""
     acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
     return [p.range_sigma**2, p.range_rate_sigma**2, acceleration]
 
@@ -95,7 +95,7 @@ def _numbers(p: Any) -> dict[str, float]:
 
 
 def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a measurement other than ``scan`` and ``radar`` from the reports of radar and ESM.
+    """Return the arrays of a measurement, except ``scan`` and ``radar``, from radar and ESM reports, by name.
 
     Args:
         readings: n rows of a table, or live values.
@@ -136,7 +136,7 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
 
 
 def predict_radar(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Return the predicted range and range rate, and those of the radar, ``(2, N)`` each."""
+    """Return the predicted and the measured range and range rate, ``(2, N)`` each."""
     T = parameters.sampling_interval
     distance, rate, acceleration = mean
     predicted = numpy.stack([distance + T * rate + 0.5 * T**2 * acceleration, rate + T * acceleration])
