@@ -37,7 +37,7 @@ from .world import NavigationWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return what draws an episode; imported here, because it brings matplotlib."""
+    """Return the object that draws an episode; imported here, because it needs matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
@@ -184,7 +184,7 @@ class TightlyCoupledNavigation(NavigationProblem):
     )
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
-        """Return the state that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a
+        """Return the state that steers the tracking loops, ``(17, N)``: the estimate, extrapolated as in a
         manoeuvre.
         """
         return gnss_ins.advance(mean, self.axis[:, :, SINGER], self.common.T, self.common.decay)
