@@ -6,7 +6,7 @@ from ..contract.observation import Array
 from .disturbances import DISTURBANCES, RAISED
 
 SETTLING = 20.0
-"""Measurements that the loop needs to follow a new command."""
+"""Number of measurements that the loop needs to follow a new command."""
 
 
 def _has_new_command(moment: Moment) -> Array | None:

@@ -1,4 +1,4 @@
-"""Disturbances of the sensors of UavAutopilot, a class for each. A measurement reports dropouts only."""
+"""Disturbances of the sensors of UavAutopilot, one class each. A measurement reports dropouts only."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -10,7 +10,7 @@ from ..contract.observation import Array
 from .problem import AutopilotProblem
 
 RAISED = 2.0
-"""Factor on the nominal noise from which a noise counts as raised."""
+"""Factor on the nominal noise above which a noise counts as raised."""
 
 
 def _has_noisy_sensor(moment: Moment) -> Array | None:
@@ -28,14 +28,16 @@ def draw_steps(
     zero: Array,
     count: int | None = None,
 ) -> StepSignal:
-    """Draw the level in each part of the episode, and the first measurements of the parts."""
+    """Draw a piecewise constant signal: its level in each part of the episode, and the first measurements of the
+    parts.
+    """
     values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
     begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
     return StepSignal(draws.xp.stack(values), draws.xp.stack([zero, *begins])[1:])
 
 
 class _OfSensors(Disturbance):
-    """Base of disturbances of all m sensors, or of some."""
+    """Base class of disturbances of all m sensors, or of some."""
 
     def __init__(self, task: AutopilotProblem) -> None:
         super().__init__(task)
@@ -44,7 +46,7 @@ class _OfSensors(Disturbance):
         self.sigmas: Array = task.constant(task.parameters.value("sensor_sigmas"))[:, None]
 
     def chosen(self, named: tuple[str, ...] | None) -> Array:
-        """Return one for the disturbed sensors, otherwise zero, ``(m, 1)``."""
+        """Return a mask, one for the named sensors (None: all) and zero for the others, ``(m, 1)``."""
         return self.task.constant([[float(named is None or s in named)] for s in self.task.sensors])
 
 
@@ -58,7 +60,7 @@ class SensorLevels(NamedTuple):
 
 
 class NoisySensors(_OfSensors):
-    """White noise of sensors that differs from nominal and changes in the episode."""
+    """White noise of sensors that differs from nominal and changes during the episode."""
 
     name = "noisy_sensors"
     causes: ClassVar[tuple[Cause, ...]] = (
@@ -70,27 +72,27 @@ class NoisySensors(_OfSensors):
     )
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> SensorLevels:
-        """Draw the levels and the times of their changes."""
+        """Draw the factors on the sensors' noise and the times of their changes."""
         p, chosen = self.parameters, self.chosen(self.parameters.changing_sensors)
         levels = draw_steps(draws, "sensor", p.sensor_levels, p.sensor_times, zero, self.count)
         levels = levels._replace(values=1.0 + chosen * (levels.values - 1.0))
         return SensorLevels(levels, levels.values[0])
 
     def quiet(self, state: SensorLevels, calm: Array) -> SensorLevels:
-        """Return the levels, with one in undisturbed episodes."""
+        """Set the factors to one in the episodes where ``calm``."""
         values = self.xp.where(calm, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
 
     def advance(self, state: SensorLevels, step: DisturbanceInput) -> SensorLevels:
-        """Set the levels of this measurement."""
+        """Return the state with the factors of this measurement."""
         return state._replace(level=state.levels.at(step.number, self.xp))
 
     def change_deviations(self, state: SensorLevels, deviations: Array) -> Array:
-        """Multiply the standard deviations by the levels."""
+        """Return the standard deviations times the factors."""
         return deviations * state.level
 
     def context(self, state: SensorLevels) -> dict[str, Array]:
-        """Return all levels, and the first measurements at which they apply."""
+        """Return all factors, and the measurements at which they change, by name."""
         return {"sensor_levels": state.levels.values, "sensor_level_times": state.levels.times}
 
 
@@ -124,7 +126,7 @@ class Dropouts(_OfSensors):
         return Holds(xp.stack(starts)[1:], xp.stack(stops)[1:], none)
 
     def change_measurement(self, state: Holds, measurement: Any, step: DisturbanceInput) -> tuple[Holds, Any]:
-        """Replace the reading of each sensor in a dropout by its last one."""
+        """Replace the reading of each sensor in a dropout by its last valid one, and mark it unavailable."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
             out = within(step.number, (state.starts[i], state.stops[i]))
@@ -134,7 +136,7 @@ class Dropouts(_OfSensors):
         return state._replace(reading=reading), measurement
 
     def context(self, state: Holds) -> dict[str, Array]:
-        """Return the first measurements of the dropouts and after them."""
+        """Return the first measurements of the dropouts and those after them, by name."""
         return {"dropout_starts": state.starts, "dropout_stops": state.stops}
 
 
@@ -144,7 +146,7 @@ class SensorBias(_OfSensors):
     name = "bias"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Draw size and sign of the errors."""
+        """Draw magnitude and sign of the constant errors, ``(m, N)``."""
         xp, limits = self.xp, self.parameters.sensor_bias
         if not limits[1]:
             return xp.stack([zero] * self.count)
@@ -153,20 +155,20 @@ class SensorBias(_OfSensors):
         return self.sigmas * self.chosen(self.parameters.biased_sensors) * side * size
 
     def quiet(self, state: Array, calm: Array) -> Array:
-        """Return the errors, with zero in undisturbed episodes."""
+        """Set the errors to zero in the episodes where ``calm``."""
         return self.xp.where(calm, 0.0, state)
 
     def change_reading(self, state: Array, reading: Array) -> tuple[Array, Array]:
-        """Add the errors to the readings."""
+        """Return the readings with the constant errors added."""
         return state, reading + state if self.parameters.sensor_bias[1] else reading
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return the errors."""
+        """Return the constant errors, by name."""
         return {"sensor_bias": state}
 
 
 class SensorColour(ColouredErrors):
-    """Coloured errors of sensors, first-order Gauss-Markov processes."""
+    """Coloured errors of sensors: first-order Gauss-Markov processes."""
 
     def __init__(self, task: AutopilotProblem) -> None:
         p = task.parameters
@@ -174,7 +176,9 @@ class SensorColour(ColouredErrors):
         self.sigmas: Array = task.constant(p.value("sensor_sigmas"))[:, None]
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw standard deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
+        """Draw the stationary standard deviation, in the sensor's unit, and the correlation time, s, ``(m, N)``
+        each.
+        """
         p, none = self.parameters, self.xp.stack([zero] * self.count)
         if not self.normals:
             return none, none + 1.0
@@ -182,15 +186,15 @@ class SensorColour(ColouredErrors):
         return deviation, draws.log_uniform("correlation_time", p.sensor_correlation_time, self.count)
 
     def change_reading(self, state: ColouredErrorsState, reading: Array) -> tuple[ColouredErrorsState, Array]:
-        """Add the errors to the readings."""
+        """Return the readings with the coloured errors added."""
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return the errors at this measurement."""
+        """Return the coloured errors at this measurement, by name."""
         return {"sensor_coloured": state.level}
 
 
 DISTURBANCES: tuple[type[Disturbance], ...] = (NoisySensors, SensorColour, SensorBias, Dropouts)
-"""Disturbances in the order of their action; add new ones last to keep episodes equal."""
+"""Disturbances in the order in which they act. New ones are appended, so that episodes do not change."""
 DRAWN_FIRST = (NoisySensors, Dropouts, SensorBias)
-"""Disturbances that are drawn before the others, in this order, to keep the random numbers of episodes."""
+"""Disturbances that are drawn before the others, in this order, which fixes the random numbers of episodes."""

@@ -41,7 +41,7 @@ class Kind(NamedTuple):
     share: float = 1.0
     """Prior probability."""
     lag: float = 1.0
-    """Time constant of the actuator over the believed one; plant P has only kinds with 1."""
+    """Ratio of the actuator's time constant to that of the model; plant P has only kinds with 1."""
     error: float = 0.15
     """Standard deviation of the slow errors over the sensor's nominal one."""
     error_time: float = 1.0
@@ -51,7 +51,7 @@ class Kind(NamedTuple):
 
 
 class LevelPrior(NamedTuple):
-    """Prior of a bank over levels."""
+    """Prior of the bank over noise levels."""
 
     gusts: tuple[float, float] = (0.2, 5.0)
     """Limits of the disturbance's level, log-uniform."""
@@ -71,7 +71,7 @@ class LevelPrior(NamedTuple):
     leave: float = 1e-4
     """Probability before a measurement that noise as designed ends."""
     kept: float = 0.5
-    """Probability that a sensor's noise remains as designed at that end."""
+    """Probability that a sensor's noise remains as designed when noise as designed ends."""
     slow: tuple[str, ...] = ("rate",)
     """Sensors with slow errors."""
     kinds: tuple[Kind, ...] = (Kind(),)
@@ -97,13 +97,13 @@ that has a bias, and an actuator that is slower than designed; one of ten each."
 
 
 def grid(limits: tuple[float, float], points: int) -> numpy.ndarray:
-    """Return the midpoints of equal intervals of the logarithm."""
+    """Return the midpoints of intervals that divide the logarithm of a range evenly, ``(points,)``."""
     low, high = limits
     return numpy.asarray(low * (high / low) ** ((numpy.arange(points) + 0.5) / points))
 
 
 class Levels(NamedTuple):
-    """State of the bank over levels."""
+    """State of the bank over noise levels."""
 
     mean: Array
     """Mean of all hypotheses together, ``(n, N)``."""
@@ -114,14 +114,14 @@ class Levels(NamedTuple):
 
 
 def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
-    """Return the likelihood of the readings; NaN in a dropout of all sensors."""
+    """Return the :class:`Likelihood` of the readings; NaN in a dropout of all sensors."""
     count = ordered_sum(measurement.available)
     there = count > 0.0
     return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
 
 
 class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
-    """Gaussian sum over levels of gusts and sensors that switch at unknown times, merged like an IMM.
+    """Gaussian sum over noise levels of gusts and sensors that switch at unknown times, merged like an IMM.
 
     Args:
         task: the problem.
@@ -184,7 +184,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         heights, designed = numpy.log(levels) / (math.log(levels[-1]) or 1.0), numpy.arange(each) == 0
         raised = numpy.tile([heights, designed.astype(float)], (1, self.groups))
         self.raised: Array = constant(raised)[:, :, None]
-        """Exponents of the first two factors in each weight, ``(2, H, 1)``."""
+        """Exponents of the first two factors in each hypothesis' weight, ``(2, H, 1)``."""
 
     def start(self, initial: Initial | Start) -> Levels:
         """Return all hypotheses at the initial estimate."""
@@ -199,17 +199,19 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         return Levels(initial.mean, initial.covariance, Likelihood.unknown(none), hypotheses)
 
     def predict(self, state: Levels, measurement: Measurement) -> Levels:
-        """Apply the change of levels, and predict every hypothesis to the time of a measurement."""
+        """Mix the hypotheses for changes of the levels, and predict each to the time of a measurement."""
         h = self.switch(state.hypotheses)
         mean, covariance = self.propagate(h, measurement)
         return state._replace(hypotheses=h._replace(mean=mean, covariance=covariance))
 
     def heeds(self, measurement: Measurement) -> Array:
-        """Return where any sensor has a reading, ``(N,)``."""
+        """Return one where any sensor has a reading, zero elsewhere, ``(N,)``."""
         return self.xp.where(ordered_sum(measurement.available) > 0.0, 1.0, 0.0)
 
     def apply_factors(self, h: LevelHypotheses, logarithms: Array) -> LevelHypotheses:
-        """Multiply weights and process noise by factors, given as logarithms ``(3, N)``."""
+        """Return the hypotheses with weights and process noise multiplied by factors, given as logarithms ``(3,
+        N)``.
+        """
         xp = self.xp
         return h._replace(
             probability=xp.exp(ordered_sum(self.raised * logarithms[:2, None])) * h.probability,
@@ -217,7 +219,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def update(self, state: Levels, given: FilterInput) -> Levels:
-        """Update with the readings one after the other, and combine the hypotheses."""
+        """Update all hypotheses with one reading after the other, and combine them."""
         xp, n, measurement, predicted = self.xp, self.n, given.measurement, state.hypotheses
         scaled = self.variances
         if given.action is not None:
@@ -251,7 +253,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def switch(self, memory: LevelHypotheses) -> LevelHypotheses:
-        """Apply the change of levels in every kind."""
+        """Return the hypotheses of every kind mixed for changes of the levels."""
         xp, each = self.xp, self.change.shape[0]
         parts = [
             noise_levels.switch(
@@ -273,7 +275,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def propagate(self, h: LevelHypotheses, measurement: Measurement) -> tuple[Array, Array]:
-        """Predict every hypothesis by equations (10) and (12)."""
+        """Return the mean and covariance of every hypothesis predicted by equations (10) and (12)."""
         xp, u = self.xp, measurement.control
         mean = [
             xp.matmul(F, h.mean[:, j]) + B * u for j, (F, B) in enumerate(zip(self.F, self.B, strict=True))

@@ -37,14 +37,14 @@ from .world import AircraftWorld, Measurement, Start
 
 
 def _picture(model: Model) -> Any:
-    """Return the class of the picture; imported here, because it imports matplotlib."""
+    """Return the object that draws an episode; imported here, because it needs matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Return the control that follows from the estimate, which is fed back."""
+    """Return the control that the autopilot computes from the estimate, by name."""
     return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 
@@ -169,7 +169,7 @@ class UavAutopilot(AutopilotProblem):
     )
 
     def feedback(self, mean: Array, covariance: Array, measurement: Measurement | Start) -> Array:
-        """Report the control that follows from an estimate, ``(N,)``."""
+        """Return the control that the autopilot computes from an estimate, ``(N,)``."""
         return self.autopilot(mean, measurement.command)
 
 
