@@ -49,7 +49,7 @@ class EstimatePicture(Picture):
         self.limits: list[tuple[float, float]] = [_extent(path[:, i]) for i in self.drawn]
 
     def values(self, track: Mapping[str, numpy.ndarray], k: int) -> dict[str, float]:
-        """Return the values of a measurement for the history.
+        """Return the values of a measurement for the history, by series name.
 
         Args:
             track: of the episode, as :meth:`.Model.picture_track` returns it of one measurement, ``(K, ...)``.
@@ -68,7 +68,7 @@ class EstimatePicture(Picture):
         return values
 
     def strips(self) -> Sequence[Strip]:
-        """Return the errors of the first components."""
+        """Return the time series of the errors of the first components."""
         return [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
             for component in self.task.components[:MOST_STRIPS]
@@ -79,7 +79,7 @@ class EstimatePicture(Picture):
         return False
 
     def open(self, figure: Figure) -> None:
-        """Make the panel and its legend."""
+        """Create the panel of the path and its legend."""
         panel: Axes = figure.add_axes(PANEL)
         self.panel = panel
         panel.tick_params(labelsize=8)
@@ -116,7 +116,7 @@ class EstimatePicture(Picture):
         )
 
     def arrange(self) -> None:
-        """Set limits around the whole path."""
+        """Set the axis limits to the whole path."""
         if not self.plane:
             self.panel.set_xlim(0.5, self.task.horizon + 0.5)
             self.panel.set_ylim(*self.limits[0])

@@ -1,4 +1,4 @@
-"""Report of an environment on every measurement, after the action."""
+"""Report function of an environment, computed at every measurement after the action."""
 
 import functools
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ class StepReport(NamedTuple):
 
 @functools.cache
 def step_report(kind: str, errors: bool = False, details: bool = False, episode: bool = False) -> Report:
-    """Return the function that makes a :class:`StepReport`, the same one for the same arguments.
+    """Return the function that computes a :class:`StepReport`; equal arguments return the same function.
 
     Args:
         kind: of reward, one of :data:`.reward.OWN_REWARDS`.

@@ -51,7 +51,7 @@ LONGEST_PAUSE = 1800.0
 def clean_flight(
     name: str, rows: "pandas.DataFrame", limits: Cleaning
 ) -> tuple[list[Trajectory], dict[str, int]]:
-    """Cut one flight into pieces.
+    """Return the valid pieces of one recorded flight, and the counts of removed rows and cuts.
 
     Args:
         name: name of the flight.
@@ -116,7 +116,7 @@ def clean_flight(
 
 
 def _arrays(rows: "pandas.DataFrame") -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray | None]:
-    """Return times ``(n,)``, positions and velocities ``(n, 2)``."""
+    """Return the times ``(n,)``, positions and velocities ``(n, 2)`` of a flight's rows; velocities may be None."""
     # In the order of rows in memory, on which the last bit of a fit depends.
     pairs = [
         numpy.ascontiguousarray(rows[[*pair]].to_numpy())

@@ -32,7 +32,7 @@ SIMULATION_PARAMETERS = (
 
 
 def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping[str, Any]) -> LogFormat:
-    """Return the log format of a state-space model.
+    """Return the :class:`LogFormat` of a state-space model.
 
     Args:
         definition: the models.
@@ -64,7 +64,7 @@ def _read(
     defaults: Mapping[str, Any],
     columns: Columns,
 ) -> TrackLog:
-    """Return the measurements of one track.
+    """Return the measurements of one track from the columns of a table.
 
     Raises:
         ValueError: if a column is missing or a value is not possible.
@@ -109,7 +109,7 @@ def _read(
 def _check_noise(
     definition: "StateSpaceDefinition", made: Mapping[str, numpy.ndarray], rows: numpy.ndarray, usual: float
 ) -> None:
-    """Raise ValueError for a row that makes R of a sensor not positive definite, such as an accuracy of zero."""
+    """Raise ValueError for a row that makes a sensor's R not positive definite, such as an accuracy of zero."""
     count = len(rows)
     interval = made.get("interval", numpy.full(count, usual))
     inputs = made.get("inputs", numpy.zeros((count, 0)))
@@ -170,7 +170,7 @@ def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, pa
 def _predict(
     definition: "StateSpaceDefinition", mean: numpy.ndarray, measurement: Any, parameters: Any
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the predicted and the received measurement, ``(m, ...)`` each, with angles on the nearest turn."""
+    """Return the predicted and the received measurement, ``(m, ...)`` each; predicted angles on the nearest turn."""
     model = definition.filters[0]
     rows = [mean]
     rows += [measurement.interval[None]] if model.timed else []

@@ -59,7 +59,7 @@ def read_truth(
     times: Sequence[str],
     sort: bool = False,
 ) -> TruthTable:
-    """Read a file of true positions: a table, or a log of a receiver.
+    """Return the true positions in a file, a table or a receiver log, by time.
 
     Args:
         path: path of the file, with a time and x and y (m), latitude and longitude (degrees), or components.

@@ -322,8 +322,7 @@ class GainBank(_KalmanBank):
         return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
 
     def covariance(self, state: KalmanState) -> Array:
-        """Return the filter's covariance, ``(n, n, N)``; under an action inflated by the average NIS if that is above
-        one.
+        """Return the filter's covariance, ``(n, n, N)``, under an action inflated by the average NIS if above one.
 
         The factor applies only under nonzero actions, because only the innovations show whether the action fits the
         noise. Under the action zero it is the paper's filter with the paper's covariance.
@@ -383,9 +382,7 @@ class ModeBank(_KalmanBank):
         self.raw_covariance: Array = task.constant(packed_covariance.pack(raw)[:, None])
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Return the selected mode, and its factor on the process noise: ``wide_band_scale``, ``over_smoothed_scale``
-        or 1.
-        """
+        """Return the selected mode (one-hot), and its factor on the process noise."""
         xp, p = self.xp, self.parameters
         shown = xp.stack([xp.astype(action == i, xp.float64) for i in range(len(MODES))])
         wide, smooth = (p.wide_band_scale - 1.0) * shown[1], (p.over_smoothed_scale - 1.0) * shown[3]

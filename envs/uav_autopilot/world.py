@@ -137,10 +137,11 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return truth, Start(xp.zeros_like(state), covariance, zero)
 
     def _commands(self, draws: Draws, zero: Array) -> StepSignal:
-        """Draw the command signal.
+        """Draw the command signal, a step or random manoeuvres.
 
-        In each period of random manoeuvres, at a random time, a step to a new level or a doublet
-        about the present one, with equal probability.
+        Each period of random manoeuvres has, at a random time, a step to a new level or a doublet about the present
+        one, with
+        equal probability.
         """
         xp, p = self.xp, self.parameters
         if p.step_size:
