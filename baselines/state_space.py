@@ -314,7 +314,7 @@ class Unscented(Extended):
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task, process_noise, measurement_noise, **noises)
-        usual = task.definition.usual_noise(task.parameters.sampling_interval)
+        usual = task.definition.nominal_process_noise(task.parameters.sampling_interval)
         self.uncertain: Array = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Any:

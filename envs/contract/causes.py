@@ -41,7 +41,7 @@ class Moment(NamedTuple):
     deviations: Array | None
     """Standard deviations that are stated for their errors, ``(C, N)``."""
 
-    def knows(self, *names: str) -> bool:
+    def has_context(self, *names: str) -> bool:
         """Return whether the context has an array under each of these names and none of these arrays is empty."""
         return all(name in self.context and 0 not in self.context[name].shape for name in names)
 
@@ -97,7 +97,7 @@ def context_flag(name: str) -> Callable[[Moment], Array | None]:
     """
 
     def holds(moment: Moment) -> Array | None:
-        return moment.context[name] > 0.0 if moment.knows(name) else None
+        return moment.context[name] > 0.0 if moment.has_context(name) else None
 
     return holds
 

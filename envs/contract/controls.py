@@ -68,7 +68,7 @@ class SteerableFilter(Filter[TaskT, Measurement, State]):
     """Factor by which an action of one multiplies each setting: white noise of deviation one, with which a new policy
     explores, then increases the cost by a twentieth at most."""
 
-    def heeds(self, measurement: Measurement) -> Array:
+    def has_effect(self, measurement: Measurement) -> Array:
         """Return one where an action affects the update with a measurement, zero where nothing was measured,
         ``(N,)``.
         """
@@ -111,7 +111,7 @@ class SettingsBank(Bank[Any, Any, Any]):
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.own.settings),), numpy.float32)
 
     @abstractmethod
-    def look(self, state: Any, found: Any, measurement: Any) -> Any:
+    def add_observed(self, state: Any, found: Any, measurement: Any) -> Any:
         """Return the bank's state with the values that the agent observes at a measurement filled in.
 
         Args:
@@ -123,12 +123,12 @@ class SettingsBank(Bank[Any, Any, Any]):
     def predict(self, state: Any, measurement: Any) -> Any:
         """Return the bank's state predicted to a measurement, with the values that the agent observes."""
         own = self.own.predict(state.own, measurement)
-        return self.look(state._replace(own=own), self.own.examine(own, measurement), measurement)
+        return self.add_observed(state._replace(own=own), self.own.examine(own, measurement), measurement)
 
     def act(self, state: Any, measurement: Any, action: Array) -> Any:
         """Update the filter with a measurement, its settings multiplied by the factors of the action."""
         shown = self.xp.clip(self.xp.astype(action, self.xp.float64), -1.0, 1.0)
-        logarithms = self.own.heeds(measurement) * self.log_reach * shown
+        logarithms = self.own.has_effect(measurement) * self.log_reach * shown
         own = self.own.update(state.own, FilterInput(measurement, None, logarithms))
         return state._replace(own=own, action=shown)
 

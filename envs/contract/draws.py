@@ -2,7 +2,7 @@
 
 A world draws its quantities in a fixed order. A first pass without random numbers counts how many numbers that takes
 (:meth:`Draws.counting`). Each draw is stored by name: the levels, times and kinds of an episode are its context. A
-draw may be in force within a window of time, or change in steps: :func:`within`, :class:`StepSignal`.
+draw may be in force within a window of time, or change in steps: :func:`is_within`, :class:`StepSignal`.
 """
 
 import math
@@ -123,6 +123,6 @@ class StepSignal(NamedTuple):
         return value
 
 
-def within(time: Array, window: Array) -> Array:
+def is_within(time: Array, window: Array) -> Array:
     """Return booleans ``(N,)``: whether a time lies in a window ``[start, end)``, its first and second row."""
     return (time >= window[0]) & (time < window[1])

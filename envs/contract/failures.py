@@ -12,7 +12,7 @@ PYTHON = str(Path(traceback.__file__).parent)
 """Folder of Python's own modules."""
 
 
-def own_line(error: BaseException) -> str:
+def user_code_line(error: BaseException) -> str:
     """Return the last line of the user's code in a traceback, as " (mine.py, line 12)"; "" if there is none.
 
     Code of this package and of installed libraries is not the user's own.
@@ -42,4 +42,4 @@ def explain_errors(what: str) -> Iterator[None]:
     except NotTraceable:
         raise
     except (Exception, SystemExit) as error:
-        raise ValueError(f"{what}: {type(error).__name__}: {error}{own_line(error)}") from error
+        raise ValueError(f"{what}: {type(error).__name__}: {error}{user_code_line(error)}") from error

@@ -26,7 +26,7 @@ class DisturbanceInput(NamedTuple):
     """Feedback of a closed loop, see :meth:`.World.advance`."""
 
 
-def undisturbed(draws: Draws, parameters: Any) -> Array | None:
+def draw_undisturbed(draws: Draws, parameters: Any) -> Array | None:
     """Draw booleans ``(N,)``: which episodes have no hidden disturbance; None if every episode may have them.
 
     The first call takes a random number. Disturbances that a measurement reports are drawn in these episodes by the
@@ -71,7 +71,7 @@ class Disturbance(ABC):
         self.xp: ModuleType = task.xp
 
     @classmethod
-    def is_in(cls, parameters: Any) -> bool:
+    def is_enabled(cls, parameters: Any) -> bool:
         """Return whether a task with these parameters has the disturbance; by default True."""
         return True
 
@@ -92,10 +92,10 @@ class Disturbance(ABC):
         """
         return state
 
-    def quiet(self, state: Any, calm: Array) -> Any:
+    def switch_off(self, state: Any, calm: Array) -> Any:
         """Return the initial state with the disturbance switched off in episodes without hidden disturbances.
 
-        A disturbance that the measurement reports leaves its state as it is, see :func:`undisturbed`.
+        A disturbance that the measurement reports leaves its state as it is, see :func:`draw_undisturbed`.
 
         Args:
             state: at the start of the track.
@@ -178,7 +178,7 @@ class Disturbances:
             kinds: in the order in which they act.
             drawn: the kinds that are drawn first; the others follow in the order of ``kinds``.
         """
-        parts = [kind(task) for kind in kinds if kind.is_in(task.parameters)]
+        parts = [kind(task) for kind in kinds if kind.is_enabled(task.parameters)]
         order = *drawn, *kinds
         return cls(parts, sorted(parts, key=lambda part: order.index(type(part))))
 
@@ -198,13 +198,13 @@ class Disturbances:
         states = {part.name: draw(part) for part in self.drawn}
         return {part.name: states[part.name] for part in self.parts}
 
-    def quiet(self, states: dict[str, Any], calm: Array | None) -> dict[str, Any]:
+    def switch_off(self, states: dict[str, Any], calm: Array | None) -> dict[str, Any]:
         """Return the states with hidden disturbances switched off in the episodes where ``calm`` is true."""
         if calm is None:
             return states
-        return {part.name: part.quiet(states[part.name], calm) for part in self.parts}
+        return {part.name: part.switch_off(states[part.name], calm) for part in self.parts}
 
-    def share(
+    def split_noise(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
     ) -> dict[str, DisturbanceInput]:
         """Split the random numbers of a measurement among the disturbances; return their inputs by name."""
@@ -306,7 +306,7 @@ class Glint(Outliers):
     name = "glint"
 
     @classmethod
-    def is_in(cls, parameters: Any) -> bool:
+    def is_enabled(cls, parameters: Any) -> bool:
         """Return whether the parameters give glint a probability above zero."""
         return bool(parameters.glint_probability > 0.0)
 
@@ -395,7 +395,7 @@ class ColouredErrors(Disturbance):
         level = deviation * normals if self.normals else self.xp.stack([zero] * self.count)
         return ColouredErrorsState(deviation, process, level)
 
-    def quiet(self, state: ColouredErrorsState, calm: Array) -> ColouredErrorsState:
+    def switch_off(self, state: ColouredErrorsState, calm: Array) -> ColouredErrorsState:
         """Return the state with the errors set to zero in the episodes where ``calm`` is true."""
         deviation, kick, level = (
             self.xp.where(calm, 0.0, each) for each in (state.deviation, state.process.kick, state.level)

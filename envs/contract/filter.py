@@ -73,7 +73,7 @@ class Likelihood(NamedTuple):
         return Likelihood(*(none if values is None else values for values in self))
 
 
-class Stated(NamedTuple):
+class ReportedParts(NamedTuple):
     """The parts of the estimate that a filter reports, if it does not report all of it; the rest is NaN."""
 
     components: tuple[bool, ...]
@@ -105,7 +105,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     """Whether it runs as Python code on every backend, since it cannot be traced."""
     adapts_covariance: bool = False
     """Whether the reported covariance grows with the innovations."""
-    stated: Stated | None = None
+    stated: ReportedParts | None = None
     """Parts of the estimate that it reports; None: mean and covariance of all components at every measurement."""
     least_interval: ClassVar[float] = 0.0
     """Smallest interval between measurements, as a share of the sampling interval, for which its gains are valid."""

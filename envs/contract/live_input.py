@@ -135,9 +135,9 @@ class LiveInput:
             if array is not None:
                 values = self._read_finite(given, name, array, "at the start")
                 found[name] = numpy.reshape(values, (*array.shape[:-1], self.tracks)).astype(array.dtype)
-        return type(self.initial)(**found), {"time": time, "count": self.same_of_all(0.0)}
+        return type(self.initial)(**found), {"time": time, "count": self.broadcast(0.0)}
 
-    def same_of_all(self, number: float, shape: tuple[int, ...] = ()) -> Any:
+    def broadcast(self, number: float, shape: tuple[int, ...] = ()) -> Any:
         """Return an array ``(*shape, N)`` filled with one number; for one track ``shape``, or the number itself."""
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 

@@ -48,7 +48,7 @@ class Readings(Protocol):
         ...
 
 
-def optional(readings: Readings, name: str, count: int) -> numpy.ndarray:
+def optional_column(readings: Readings, name: str, count: int) -> numpy.ndarray:
     """Return the numbers of a column, ``(n,)``; all NaN if the column does not exist.
 
     Args:
@@ -128,7 +128,7 @@ class TrackLog(NamedTuple):
     """Source of the deviations, in words."""
 
 
-class Predicted(NamedTuple):
+class PredictedCoordinate(NamedTuple):
     """A predicted coordinate of a measurement."""
 
     name: str
@@ -188,7 +188,7 @@ class LogFormat:
     """Function that returns the predicted and the measured coordinates, ``(m, N)`` each, NaN where nothing was
     received. Its arguments are the mean ``(C, N)`` after the previous measurement, the ``Measurement`` and the
     parameters."""
-    predicted: tuple[Predicted, ...] = ()
+    predicted: tuple[PredictedCoordinate, ...] = ()
     """Predicted coordinates, at least m, the main ones first."""
     plane: tuple[str, ...] = ()
     """Two columns of metres, east and north, and two of their true values, which latitude and longitude may

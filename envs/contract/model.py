@@ -90,7 +90,7 @@ class Model:
         """
         return self._blocks.reader(name)
 
-    def under(self, control: str) -> "Model":
+    def with_control(self, control: str) -> "Model":
         """Return a model of the same task with the bank of another control."""
         return type(self)(self.task, control)
 

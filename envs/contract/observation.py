@@ -58,13 +58,13 @@ PLAIN = Compression("", None, None)
 """No compression and no limits."""
 
 
-def within(low: float, high: float) -> Compression:
+def limited(low: float, high: float) -> Compression:
     """Return a :class:`Compression` that changes nothing, for values within these limits."""
     return Compression("", None, None, (low, high))
 
 
-SHARE = within(0.0, 1.0)
-ACTION = within(-1.0, 1.0)
+SHARE = limited(0.0, 1.0)
+ACTION = limited(-1.0, 1.0)
 LARGEST_LOG = 710.0
 """Largest logarithm of a finite number; only that of zero is below the negative of :data:`SMALLEST_LOG`."""
 SMALLEST_LOG = 746.0
@@ -93,11 +93,11 @@ BOUNDED_LOG = Compression(
     (-LIMIT, LIMIT),
 )
 """For values that a wrong hypothesis can make arbitrarily large."""
-KEPT_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1, (0.0, LARGEST_LOG))
+STORED_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1, (0.0, LARGEST_LOG))
 """The block's function returns log(1 + x) already, because the filters store that; reading gives x."""
-LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1, KEPT_AS_LOG1P.limits)
-AVERAGE_OF_LOG1P = within(*KEPT_AS_LOG1P.limits)
-KEPT_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LOG))
+LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1, STORED_AS_LOG1P.limits)
+AVERAGE_OF_LOG1P = limited(*STORED_AS_LOG1P.limits)
+STORED_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LOG))
 """The block's function returns the logarithm already; reading gives the value."""
 
 
@@ -344,7 +344,7 @@ def log_squared_block(parts: Sequence[str] = ()) -> Block:
         lambda f, _: f.log_squared,
         "the normalised innovation squared",
         parts,
-        KEPT_AS_LOG1P,
+        STORED_AS_LOG1P,
     )
 
 
@@ -457,7 +457,7 @@ def prior_block(
     value: Value = lambda f, _: f.prior,
 ) -> Block:
     """Return the observation block of the predicted over the measured deviation, of which the state has the log."""
-    return Block("prior", value, text, parts, KEPT_AS_LOG)
+    return Block("prior", value, text, parts, STORED_AS_LOG)
 
 
 def last_action_block(
@@ -496,6 +496,6 @@ def clock_block(xp: ModuleType, horizon: int, unit: str = "1") -> Block:
         "time",
         lambda _, measurement: xp.astype(measurement.number, xp.float64) / horizon,
         "measurements so far over the horizon",
-        compression=within(0.0, (horizon + 1) / horizon),
+        compression=limited(0.0, (horizon + 1) / horizon),
         unit=unit,
     )

@@ -484,7 +484,7 @@ def _first(values: numpy.ndarray) -> int:
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 
-def differing(parameters: Any) -> dict[str, Any]:
+def changed_parameters(parameters: Any) -> dict[str, Any]:
     """Return the parameters of a task that differ from their defaults by name, without the horizon."""
     found = {}
     for each in dataclasses.fields(parameters):

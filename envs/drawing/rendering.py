@@ -83,7 +83,7 @@ def error_strip(title: str, component: str, limit: float) -> Strip:
     )
 
 
-def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
+def widen_limits(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
     """Return limits stretched about zero by the smallest factor 1, 2, 5, 10, ... that contain low and high."""
     lowest, highest = limits
     # A value on the far side of a limit at zero cannot be reached by stretching, and is cut off.
@@ -228,7 +228,7 @@ class _StripPanel:
             self.band.set_data(times[: len(half)], -half, half)
         # The band alone does not stretch the limits: at the start it is far wider than all that follows.
         if low <= high:
-            self.axes.set_ylim(*grown(self.strip.limits, low, high))
+            self.axes.set_ylim(*widen_limits(self.strip.limits, low, high))
 
 
 class _ObservationPanel:

@@ -11,7 +11,7 @@ from ..contract.model import Model
 from ..contract.parameters import ParameterLimits, check
 from ..contract.task import Task
 from .catalogue import nearest
-from .compiled import AVAILABLE, compiled_model, warn_of
+from .compiled import AVAILABLE, compiled_model, warn_not_compiled
 from .scenario_choice import find_scenario
 
 BACKENDS = ("auto", "compiled", "numpy", "torch")
@@ -57,7 +57,7 @@ def make_model(
         except NotTraceable as error:
             if backend == "compiled":
                 raise ValueError(f"{cls.id} cannot be compiled: {error}") from error
-            warn_of(cls.id, error)
+            warn_not_compiled(cls.id, error)
     return Model(cls(parameters, xp, device, chosen.recording), control)
 
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from ..contract.failures import own_line
+from ..contract.failures import user_code_line
 from ..contract.parameters import quote_shortened
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
             found = importlib.import_module(module)
     except Exception as error:  # a module is a program: it can raise anything
         # A ValueError is complete.
-        line = "" if isinstance(error, ValueError) else own_line(error)
+        line = "" if isinstance(error, ValueError) else user_code_line(error)
         raise ValueError(f"{refusal}: {type(error).__name__}: {error}{line}") from error
     places = (*getattr(found, "__path__", ()), getattr(found, "__file__", None) or "")
     FOUND_IN.extend(

@@ -74,7 +74,7 @@ class CompiledModel(Model):
         """Name of the backend: "compiled"."""
         return "compiled"
 
-    def under(self, control: str) -> Model:
+    def with_control(self, control: str) -> Model:
         """Return a compiled model of the same task with the bank of another control."""
         return CompiledModel(self.task, control, self.threads)
 
@@ -104,7 +104,7 @@ class CompiledModel(Model):
                 return self.programs.function(function)(*parts, threads=self.threads)
             except NotTraceable as error:
                 self.programs.refused.add(function)
-                warn_of(f"{_name_of(function)} of {self.task.id}", error)
+                warn_not_compiled(f"{_name_of(function)} of {self.task.id}", error)
         return function(self._plain, *parts)
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
@@ -184,7 +184,7 @@ def _name_of(function: Callable[..., Any]) -> str:
     return getattr(function, "__qualname__", type(function).__name__)
 
 
-def warn_of(what: str, error: BaseException) -> None:
+def warn_not_compiled(what: str, error: BaseException) -> None:
     """Warn that a function runs with NumPy, and quote the line of code that prevents its compilation."""
     found: BaseException = error.__cause__ or error
     own = Path(namespace.__file__).parent
@@ -208,6 +208,6 @@ def can_step(model: Any, report: Report) -> bool:
         model.programs.report_program(report)
     except NotTraceable as error:
         model.programs.refused.add(report)
-        warn_of(f"{_name_of(report)} of {model.task.id}", error)
+        warn_not_compiled(f"{_name_of(report)} of {model.task.id}", error)
         return False
     return True

@@ -26,8 +26,8 @@ from ..contract.task import Task
 from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
 from .programs import Report
-from .reward import OWN_REWARDS, RewardBaseline
-from .stepper import Stepper, mean_of
+from .reward import REWARD_FUNCTIONS, RewardBaseline
+from .stepper import Stepper, mean_reward
 
 
 def whole_episode(model: Model, episode: Episode) -> Episode:
@@ -224,7 +224,7 @@ class ModelStepper:
     def first_reward(self, beside: "ModelStepper | None") -> float:
         """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
         others = [0.0] * len(self._reports) if beside is None else beside._reports
-        return float(mean_of([a - b for a, b in zip(self._reports, others, strict=True)])[0])
+        return float(mean_reward([a - b for a, b in zip(self._reports, others, strict=True)])[0])
 
     def observation_of_first(self) -> Array:
         """Return the observation of the first lane, ``(fields,)``, in memory that is not overwritten."""
@@ -344,13 +344,13 @@ class Lanes:
             action: batch first, as the action space has it.
             kind: one of :data:`~.reward.REWARDS`.
         """
-        own, *beside = self._take_and_decide(action, OWN_REWARDS[kind])
+        own, *beside = self._take_and_decide(action, REWARD_FUNCTIONS[kind])
         rewards = (
             own.rewards
             if not beside
             else [a - b for a, b in zip(own.rewards, beside[0].rewards, strict=True)]
         )
-        return mean_of(rewards)[: self.count]
+        return mean_reward(rewards)[: self.count]
 
     def step_alone(self, action: Array, kind: str) -> tuple[Array, float, bool]:
         """Apply one action where there is one lane; return its observation, reward, and whether the episode is over.
@@ -359,7 +359,7 @@ class Lanes:
             action: as the action space has it.
             kind: one of :data:`~.reward.REWARDS`; the reward equals that of :meth:`step_reward`.
         """
-        steppers, report = self._moving, OWN_REWARDS[kind]
+        steppers, report = self._moving, REWARD_FUNCTIONS[kind]
         if steppers is not self._steppers.get(report):
             steppers = self._reporting(report)
         own, beside = steppers[0], steppers[1:]
@@ -470,7 +470,7 @@ class Lanes:
         return [stepper for stepper in self._moving if isinstance(stepper, ModelStepper)]
 
     @property
-    def flies_alone(self) -> bool:
+    def has_running_episode(self) -> bool:
         """Whether the first lane has an episode that is not over."""
         return bool(self._moving) and self.decisions.item(0) < self._lengths.item(0)
 

@@ -104,7 +104,7 @@ def no_reward(model: Model, state: Any) -> Array:
     return 0.0 * model.mean(state)[0]
 
 
-OWN_REWARDS: dict[str, Callable[[Model, Any], Array]] = {
+REWARD_FUNCTIONS: dict[str, Callable[[Model, Any], Array]] = {
     "cost": cost_reward,
     "log-likelihood": log_likelihood_reward,
     "cost-and-likelihood": cost_and_likelihood_reward,
@@ -114,7 +114,7 @@ OWN_REWARDS: dict[str, Callable[[Model, Any], Array]] = {
 }
 """Functions of a model and its episodes. Where there is a :func:`reference`, its reward is subtracted later. "none" is
 for recordings without truth."""
-REWARDS = tuple(kind for kind in OWN_REWARDS if kind != "none")
+REWARDS = tuple(kind for kind in REWARD_FUNCTIONS if kind != "none")
 """Kinds of reward that a user can choose."""
 
 
@@ -136,7 +136,7 @@ def reference(kind: str, model: Model) -> RewardBaseline | None:
     """
     if kind == "relative":
         paper = model.task.paper_policy
-        return RewardBaseline(model.under(paper.control), paper.action)
+        return RewardBaseline(model.with_control(paper.control), paper.action)
     if kind == "log-relative":
         return RewardBaseline(model, (0.0,) * model.action_space.shape[0] if model.action_space.shape else 0)
     return None

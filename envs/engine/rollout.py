@@ -15,7 +15,7 @@ from ...compiler.functions import Specialised, address_of, empty_lanes, leaves, 
 from ...compiler.gradients import pullback
 from ..contract.model import Episode
 from .programs import Programs
-from .reward import OWN_REWARDS, teacher_reward
+from .reward import REWARD_FUNCTIONS, teacher_reward
 
 
 class TrainingObjective(NamedTuple):
@@ -52,7 +52,7 @@ def _forward(
     """Return the episodes at the next measurement as rows, their reward and observation."""
     model = programs.traced
     after = model.act(_unpack(programs.later.episode, state), action)
-    episode, own = model.measure(after, noise), OWN_REWARDS[reward.kind](model, after)
+    episode, own = model.measure(after, noise), REWARD_FUNCTIONS[reward.kind](model, after)
     if teacher:
         taught = teacher_reward(reward.kind, model, after, *teacher)
         own = (1.0 - reward.teacher_share) * own + reward.teacher_share * taught

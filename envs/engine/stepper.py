@@ -26,7 +26,7 @@ from .episode_noise import EpisodeNoise
 from .programs import Report
 
 
-def mean_of(rewards: Sequence[Any]) -> Any:
+def mean_reward(rewards: Sequence[Any]) -> Any:
     """Return the mean reward over the measurements of one decision."""
     return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
 
@@ -419,7 +419,7 @@ class Stepper:
             own: float = self._first_rewards.item(0)
             return own if beside is None else own - beside._first_rewards.item(0)
         rewards = self._first_rewards if beside is None else self._first_rewards - beside._first_rewards
-        return mean_of(rewards.tolist())
+        return mean_reward(rewards.tolist())
 
     @property
     def rewards(self) -> numpy.ndarray:

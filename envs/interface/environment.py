@@ -136,7 +136,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply the action to the last measurement; return the next observation and Gymnasium's further results."""
         lanes = self.fleet.whole if self._plain and self._late is None else None
-        if lanes is not None and lanes.flies_alone:
+        if lanes is not None and lanes.has_running_episode:
             if not (
                 action.__class__ is numpy.ndarray
                 and action.shape == self._plain_action

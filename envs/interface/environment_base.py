@@ -16,7 +16,7 @@ from ..engine.catalogue import check_names, nearest, task_class
 from ..engine.lanes import Lanes
 from ..engine.reward import REWARDS
 from ..engine.scenario_choice import find_mixture, find_scenario
-from ..engine.stepper import mean_of
+from ..engine.stepper import mean_reward
 from .fleet import EpisodeDistribution, Fleet, check_alike
 from .privileged import context_shapes, in_sigmas
 from .requests import EnvOptions
@@ -162,7 +162,7 @@ class EnvBase:
         known = [self._first_distribution, *self.fleet.distributions()]
         distributions = []
         for lane in chosen:
-            now = self.fleet.course_of(lane)
+            now = self.fleet.distribution_of(lane)
             choice = now.scenario, now.parameters
             if "scenario" in wanted:
                 scenario = wanted["scenario"]
@@ -175,7 +175,7 @@ class EnvBase:
                 known.append(found)
             distributions.append(found)
         for lane, distribution in zip(chosen, distributions, strict=True):
-            self.fleet.send(lane, distribution)
+            self.fleet.set_distribution(lane, distribution)
         self.last_decision = self.fleet.decisions_per_episode
 
     # --- observations
@@ -302,7 +302,7 @@ class EnvBase:
             info[name] = task.xp.moveaxis(values[..., :count], -1, 0)
         rewards = [own.reward if other is None else own.reward - other.reward for own, other in results]
         scaled = in_sigmas(last.error, last.covariance, count, task.xp) if self.privileged else None
-        return mean_of(rewards)[:count], scaled
+        return mean_reward(rewards)[:count], scaled
 
     def _forget_errors(self, lanes: Sequence[int]) -> None:
         """Set the stored errors of lanes to zero, since new episodes have no estimate after an action."""

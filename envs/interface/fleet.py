@@ -20,7 +20,7 @@ from ..contract.model import Model
 from ..contract.observation import Array
 from ..data.recording import Recording
 from ..engine.lanes import Lanes
-from ..engine.reward import OWN_REWARDS, reference
+from ..engine.reward import REWARD_FUNCTIONS, reference
 from .specification import plain
 
 ROOM = 8
@@ -83,7 +83,7 @@ class Fleet:
 
     Args:
         count: number of lanes.
-        distribution: of the episodes of all lanes, until :meth:`send` sets another.
+        distribution: of the episodes of all lanes, until :meth:`set_distribution` sets another.
         kind: kind of reward, which may need a baseline beside every episode.
         longest: decisions after which an episode ends at the latest; default: its task's horizon.
     """
@@ -133,11 +133,11 @@ class Fleet:
         """Return the distinct distributions of the lanes as a list."""
         return list({id(distribution): distribution for distribution in self._distributions}.values())
 
-    def course_of(self, lane: int) -> EpisodeDistribution:
+    def distribution_of(self, lane: int) -> EpisodeDistribution:
         """Return the :class:`EpisodeDistribution` of a lane's next episodes."""
         return self._distributions[lane]
 
-    def send(self, lane: int, distribution: EpisodeDistribution) -> None:
+    def set_distribution(self, lane: int, distribution: EpisodeDistribution) -> None:
         """Set the distribution from which a lane's episodes are drawn after its next restart."""
         self._sent = self._sent or distribution is not self._distributions[lane]
         self._distributions[lane] = distribution
@@ -165,7 +165,7 @@ class Fleet:
         return most if self._longest is None else min(most, self._longest)
 
     def _make_lanes(self, model: Model, count: int) -> Lanes:
-        beside, report = reference(self._kind, model), OWN_REWARDS[self._kind]
+        beside, report = reference(self._kind, model), REWARD_FUNCTIONS[self._kind]
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:

@@ -114,7 +114,7 @@ class StateSpaceDefinition:
     """Sensors, each of which measures some of the m numbers; one for all of them where they have no names."""
 
     @property
-    def usual_inputs(self) -> numpy.ndarray:
+    def nominal_inputs(self) -> numpy.ndarray:
         """Return the mean values of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
@@ -125,9 +125,9 @@ class StateSpaceDefinition:
         inputs = ", ".join(self.inputs)
         return f"{words}; inputs, which acted since the one before, are {inputs}." if inputs else f"{words}."
 
-    def usual_noise(self, interval: float) -> numpy.ndarray:
+    def nominal_process_noise(self, interval: float) -> numpy.ndarray:
         """Return Q of the filters' first model at the initial mean for an interval, s, ``(n, n)``."""
-        return process_noise(self.filters[0], self.mean, interval, self.usual_inputs)
+        return process_noise(self.filters[0], self.mean, interval, self.nominal_inputs)
 
 
 def process_noise(
@@ -166,7 +166,7 @@ def sensor_noise(
     return numpy.reshape(model.R.value(numpy.concatenate(rows), numpy), (m, m, K))
 
 
-def usual_sensor_noise(
+def nominal_sensor_noise(
     model: StateSpaceModel, mean: numpy.ndarray, interval: float, inputs: Mapping[str, Input]
 ) -> numpy.ndarray:
     """Return R of a model at the initial mean, averaged over the distribution of the inputs, ``(m, m)``.

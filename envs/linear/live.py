@@ -28,7 +28,7 @@ class StateSpaceInput(LiveInput):
         super().__init__(task, initial, measurement, tracks)
         own = task.definition
         self.fuses: bool = all(
-            model.allows_zero_interval(own.mean, own.usual_inputs) for model in own.filters
+            model.allows_zero_interval(own.mean, own.nominal_inputs) for model in own.filters
         )
         self._noise_varies = any(isinstance(model.R, VectorFunction) for model in own.filters)
         self._names = ["values", *(channel.name for channel in self.groups), *self.measured]
@@ -47,7 +47,7 @@ class StateSpaceInput(LiveInput):
     def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the initial estimate and a memory in which the inputs are unknown (NaN)."""
         initial, memory = super().start(time, given)
-        return initial, {**memory, "inputs": self.same_of_all(numpy.nan, (len(self.inputs),))}
+        return initial, {**memory, "inputs": self.broadcast(numpy.nan, (len(self.inputs),))}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the measurement from the values of one time, and the memory for the next one.

@@ -34,7 +34,7 @@ from .equations import (
     StateSpaceDefinition,
     StateSpaceMeasurement,
     StateSpaceProblem,
-    usual_sensor_noise,
+    nominal_sensor_noise,
 )
 from .inputs import InputProcesses
 from .live import StateSpaceInput
@@ -94,7 +94,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.is_switching: bool = own.switching and len(own.world) > 1
         self.has_losses: bool = self.parameters.availability < 1.0
         self.drawn: int = int(self.is_switching) + int(self.has_jitter) + int(self.has_losses)
-        usual = usual_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
+        usual = nominal_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
         deviations = numpy.sqrt(numpy.diag(usual))
         self.receptions: Receptions = Receptions(task.parameters, task.xp, own.channels, deviations)
         self.delayed: int = self.drawn + self.receptions.row_uniforms

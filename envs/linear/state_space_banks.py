@@ -25,9 +25,9 @@ from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
     AVERAGE_OF_LOG1P,
-    KEPT_AS_LOG,
     SHARE,
     SIGNED_LOG,
+    STORED_AS_LOG,
     Array,
     Block,
     availability_block,
@@ -86,10 +86,10 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
     @property
     def action_space(self) -> gymnasium.Space[Any]:
         """Gymnasium box [-1, 1] with one number for each entry of the action."""
-        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
-    def answers(self) -> Sequence[str]:
+    def action_names(self) -> Sequence[str]:
         """Names of the entries of the action."""
         raise NotImplementedError
 
@@ -107,7 +107,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
                 compression=AVERAGE_OF_LOG1P,
             ),
             availability_block(parts=parts),
-            last_action_block(self.answers),
+            last_action_block(self.action_names),
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
@@ -120,7 +120,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
             zero,
             zero,
             zero + math.log(2.0),
-            self.xp.stack([zero] * len(self.answers)),
+            self.xp.stack([zero] * len(self.action_names)),
         )
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
@@ -175,7 +175,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 class StateSpaceNoiseBank(StateSpaceBank):
     """Bank of the control ``noise``: the action scales Q and R."""
 
-    answers: Sequence[str] = ("process", "measurement")
+    action_names: Sequence[str] = ("process", "measurement")
 
     def _scale(self, action: Array, entry: int) -> Array:
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
@@ -203,7 +203,7 @@ class StateSpaceGainBank(StateSpaceBank):
     """Bank of the control ``gain``: the action multiplies the Kalman gain of each component."""
 
     @property
-    def answers(self) -> Sequence[str]:
+    def action_names(self) -> Sequence[str]:
         """Names of the components, one for each entry of the action."""
         return tuple(component.name for component in self.task.components)
 
@@ -237,13 +237,13 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
     def __init__(self, task: StateSpaceProblem, control: str) -> None:
         super().__init__(task, control)
-        usual = task.definition.usual_noise(self.parameters.sampling_interval)
+        usual = task.definition.nominal_process_noise(self.parameters.sampling_interval)
         sigma = numpy.sqrt(numpy.diag(usual))
         self.deviations: Array = task.constant(sigma)[:, None]
         self.scales: Array = task.constant(1.0 / numpy.where(sigma > 0.0, sigma, 1.0))[:, None]
 
     @property
-    def answers(self) -> Sequence[str]:
+    def action_names(self) -> Sequence[str]:
         """Names of the action's entries: noises, their factors in the gain alone, and offsets."""
         counts = {"process": self.states, "sensor": self.sensors, "agility": self.states}
         counts |= {"caution": self.sensors, "offset": self.states}
@@ -281,7 +281,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
                 spread,
                 "deviation of the state over that of the process noise",
                 names,
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
         )
 
@@ -404,7 +404,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
                 lambda f, _: f.log_predicted,
                 "predicted probabilities",
                 modes,
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
             Block(
                 "probability",

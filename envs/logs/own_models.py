@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..contract.log_format import Column, LogFormat, PlainRows, Predicted, TrackLog, TrackStart
+from ..contract.log_format import Column, LogFormat, PlainRows, PredictedCoordinate, TrackLog, TrackStart
 from ..linear.equations import find_invalid_noise
 from .recorded_tables import UNEVEN, Columns
 
@@ -47,7 +47,7 @@ def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping
         functools.partial(_read, definition, dict(defaults)),
         _start,
         predict=functools.partial(_predict, definition) if one else None,
-        predicted=tuple(Predicted(name, unit, name) for name, unit in definition.measured.items()),
+        predicted=tuple(PredictedCoordinate(name, unit, name) for name, unit in definition.measured.items()),
         plain_rows=PlainRows(
             tuple(definition.measured),
             tuple(definition.inputs),

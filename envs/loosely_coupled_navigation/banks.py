@@ -16,9 +16,9 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
-    KEPT_AS_LOG,
-    KEPT_AS_LOG1P,
     SHARE,
+    STORED_AS_LOG,
+    STORED_AS_LOG1P,
     Array,
     Block,
     Compression,
@@ -35,8 +35,8 @@ from .world import Measurement
 
 SCHEMES = ("plain-white", "plain-reduced", "augmented")
 """Names of the three filters of the bank under ``mode`` and ``weights``."""
-KEPT_AS_DEVIATION_LOG = Compression(
-    "half the log of ", None, lambda shown: numpy.exp(2.0 * shown), KEPT_AS_LOG.limits
+STORED_AS_DEVIATION_LOG = Compression(
+    "half the log of ", None, lambda shown: numpy.exp(2.0 * shown), STORED_AS_LOG.limits
 )
 """Compression of a block whose function returns the log standard deviation; reading gives the variance."""
 
@@ -163,7 +163,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
                 lambda f, _: xp.log(1.0 + f.seen.average_square),
                 "the short average of its square",
                 each,
-                KEPT_AS_LOG1P,
+                STORED_AS_LOG1P,
             ),
             average_block(
                 "average_product",
@@ -175,7 +175,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
                 "reported_noise",
                 lambda _, measurement: xp.log(measurement.reported_deviation / nominal),
                 "the reported over the nominal variance of a measurement",
-                compression=KEPT_AS_DEVIATION_LOG,
+                compression=STORED_AS_DEVIATION_LOG,
             ),
             availability_block("1 with a measurement, 0 without", over_interval="mean"),
             self.last_action(),
@@ -278,7 +278,7 @@ class NoiseBank(KalmanBucyBank):
                 "predicted_deviation",
                 lambda f, _: self.xp.log(f.deviation / nominal),
                 "the predicted standard deviation of the position over the nominal one of a measurement",
-                compression=KEPT_AS_LOG,
+                compression=STORED_AS_LOG,
             ),
         )
 

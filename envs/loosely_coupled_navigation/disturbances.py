@@ -5,7 +5,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from ...filters.array_namespace import namespace
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment
-from ..contract.draws import Draws, StepSignal, draw_between, within
+from ..contract.draws import Draws, StepSignal, draw_between, is_within
 from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput, Outliers
 from ..contract.observation import Array
 from ..contract.task import Task
@@ -20,7 +20,7 @@ AFTERMATH = 25.0
 
 
 def _follows_outage(moment: Moment) -> Array | None:
-    if not moment.knows("outage"):
+    if not moment.has_context("outage"):
         return None
     end = moment.context["outage"][1]
     since = moment.measurement.number - end
@@ -28,7 +28,7 @@ def _follows_outage(moment: Moment) -> Array | None:
 
 
 def _is_unreported(moment: Moment) -> Array | None:
-    if not moment.knows("receiver_deviation"):
+    if not moment.has_context("receiver_deviation"):
         return None
     return moment.context["receiver_deviation"] > UNREPORTED * moment.measurement.reported_deviation
 
@@ -37,7 +37,11 @@ def _within(window: str, phrase: str) -> Cause:
     """Return the cause that a measurement lies in a window of the context."""
 
     def holds(moment: Moment) -> Array | None:
-        return within(moment.measurement.number, moment.context[window]) if moment.knows(window) else None
+        return (
+            is_within(moment.measurement.number, moment.context[window])
+            if moment.has_context(window)
+            else None
+        )
 
     return Cause(window, phrase, holds)
 
@@ -86,7 +90,7 @@ class NoiseChanges(Disturbance):
         change = xp.stack([earlier, later])
         return Levels(xp.stack(levels), xp.stack(reported), change, levels[0], reported[0])
 
-    def quiet(self, state: Levels, calm: Array) -> Levels:
+    def switch_off(self, state: Levels, calm: Array) -> Levels:
         """Set the true noise to the reported one where ``calm``; the reports do not change."""
         return state._replace(true=self.xp.where(calm, state.reported, state.true))
 
@@ -201,7 +205,7 @@ class Outage(_Once):
         """Remove the fix from the measurement within the outage."""
         if not self.probability:
             return state, measurement
-        out = within(step.number, state.window)
+        out = is_within(step.number, state.window)
         available = self.xp.where(out, 0.0, measurement.available)
         return state, measurement._replace(fix=available * measurement.fix, available=available)
 
@@ -209,7 +213,7 @@ class Outage(_Once):
 class _Hidden(_Once):
     """Receiver disturbance that the measurement does not report."""
 
-    def quiet(self, state: Spell, calm: Array) -> Spell:
+    def switch_off(self, state: Spell, calm: Array) -> Spell:
         """Remove the disturbance from episodes where ``calm``."""
         return state._replace(window=self.xp.where(calm, NEVER, state.window))
 
@@ -229,7 +233,7 @@ class Jamming(_Hidden):
         """Return the deviations, multiplied by the factor under jamming."""
         if not self.probability:
             return deviations
-        jammed = within(state.number, state.window)
+        jammed = is_within(state.number, state.window)
         return self.xp.where(jammed, state.strength * deviations, deviations)
 
     def context(self, state: Spell) -> dict[str, Array]:
@@ -251,7 +255,7 @@ class Spoofing(_Hidden):
     def pull(self, state: Spell) -> Array:
         """Return the error of the fix on every axis at this measurement, m, ``(N,)``."""
         run = (state.strength * self.parameters.sampling_interval) * (state.number - state.window[0] + 1.0)
-        return self.xp.where(within(state.number, state.window), run, 0.0)
+        return self.xp.where(is_within(state.number, state.window), run, 0.0)
 
     def change_reading(self, state: Spell, reading: Array) -> tuple[Spell, Array]:
         """Return the fix with the spoofing error added."""

@@ -157,7 +157,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         P = faults.FaultCovariance(ins, xp.stack([zero[None]] * 3), (zero + noises.wandering**2)[None, None])
         still = xp.stack([0.0 * initial.mean[:, None, None] + zero[None]] * 4)
         free = Hypotheses(still, P, zero + self.noise_weights)
-        born = self.give_birth(free)
+        born = self.start_pulls(free)
         others = [
             xp.stack([values[..., 0, :]] * self.prior.onsets, axis=-2) for values in (born.mean, *_flat(born))
         ]
@@ -165,7 +165,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         memory = Memory(free, pulled, self.fresh + none, none)
         return FaultState(initial.mean, initial.covariance, memory, Likelihood.unknown(none))
 
-    def give_birth(self, free: Hypotheses) -> Hypotheses:
+    def start_pulls(self, free: Hypotheses) -> Hypotheses:
         """Return hypotheses whose pull begins now, ``(J - 1, 1)``, one for each noise but the modelled one."""
         xp = self.xp
         none = 0.0 * free.weights[1:]
@@ -206,7 +206,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         share = prior.onset_rate * self.spacing * T
         # At most one of the onsets is born at a measurement.
         given = xp.where(born & begins, share / (1.0 + share), 0.0)
-        begun = self.give_birth(free)
+        begun = self.start_pulls(free)
         merged = self.merge(begun, pulled, 1.0 - ordered_sum(given), hazard)
         replaced = [xp.where(born, new, old) for new, old in zip(_flat(begun), _flat(pulled), strict=True)]
         free = Hypotheses(
@@ -257,7 +257,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
         return state._replace(memory=memory)
 
-    def heeds(self, measurement: Measurement) -> Array:
+    def has_effect(self, measurement: Measurement) -> Array:
         """Return one where there is a fix, zero elsewhere, ``(N,)``."""
         return measurement.available
 

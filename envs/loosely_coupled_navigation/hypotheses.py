@@ -131,7 +131,9 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         young = xp.where(age <= self.own.prior.shortest, by_onset, 0.0)
         return xp.stack([free[0], *noises, ordered_sum(young), ordered_sum(by_onset - young)])
 
-    def look(self, state: HypothesesState, found: Weighing, measurement: Measurement) -> HypothesesState:
+    def add_observed(
+        self, state: HypothesesState, found: Weighing, measurement: Measurement
+    ) -> HypothesesState:
         """Return the state with the innovations, and the probabilities before and after the fix, filled in."""
         bank, predicted, p = self.own, state.own.memory, found.weights
         age = bank.age(measurement.number)

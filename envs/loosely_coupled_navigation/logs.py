@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy
 
-from ..contract.log_format import Column, LogFormat, Predicted, TrackLog, TrackStart
+from ..contract.log_format import Column, LogFormat, PredictedCoordinate, TrackLog, TrackStart
 from ..logs.plausibility import check_extents
 from ..logs.recorded_tables import Columns
 from .parameters import AXES, LooselyCoupledNavigationParameters
@@ -117,7 +117,7 @@ LOG_FORMAT = LogFormat(
     read_log,
     start_track,
     predict=predict_fix,
-    predicted=tuple(Predicted(axis, "m", "position") for axis in AXES),
+    predicted=tuple(PredictedCoordinate(axis, "m", "position") for axis in AXES),
     longest_interval=5.0,
     decision_interval=1,
     regular_rows=lambda p: {"usual_sigma": p.receiver_variance**0.5},

@@ -7,7 +7,7 @@ import numpy
 
 from ...filters.ordered_sums import ordered_sum
 from ..contract.draws import Draws
-from ..contract.faults import Disturbances, undisturbed
+from ..contract.faults import Disturbances, draw_undisturbed
 from ..contract.filter import Initial
 from ..contract.observation import Array
 from ..contract.task import Task
@@ -95,7 +95,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         position.
         """
         xp, p = self.xp, self.parameters
-        calm = undisturbed(draws, p)
+        calm = draw_undisturbed(draws, p)
 
         def factor(name: str, limits: tuple[float, float]) -> Array:
             drawn = draws.log_uniform(name, limits)
@@ -109,7 +109,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         states = self.disturbances.begin(draws, normals[2 * p.axes :], zeros[0])
         harmonics, turn = self._motion(draws, zeros)
         reference = ordered_sum(harmonics[0])
-        states = self.disturbances.quiet(self.disturbances.complete(states, draws), calm)
+        states = self.disturbances.switch_off(self.disturbances.complete(states, draws), calm)
         truth = Truth(
             number=zeros[0],
             reference=reference,
@@ -170,7 +170,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         ins = truth.ins + increment
 
         further = noise[3 * n : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(number, p.sampling_interval, *further, feedback)
+        steps = self.disturbances.split_noise(number, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         deviation = self.disturbances.change_deviations(states, xp.ones_like(number))
         reading = reference + deviation * noise[2 * n : 3 * n]

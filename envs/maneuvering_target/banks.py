@@ -18,8 +18,8 @@ from ...filters.ordered_sums import weighted_sum
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
-    KEPT_AS_LOG,
     SHARE,
+    STORED_AS_LOG,
     Array,
     Block,
     Quantity,
@@ -163,7 +163,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
                 lambda state, measurement: 0.5 * xp.log(measurement.variance / unit),
                 "the measurement's sigma over range_sigma",
                 "xy",
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
             Block(
                 "scan",
@@ -178,7 +178,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
                 "the time since the last measurement over sampling_interval, within {:g} and {:g}".format(
                     *PERIODS_SHOWN
                 ),
-                compression=KEPT_AS_LOG,
+                compression=STORED_AS_LOG,
             ),
         )
 

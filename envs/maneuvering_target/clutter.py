@@ -59,7 +59,7 @@ class Clutter(Disturbance):
     row_uniforms = 2 * PLOT_SLOTS + 2
 
     @classmethod
-    def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
+    def is_enabled(cls, parameters: ManeuveringTargetParameters) -> bool:
         """Return whether the parameters give a density of false plots."""
         return parameters.cluttered
 

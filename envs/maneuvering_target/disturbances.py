@@ -7,7 +7,7 @@ deviations. A measurement reports none of them.
 from typing import NamedTuple
 
 from ..contract.draws import Draws
-from ..contract.faults import Disturbance, DisturbanceInput, GaussMarkov, Glint, undisturbed
+from ..contract.faults import Disturbance, DisturbanceInput, GaussMarkov, Glint, draw_undisturbed
 from ..contract.observation import Array
 from .clutter import Clutter
 from .parameters import ManeuveringTargetParameters
@@ -32,7 +32,7 @@ class ColouredScanErrors(Disturbance):
     normals = 2
 
     @classmethod
-    def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
+    def is_enabled(cls, parameters: ManeuveringTargetParameters) -> bool:
         """Return whether the parameters allow coloured errors."""
         return parameters.coloured
 
@@ -40,7 +40,7 @@ class ColouredScanErrors(Disturbance):
         """Draw standard deviation, correlation time and the stationary initial errors."""
         p = self.parameters
         deviation = draws.uniform("coloured_sigma", p.coloured_sigma)
-        calm = undisturbed(draws, p)
+        calm = draw_undisturbed(draws, p)
         if calm is not None:
             deviation = self.xp.where(calm, 0.0, deviation)
         return ColouredScanErrorsState(
@@ -67,7 +67,7 @@ class Bias(Disturbance):
     name = "bias"
 
     @classmethod
-    def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
+    def is_enabled(cls, parameters: ManeuveringTargetParameters) -> bool:
         """Return whether the parameters allow a bias."""
         return parameters.bias > 0.0
 

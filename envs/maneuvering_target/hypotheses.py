@@ -110,7 +110,7 @@ class HypothesesBank(SettingsBank, RadarBank):
             [ordered_sum(probabilities[h] for h in members) for members in self.groups.values()]
         )
 
-    def look(
+    def add_observed(
         self, state: HypothesesState, found: SemiMarkovState, measurement: Measurement
     ) -> HypothesesState:
         """Return the state with the innovation, and the probabilities before and after it, filled in."""

@@ -34,7 +34,7 @@ from ...filters import coordinated_turn
 from ...filters.array_namespace import namespace
 from ...filters.small_matrices import apply, outer, product, transpose
 from ..contract.filter import Bank, Initial
-from ..contract.observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block, innovation_block, prior_block
+from ..contract.observation import SIGNED_LOG, STORED_AS_LOG, Array, Block, innovation_block, prior_block
 from .banks import SCANS_SHOWN
 from .parameters import ManeuveringTargetParameters
 from .problem import TargetProblem
@@ -117,7 +117,7 @@ def sensor_blocks(
             lambda f, z: 0.5 * xp.log(variances(f, z) * (1.0 / p.range_sigma**2)),
             "the measurement's sigma over range_sigma",
             FRAME,
-            KEPT_AS_LOG,
+            STORED_AS_LOG,
         ),
         Block("measurement_correlation", coupling, "correlation of the measurement's errors"),
     )
@@ -133,7 +133,7 @@ def clock_blocks(bank: Any) -> Sequence[Block]:
             "speed",
             lambda f, _: xp.log(speed_of(f.mean[2:], LEAST_SPEED) * 0.01),
             "the predicted speed over 100 m/s",
-            compression=KEPT_AS_LOG,
+            compression=STORED_AS_LOG,
         ),
         Block(
             "scan",
@@ -145,7 +145,7 @@ def clock_blocks(bank: Any) -> Sequence[Block]:
             "interval",
             lambda _, measurement: xp.log(measurement.interval * (1.0 / p.sampling_interval)),
             "the time since the scan before over sampling_interval",
-            compression=KEPT_AS_LOG,
+            compression=STORED_AS_LOG,
         ),
     )
 
@@ -215,7 +215,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
                 lambda f, _: xp.log(f.deviation * (1.0 / NOMINAL_ACCELERATION)),
                 "the sigma of the acceleration in the last scan over the nominal one",
                 FRAME,
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
             *clock_blocks(self),
         )

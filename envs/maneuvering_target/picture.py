@@ -22,7 +22,7 @@ from ..drawing.rendering import (
     History,
     Picture,
     Strip,
-    grown,
+    widen_limits,
 )
 from .banks import AlphaBeta, Filters
 from .hypotheses import GROUPS, HypothesesState
@@ -278,7 +278,7 @@ class ManeuveringTargetPicture(Picture):
             ellipse.set_width(2.0 * ELLIPSE_SIGMAS * large)
             ellipse.set_height(2.0 * ELLIPSE_SIGMAS * small)
             ellipse.set_angle(direction)
-        self._set_reach(grown((0.0, self.reach), 0.0, float(numpy.abs(estimated - true).max()))[1])
+        self._set_reach(widen_limits((0.0, self.reach), 0.0, float(numpy.abs(estimated - true).max()))[1])
 
 
 def _pair(history: Mapping[str, Any], name: str) -> numpy.ndarray:

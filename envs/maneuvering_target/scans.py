@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..contract.draws import Draws
-from ..contract.faults import undisturbed
+from ..contract.faults import draw_undisturbed
 from ..contract.observation import Array
 from ..contract.task import Task
 from ..data.recorded_world import Feed
@@ -102,7 +102,7 @@ class UnreliableScans(RegularScans):
         p, never = self.parameters, 0.0 * motion[0][0]
         seen = draws.uniform("detection_probability", p.detection_probability)
         jitter = draws.uniform("scan_jitter", p.scan_jitter)
-        undisturbed(draws, p)  # takes its random number here
+        draw_undisturbed(draws, p)  # takes its random number here
         return Reliability(seen, jitter, never, never, *motion)
 
     def advance(

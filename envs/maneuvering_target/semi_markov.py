@@ -287,7 +287,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         tables = self.fly(*switched, T=measurement.interval)
         return state._replace(track=tuple(table.pack() for table in tables))
 
-    def heeds(self, measurement: Measurement) -> Array:
+    def has_effect(self, measurement: Measurement) -> Array:
         """Return one where the scan saw the target, zero elsewhere, ``(N,)``."""
         return measurement.available
 

@@ -43,7 +43,7 @@ class RadarStudentBank(StudentBank[object, Measurement]):
         sides = [[turn, none], [none, turn]]
         return self.xp.concat([self.xp.concat(row, axis=1) for row in sides])
 
-    def look(self, mean: Array, motion: Array, measurement: Measurement) -> View:
+    def predict_view(self, mean: Array, motion: Array, measurement: Measurement) -> View:
         """Return the estimate predicted with the last output acceleration, with frame, units and innovation."""
         xp = self.xp
         mean, _ = advance(mean, ACCELERATION_REACH * motion, measurement.interval)

@@ -72,8 +72,8 @@ class StudentState(NamedTuple):
 class StudentBank(Bank[TaskT, Measurement, StudentState]):
     """Base class of the banks of ``student``: an estimate that the action corrects.
 
-    A subclass defines how the estimate moves and in which frame it is corrected (:meth:`rotate`, :meth:`look`), and
-    further features (:attr:`features`).
+    A subclass defines how the estimate moves and in which frame it is corrected (:meth:`rotate`,
+    :meth:`predict_view`), and further features (:attr:`features`).
     """
 
     gain: ClassVar[Sequence[tuple[int, float]]]
@@ -94,7 +94,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         """Return the rotation U into the frame at an estimate, ``(C, C, N)``; an identity without a frame."""
 
     @abstractmethod
-    def look(self, mean: Array, motion: Array, measurement: Any) -> View:
+    def predict_view(self, mean: Array, motion: Array, measurement: Any) -> View:
         """Return the estimate predicted to a measurement, with frame, units and innovation.
 
         Args:
@@ -143,7 +143,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
 
     def predict(self, state: StudentState, measurement: Measurement) -> StudentState:
         """Predict to the measurement with the last motion output, and compute the innovation."""
-        view = self.look(state.mean, state.motion, measurement)
+        view = self.predict_view(state.mean, state.motion, measurement)
         return state._replace(mean=view.mean, view=view)
 
     def act(self, state: StudentState, measurement: Measurement, action: Array) -> StudentState:

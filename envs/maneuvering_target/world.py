@@ -126,7 +126,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
         (position, velocity), available = scan.motion, scan.available
         further = noise[2 : self.normals], uniforms[self.scans.row_uniforms :]
-        steps = self.disturbances.share(number, scan.interval, *further, feedback)
+        steps = self.disturbances.split_noise(number, scan.interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         errors = self.disturbances.change_errors(states, noise[:2])
         states, measured = self._measure(position, errors, states)

@@ -26,10 +26,10 @@ from ..contract.observation import (
     average_log_squared_block,
     innovation_block,
     last_weight_block,
+    limited,
     linear_scale,
     log_squared_block,
     relative_likelihood_block,
-    within,
 )
 from .parameters import RadarEsmTrackingParameters
 from .problem import RadarEsmProblem
@@ -118,7 +118,7 @@ def clock_block(task: RadarEsmProblem) -> Block:
     return Block(
         "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * factor,
         f"time since the start of the track over {TIME_UNIT:g} s",
-        compression=within(0.0, (task.parameters.horizon + 1) * factor),
+        compression=limited(0.0, (task.parameters.horizon + 1) * factor),
     )  # fmt: skip
 
 
@@ -161,7 +161,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         decision, bearing_difference = decision_blocks(self.task)
         average = f"exponential average over {p.averaging_measurements:g} scans"
         count = f"decisions for this emitter type so far over {COUNT_UNIT:g}"
-        counted = within(0.0, (self.last_scan + 1) / COUNT_UNIT)
+        counted = limited(0.0, (self.last_scan + 1) / COUNT_UNIT)
 
         return (
             innovation_block(

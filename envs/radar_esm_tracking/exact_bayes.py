@@ -215,11 +215,11 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             packed_covariance.pack(covariance),
             self.prior_of_class + none,
             nothing,
-            table * self.look(initial.first),
+            table * self.look_likelihood(initial.first),
             table,
         )
 
-    def look(self, measurement: Measurement) -> Array:
+    def look_likelihood(self, measurement: Measurement) -> Array:
         """Return the likelihood of this scan's ESM look for types and emitter hypotheses, ``(J, 2, V, N)``."""
         look = emitters.Look(measurement.looked, measurement.decision, measurement.bearing_difference)
         return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
@@ -338,7 +338,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         first, later = (
             emitters.fall_silent(table, self.grid, looked) for table in (moved.first, moved.later)
         )
-        look = self.look(measurement)
+        look = self.look_likelihood(measurement)
         first, later = first * look, later * look
         marginal = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
         memory = self.normalise(

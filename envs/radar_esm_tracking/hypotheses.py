@@ -141,7 +141,9 @@ class HypothesesBank(SettingsBank):
             "probabilities": probabilities,
         }
 
-    def look(self, state: HypothesesState, found: ClassState, measurement: Measurement) -> HypothesesState:
+    def add_observed(
+        self, state: HypothesesState, found: ClassState, measurement: Measurement
+    ) -> HypothesesState:
         """Return the state with the joint innovation, and the probabilities before and after the scan, filled in."""
         xp, bank, tracks = self.xp, self.own, state.own.tracks
         size = tracks.weights.shape[0] * tracks.weights.shape[1]

@@ -26,7 +26,7 @@ from ...filters import class_fusion, imm, packed_covariance
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.small_matrices import apply, cholesky
 from ..contract.controls import bank_probabilities
-from ..contract.observation import KEPT_AS_LOG, Array, Block, last_action_block
+from ..contract.observation import STORED_AS_LOG, Array, Block, last_action_block
 from .banks import ClassBank
 from .problem import RadarEsmProblem
 from .world import Measurement, Start
@@ -81,7 +81,7 @@ class KalmanNetBank(ClassBank):
         self.propagator: Array = task.constant(numpy.stack(propagators, axis=-1))[..., None]
         self.process_noise: Array = packed_covariance.pack(task.constant(models.Q)[..., None])
         self.radar_variances: list[float] = [float(variance) for variance in numpy.diagonal(models.R)]
-        self.answers: tuple[str, ...] = (
+        self.action_names: tuple[str, ...] = (
             *(f"evidence_{name}" for name in task.modes),
             *NOISES,
             *(f"caution_{name}" for name in NOISES),
@@ -90,7 +90,7 @@ class KalmanNetBank(ClassBank):
     @property
     def action_space(self) -> gymnasium.Space[Any]:
         """Gymnasium box of evidence, noises, and their factors in the gain alone."""
-        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -105,16 +105,16 @@ class KalmanNetBank(ClassBank):
                 lambda f, _: 0.5 * self.xp.log(f.covariance[place] * unit),
                 "the predicted deviation of the range over range_sigma",
                 self.task.modes,
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
-            last_action_block(self.answers),
+            last_action_block(self.action_names),
         )
 
     def start(self, initial: Start) -> Any:
         """Return the paper's algorithm at the start of the track, as :class:`NetFilters`."""
         fields = super().start(initial)._asdict()
         fields["covariance"] = covariance = packed_covariance.pack(fields["covariance"])
-        action = self.xp.stack([0.0 * initial.mean[0]] * len(self.answers))
+        action = self.xp.stack([0.0 * initial.mean[0]] * len(self.action_names))
         return NetFilters(**fields, gain_covariance=covariance, action=action)
 
     def noises(self, action: Array) -> tuple[Array, list[Array]]:

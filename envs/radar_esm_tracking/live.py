@@ -34,7 +34,7 @@ class ScanInput(LiveInput):
         for name, array in initial.items():
             if given.get(name) is not None:
                 initial[name] = self.read(given, name, array.shape[:-1]).reshape(array.shape)
-        return Start(**initial, first=first), {"time": time, "count": self.same_of_all(0.0)}
+        return Start(**initial, first=first), {"time": time, "count": self.broadcast(0.0)}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the measurement of a scan, and the memory for the next one."""

@@ -10,7 +10,15 @@ from typing import Any
 import numpy
 
 from ...filters.class_fusion import bearing_difference
-from ..contract.log_format import Column, LogFormat, Predicted, Readings, TrackLog, TrackStart, optional
+from ..contract.log_format import (
+    Column,
+    LogFormat,
+    PredictedCoordinate,
+    Readings,
+    TrackLog,
+    TrackStart,
+    optional_column,
+)
 from ..logs.recorded_tables import Columns
 from .parameters import RadarEsmTrackingParameters
 
@@ -106,7 +114,7 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
         ValueError: for a decision that is no emitter type, or lacks a bearing.
     """
     types, count = len(p.recognition), len(scans)
-    decision = optional(readings, "decision", count)
+    decision = optional_column(readings, "decision", count)
     decided = numpy.isfinite(decision)
     wrong = decided & ((decision != numpy.round(decision)) | (decision < 0) | (decision >= types))
     if wrong.any():
@@ -115,8 +123,8 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
             f"decision is the number of an emitter type from 0 to {types - 1}, and {readings.place(number)} has "
             f"{decision[number]:g}"
         )
-    difference = optional(readings, "bearing_difference", count)
-    radar, esm = (optional(readings, name, count) for name in ("radar_bearing", "esm_bearing"))
+    difference = optional_column(readings, "bearing_difference", count)
+    radar, esm = (optional_column(readings, name, count) for name in ("radar_bearing", "esm_bearing"))
     apart = numpy.where(numpy.isfinite(difference), difference, radar - esm)
     lacking = decided & ~numpy.isfinite(apart)
     if lacking.any():
@@ -124,7 +132,7 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
             f"{readings.place(int(lacking.argmax()))} has a decision and lacks a bearing: a decision needs "
             "radar_bearing and esm_bearing (degrees), or bearing_difference"
         )
-    looked = optional(readings, "looked", count)
+    looked = optional_column(readings, "looked", count)
     listens = scans % p.esm_period == 0
     return {
         "looked": numpy.where(numpy.isfinite(looked), looked > 0.5, listens) | decided,
@@ -148,7 +156,10 @@ LOG_FORMAT = LogFormat(
     read_log,
     start_track,
     predict=predict_radar,
-    predicted=(Predicted("range", "m", "range"), Predicted("range_rate", "m/s", "range rate")),
+    predicted=(
+        PredictedCoordinate("range", "m", "range"),
+        PredictedCoordinate("range_rate", "m/s", "range rate"),
+    ),
     longest_interval=60.0,
     decision_interval=1,
     regular_rows=_numbers,

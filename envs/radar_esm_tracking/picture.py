@@ -20,7 +20,7 @@ from ..drawing.rendering import (
     Picture,
     Strip,
     error_strip,
-    grown,
+    widen_limits,
 )
 from .problem import RadarEsmProblem
 
@@ -191,7 +191,7 @@ class RadarEsmTrackingPicture(Picture):
         for s, line in enumerate(self.classes):
             put(line, numpy.where(true_class == s, CLASS_ROW, numpy.nan))
         shown = numpy.concatenate([history.get("true", empty), history.get("estimate", empty), [0.0]])
-        reach = grown((-self.height, self.height), float(shown.min()), float(shown.max()))
+        reach = widen_limits((-self.height, self.height), float(shown.min()), float(shown.max()))
         self.acceleration.set_ylim(*reach)
 
 

@@ -8,7 +8,7 @@ import numpy
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
 from ..contract.draws import Draws, category, draw_between
-from ..contract.faults import Disturbance, Disturbances, GaussMarkov, Glint, undisturbed
+from ..contract.faults import Disturbance, Disturbances, GaussMarkov, Glint, draw_undisturbed
 from ..contract.observation import Array
 from ..contract.world import World
 from .parameters import RadarEsmTrackingParameters
@@ -159,7 +159,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         if p.class_change_probability < 1.0:
             changes = draws.event("class_changes", p.class_change_probability)
             change = xp.where(changes, change, self.never)
-        calm = undisturbed(draws, p)
+        calm = draw_undisturbed(draws, p)
         if calm is not None:
             change = xp.where(calm, self.never, change)
             second_emitter, coloured, correlation = (
@@ -237,7 +237,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
             wandering = GaussMarkov(truth.radar_decay, truth.radar_kick)
             truth = truth._replace(radar_error=wandering.advance(truth.radar_error, noise[7:9]))
         further = noise[self.own_normals : self.normals], uniforms[4:]
-        steps = self.disturbances.share(scan, p.sampling_interval, *further, feedback)
+        steps = self.disturbances.split_noise(scan, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         truth = truth._replace(disturbances=states)
         truth, measurement = self._measure(truth, noise[3:5], noise[5:7], uniforms[:3])

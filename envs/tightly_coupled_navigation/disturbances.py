@@ -6,7 +6,13 @@ from typing import Any, ClassVar, NamedTuple
 from ...filters import gnss_ins
 from ..contract.causes import Cause, Moment, context_flag
 from ..contract.draws import Draws, draw_between
-from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput, undisturbed
+from ..contract.faults import (
+    ColouredErrors,
+    ColouredErrorsState,
+    Disturbance,
+    DisturbanceInput,
+    draw_undisturbed,
+)
 from ..contract.observation import Array
 from .problem import NavigationProblem
 
@@ -21,7 +27,7 @@ PULLED = 5.0
 
 
 def _is_noisy(moment: Moment) -> Array | None:
-    if not moment.knows("noise_factor"):
+    if not moment.has_context("noise_factor"):
         return None
     noisy: Array = moment.xp.any(moment.context["noise_factor"] > 1.0, axis=0)
     return noisy
@@ -40,7 +46,7 @@ def _lacks_rate(moment: Moment) -> Array:
 
 
 def _is_pulled(moment: Moment) -> Array | None:
-    if not moment.knows("range_error"):
+    if not moment.has_context("range_error"):
         return None
     pulled: Array = moment.xp.any(moment.xp.abs(moment.context["range_error"]) > PULLED, axis=0)
     return pulled
@@ -123,7 +129,7 @@ class _Once(_OfSatellites):
 class _Hidden(_Once):
     """Temporary disturbance that the measurement does not report."""
 
-    def quiet(self, state: Fault, calm: Array) -> Fault:
+    def switch_off(self, state: Fault, calm: Array) -> Fault:
         """Remove the disturbance from episodes where ``calm``."""
         return state._replace(window=self.xp.where(calm, -1.0, state.window))
 
@@ -225,7 +231,7 @@ class RangeColour(ColouredErrors):
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
         """Draw the stationary standard deviation, m, and the correlation time, s, ``(N,)`` each."""
         p = self.parameters
-        undisturbed(draws, p)  # comes first among the random numbers
+        draw_undisturbed(draws, p)  # comes first among the random numbers
         if not self.normals:
             return zero, zero + p.pseudorange_correlation_time[0]
         lasting = p.pseudorange_correlation_time

@@ -10,8 +10,8 @@ from ..contract.controls import SettingsBank, SteerableFilter
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import (
     BOUNDED_LOG,
-    KEPT_AS_LOG,
     SHARE,
+    STORED_AS_LOG,
     Array,
     Block,
     log_density_block,
@@ -101,7 +101,7 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
             ),
             Block(
                 "position_sigma", lambda f, y: 0.5 * xp.log(ordered_sum(f.own.covariance[i, i] for i in range(3))),
-                "the sigma of the position after the last action, m", compression=KEPT_AS_LOG,
+                "the sigma of the position after the last action, m", compression=STORED_AS_LOG,
             ),
         )  # fmt: skip
 
@@ -127,7 +127,9 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
             between=none,
         )
 
-    def look(self, state: HypothesesState, found: Posterior, measurement: Measurement) -> HypothesesState:
+    def add_observed(
+        self, state: HypothesesState, found: Posterior, measurement: Measurement
+    ) -> HypothesesState:
         """Return the state with innovation statistics, and probabilities before and after a measurement, filled in."""
         xp, task = self.xp, self.task
         log_predicted = imm.log_probabilities(found.predicted)

@@ -25,7 +25,7 @@ import numpy
 from ...filters import gnss_ins
 from ...filters.packed_covariance import diagonal, pack, unpack
 from ..contract.filter import Initial
-from ..contract.observation import KEPT_AS_LOG, Array, Block
+from ..contract.observation import STORED_AS_LOG, Array, Block
 from .banks import Filters, Prediction, RobustBank
 from .parameters import HYPOTHESES, SINGER
 from .problem import NavigationProblem
@@ -84,7 +84,7 @@ class KalmanNetBank(RobustBank):
 
         *shown, last = (block for block in super().blocks if block.name not in DROPPED)
         sure = Block(
-            "spread", spread, "predicted deviation over the unit of the cost", tuple(parts), KEPT_AS_LOG
+            "spread", spread, "predicted deviation over the unit of the cost", tuple(parts), STORED_AS_LOG
         )
         return (*shown, sure, last)
 

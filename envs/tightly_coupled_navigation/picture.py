@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from ...filters import gnss_ins
 from ..contract.model import Episode, Model
-from ..drawing.rendering import BLACK, BLUE, CURVES, FIGURE_SIZE, PALE, History, Picture, Strip, grown
+from ..drawing.rendering import BLACK, BLUE, CURVES, FIGURE_SIZE, PALE, History, Picture, Strip, widen_limits
 from .parameters import HYPOTHESES, LINE, REST, SINGER
 from .problem import NavigationProblem
 
@@ -198,8 +198,8 @@ class TightlyCoupledNavigationPicture(Picture):
         sides = []
         for values in places:
             low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-            sides.append(grown((-LEAST_REACH, 0.0), 1.05 * low, 0.0)[0])
-            sides.append(grown((0.0, LEAST_REACH), 0.0, 1.05 * high)[1])
+            sides.append(widen_limits((-LEAST_REACH, 0.0), 1.05 * low, 0.0)[0])
+            sides.append(widen_limits((0.0, LEAST_REACH), 0.0, 1.05 * high)[1])
         west, east, south, north = sides
         metres_per_inch = max(
             (east - west) / (FIGURE_SIZE[0] * COURSE[2]), (north - south) / (FIGURE_SIZE[1] * COURSE[3])
@@ -226,7 +226,7 @@ class TightlyCoupledNavigationPicture(Picture):
         self.thought.set_data(steps, thought)
         if len(felt):
             self.motion.set_ylim(
-                *grown((0.0, ACCELERATION_LIMIT), 0.0, float(max(felt.max(), thought.max())))
+                *widen_limits((0.0, ACCELERATION_LIMIT), 0.0, float(max(felt.max(), thought.max())))
             )
         for row, (line, runs) in enumerate(zip(self.fault_lines, self.faults, strict=True)):
             line.set_data(*_segments(runs, row))

@@ -11,7 +11,7 @@ import numpy
 from ...filters import gnss_ins
 from ...filters.ordered_sums import ordered_sum
 from ..contract.draws import Draws
-from ..contract.faults import Disturbances, undisturbed
+from ..contract.faults import Disturbances, draw_undisturbed
 from ..contract.filter import Initial
 from ..contract.observation import Array
 from ..contract.task import Task
@@ -109,7 +109,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         legs, velocity, heading = self.course.begin(draws, zeros)
         states = self.disturbances.begin(draws, normals[gnss_ins.SIZE :], zeros)
         states = self.disturbances.complete(states, draws)
-        states = self.disturbances.quiet(states, undisturbed(draws, p))
+        states = self.disturbances.switch_off(states, draw_undisturbed(draws, p))
         between_houses = states["reflections"].urban > 0.0
         velocity = xp.where(between_houses, p.urban_speed * velocity, velocity)
         slower = xp.where(between_houses, p.urban_strength * legs.acceleration, legs.acceleration)
@@ -153,7 +153,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         exact, _ = gnss_ins.observe(state, position, velocity, ins_angles, p.gravity)
 
         further = noise[self.own_normals : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(k, p.sampling_interval, *further, feedback)
+        steps = self.disturbances.split_noise(k, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         white, ranges = noise[gnss_ins.SIZE : self.own_normals], task.sensors[0].readings
         ones = xp.ones_like(white)

@@ -11,10 +11,10 @@ from ...filters import gaussian, packed_covariance
 from ...filters.ordered_sums import ordered_sum
 from ..contract.filter import Bank
 from ..contract.observation import (
-    KEPT_AS_LOG,
     LARGEST_LOG,
     SHARE,
     SIGNED_LOG,
+    STORED_AS_LOG,
     Array,
     Block,
     Compression,
@@ -131,7 +131,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
                 "log_trace",
                 lambda f, _: self.log_trace(f),
                 "the mean of the variances over those of the settled filter",
-                compression=KEPT_AS_LOG,
+                compression=STORED_AS_LOG,
             ),
             availability_block(
                 "1 where the sensor answered, 0 in a dropout", parts=sensors, over_interval="mean"

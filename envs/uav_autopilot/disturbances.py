@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 from ..contract.causes import MISSED, Cause, Moment
-from ..contract.draws import Draws, StepSignal, within
+from ..contract.draws import Draws, StepSignal, is_within
 from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput
 from ..contract.observation import Array
 from .problem import AutopilotProblem
@@ -14,7 +14,7 @@ RAISED = 2.0
 
 
 def _has_noisy_sensor(moment: Moment) -> Array | None:
-    if not moment.knows("sensor_level"):
+    if not moment.has_context("sensor_level"):
         return None
     noisy: Array = moment.xp.any(moment.context["sensor_level"] >= RAISED, axis=0)
     return noisy
@@ -78,7 +78,7 @@ class NoisySensors(_OfSensors):
         levels = levels._replace(values=1.0 + chosen * (levels.values - 1.0))
         return SensorLevels(levels, levels.values[0])
 
-    def quiet(self, state: SensorLevels, calm: Array) -> SensorLevels:
+    def switch_off(self, state: SensorLevels, calm: Array) -> SensorLevels:
         """Set the factors to one in the episodes where ``calm``."""
         values = self.xp.where(calm, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
@@ -129,7 +129,7 @@ class Dropouts(_OfSensors):
         """Replace the reading of each sensor in a dropout by its last valid one, and mark it unavailable."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
-            out = within(step.number, (state.starts[i], state.stops[i]))
+            out = is_within(step.number, (state.starts[i], state.stops[i]))
             available = xp.where(out, 0.0, available)
         reading = xp.where(available > 0.0, measurement.reading, state.reading)
         measurement = measurement._replace(reading=reading, available=available)
@@ -154,7 +154,7 @@ class SensorBias(_OfSensors):
         size = draws.uniform("bias", limits, self.count)
         return self.sigmas * self.chosen(self.parameters.biased_sensors) * side * size
 
-    def quiet(self, state: Array, calm: Array) -> Array:
+    def switch_off(self, state: Array, calm: Array) -> Array:
         """Set the errors to zero in the episodes where ``calm``."""
         return self.xp.where(calm, 0.0, state)
 

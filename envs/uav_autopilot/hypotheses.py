@@ -15,10 +15,10 @@ from ..contract.observation import (
     entropy_block,
     expected_nis_block,
     last_action_block,
+    limited,
     log_density_block,
     predicted_block,
     probability_block,
-    within,
 )
 from .banks import AutopilotBank
 from .level_bank import LevelBank, Levels, grid
@@ -102,7 +102,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
                 lambda f, _: xp.clip(f.sensor_levels, low, high),
                 "expected log of the factor on the sensor's sigma then",
                 self.task.sensors,
-                within(low, high),
+                limited(low, high),
             ),
             entropy_block(xp),
         )
@@ -149,7 +149,9 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         """Return booleans ``(N,)``: whether any sensor has a reading."""
         return ordered_sum(measurement.available) > 0.0
 
-    def look(self, state: HypothesesState, found: Levels, measurement: Measurement) -> HypothesesState:
+    def add_observed(
+        self, state: HypothesesState, found: Levels, measurement: Measurement
+    ) -> HypothesesState:
         """Return the state with the joint innovation, and the probabilities after the readings, filled in."""
         xp, bank, rows, h = self.xp, self.own, self.own.rows, state.own.hypotheses
         whole = noise_levels.merge(h.mean, h.covariance, h.probability)

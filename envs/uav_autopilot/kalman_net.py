@@ -63,13 +63,13 @@ class KalmanNetBank(NoiseBank):
         parts = {"disturbance": model.scaled_noise, "other": model.other_noise}
         parts = {name: Q for name, Q in parts.items() if Q.any()}
         self.noise_parts = [task.constant(packed_covariance.pack(Q)[:, None]) for Q in parts.values()]
-        self.answers: tuple[str, ...] = (
+        self.action_names: tuple[str, ...] = (
             *parts,
             *sensors,
             *(f"agility_{name}" for name in parts),
             *(f"caution_{s}" for s in sensors),
         )
-        self.no_action: tuple[float, ...] = (0.0,) * len(self.answers)
+        self.no_action: tuple[float, ...] = (0.0,) * len(self.action_names)
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -88,12 +88,12 @@ class KalmanNetBank(NoiseBank):
         """Gymnasium box of a factor for each part of the process noise and each sensor, then one more each for the
         gain.
         """
-        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
     def action_block(self) -> Block:
         """Observation block of the last output of the network."""
-        return last_action_block(self.answers, name="action")
+        return last_action_block(self.action_names, name="action")
 
     def scaled_noise(self, scale: Array, entries: list[int] | slice) -> Array:
         """Return the process noise with its parts times factors ``(L, N)`` at some packed entries, ``(entries, N)``."""

@@ -204,7 +204,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         mean, covariance = self.propagate(h, measurement)
         return state._replace(hypotheses=h._replace(mean=mean, covariance=covariance))
 
-    def heeds(self, measurement: Measurement) -> Array:
+    def has_effect(self, measurement: Measurement) -> Array:
         """Return one where any sensor has a reading, zero elsewhere, ``(N,)``."""
         return self.xp.where(ordered_sum(measurement.available) > 0.0, 1.0, 0.0)
 

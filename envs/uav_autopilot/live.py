@@ -24,7 +24,7 @@ class SensorInput(LiveInput):
     def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the initial estimate with the given command (default: zero), and the memory."""
         initial, memory = super().start(time, {"command": 0.0, **given})
-        return initial, {**memory, "reading": self.same_of_all(0.0, self.measurement.reading.shape[:-1])}
+        return initial, {**memory, "reading": self.broadcast(0.0, self.measurement.reading.shape[:-1])}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the measurement of the received readings, and the memory for the next one."""

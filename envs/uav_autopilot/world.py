@@ -8,7 +8,7 @@ import numpy
 from ...filters import linear_systems
 from ...filters.linear_systems import Regulator
 from ..contract.draws import Draws, StepSignal
-from ..contract.faults import Disturbances, undisturbed
+from ..contract.faults import Disturbances, draw_undisturbed
 from ..contract.observation import Array
 from ..contract.world import World
 from .disturbances import DISTURBANCES, DRAWN_FIRST, draw_steps
@@ -118,7 +118,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         levels = draw_steps(draws, "disturbance", p.disturbance_levels, p.disturbance_times, zero)
         states = self.disturbances.begin(draws, normals[size:], zero)
         states = self.disturbances.complete(states, draws)
-        calm = undisturbed(draws, p)
+        calm = draw_undisturbed(draws, p)
         if calm is not None:
             levels = levels._replace(values=xp.where(calm, 1.0, levels.values))
         if p.plant == "U":
@@ -131,7 +131,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
             sensor_level=xp.ones_like(xp.stack([zero] * len(self.task.sensors))),
             commands=commands,
             levels=levels,
-            disturbances=self.disturbances.quiet(states, calm),
+            disturbances=self.disturbances.switch_off(states, calm),
         )
         covariance = xp.broadcast_to(self.initial_covariance, (*self.initial_covariance.shape[:2], len(zero)))
         return truth, Start(xp.zeros_like(state), covariance, zero)
@@ -180,7 +180,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         state = xp.matmul(self.F, truth.state) + self.B * feedback + disturbance
         state = xp.clip(state, -FARTHEST, FARTHEST)
         further = noise[self.own_normals : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(
+        steps = self.disturbances.split_noise(
             number, self.parameters.value("sampling_interval"), *further, feedback
         )
         states = self.disturbances.advance(truth.disturbances, steps)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Filter, FilterInput, Stated
+from ...envs.contract.filter import Filter, FilterInput, ReportedParts
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.logs.flight_tables import clock_seconds, describe_time
@@ -205,7 +205,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         table = given.table
         self.given = given
         self.names: list[str] = list(names)
-        self.stated: Stated | None = Stated(table.known, table.deviations)
+        self.stated: ReportedParts | None = ReportedParts(table.known, table.deviations)
         held = {name: numpy.flatnonzero(table.track == name) for name in {*names}}
         if {*table.track.tolist()} == {""}:
             held = {name: numpy.arange(len(table.time)) for name in held}

@@ -14,11 +14,11 @@ import numpy
 
 from ...compiler.namespace import NotTraceable
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, FilterInput, Likelihood, State, Stated
+from ...envs.contract.filter import Filter, FilterInput, Likelihood, ReportedParts, State
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
-from ...envs.engine.compiled import warn_of
+from ...envs.engine.compiled import warn_not_compiled
 from ...filters.small_matrices import cholesky
 from .adapters import select_lanes
 from .kinds import INFORMED_KINDS, Kind, check_competitor, compilation_key, is_program, make_competitor
@@ -152,13 +152,13 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         own: Any = None,
         name: str = "",
         count: int | None = None,
-        stated: Stated | None = None,
+        stated: ReportedParts | None = None,
     ) -> None:
         super().__init__(task)
         self.own = own
         self.name = name
         self.count = count
-        self.stated: Stated | None = getattr(own, "stated", stated)
+        self.stated: ReportedParts | None = getattr(own, "stated", stated)
         self.memory: Any = None
         self.step_number: int = 0
         self.extra: Mapping[str, Array] = {}
@@ -271,7 +271,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         super().__init__(task)
         self.own = own
         self.in_python: bool = own.in_python
-        self.stated: Stated | None = own.stated
+        self.stated: ReportedParts | None = own.stated
 
     def start(self, initial: Any) -> Checked:
         """Start from the initial estimate."""
@@ -458,7 +458,7 @@ class _Maker:
     kind: Kind
     maker: Any
     """Maker of a competitor that can be traced; None for one that runs in Python."""
-    stated: Stated | None = None
+    stated: ReportedParts | None = None
     """Reported quantities of a competitor that runs in Python."""
 
     def __call__(self, model: Model) -> Filter[Any, Any, Any]:
@@ -531,7 +531,7 @@ def close_loop(
         try:
             return model.with_filter(_Maker(kind, compilation_key(competitor)))
         except NotTraceable as error:
-            warn_of(f"{name!r} of {model.task.id}", error)
+            warn_not_compiled(f"{name!r} of {model.task.id}", error)
     looped = model.with_filter(_Maker(kind, None, own.stated))
     held = PythonFilter(model.task, own, f"{kind} {name!r}", count if kind in TRUTH_FREE_KINDS else None)
     looped.filter = wrap_for_loop(kind, model, held)

@@ -19,7 +19,7 @@ from ...compiler.program import Graph
 from ...envs.contract.filter import FilterInput
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array, DecisionMeans
-from ...envs.engine.compiled import CompiledModel, warn_of
+from ...envs.engine.compiled import CompiledModel, warn_not_compiled
 from .filters import AroundBank
 from .kinds import Policy, is_traceable
 
@@ -222,5 +222,5 @@ def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Po
     try:
         return trace(model, policy)
     except NotTraceable as error:
-        warn_of(f"policy {type(policy).__name__} of {model.task.id}", error)
+        warn_not_compiled(f"policy {type(policy).__name__} of {model.task.id}", error)
         return None
