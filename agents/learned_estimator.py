@@ -34,9 +34,9 @@ class LearnedEstimator(SteeredFilter):
         """Predict in the bank."""
         return super().predict(state, fill_missing(measurement))
 
-    def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
+    def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
         """Run the network on the measurement, and update with its action."""
-        return super().update(state, FilterInput(fill_missing(given.measurement)))
+        return super().update(state, FilterInput(fill_missing(inputs.measurement)))
 
 
 def fill_missing(measurement: Any) -> Any:

@@ -118,9 +118,9 @@ class ScaledNoise(Filter[Task, Any, Any]):
         """Predict to the scaled measurement."""
         return self.own.predict(state, self.scaled(measurement, self.factor))
 
-    def update(self, state: Any, given: FilterInput) -> Any:
+    def update(self, state: Any, inputs: FilterInput) -> Any:
         """Update with the scaled measurement."""
-        return self.own.update(state, FilterInput(self.scaled(given.measurement, self.factor)))
+        return self.own.update(state, FilterInput(self.scaled(inputs.measurement, self.factor)))
 
     def mean(self, state: Any) -> Array:
         """Return the mean of the filter."""
@@ -184,9 +184,9 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         """Start the filter, with unknown likelihood."""
         return RobustState(self.own.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: RobustState, given: FilterInput) -> RobustState:
+    def update(self, state: RobustState, inputs: FilterInput) -> RobustState:
         """Update as stated and with wide deviations, select the likelier result, and compute the mixture likelihood."""
-        (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(given.measurement, state.own)
+        (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(inputs.measurement, state.own)
         nis = None if own.nis is None else self.xp.where(is_outlier, other.nis, own.nis)
         likelihood = Likelihood(log_likelihood, nis, own.nis_degrees).fill_unknown(log_likelihood)
         return RobustState(select_nested(is_outlier, wide, usual), likelihood)

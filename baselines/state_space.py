@@ -198,9 +198,9 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun)
 
-    def update(self, state: Any, given: FilterInput) -> Any:
+    def update(self, state: Any, inputs: FilterInput) -> Any:
         """Predict and update."""
-        return _in_order(state, given.measurement, self.take)
+        return _in_order(state, inputs.measurement, self.take)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
         """Predict to a measurement and update with it."""
@@ -359,9 +359,9 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
         """Start from the initial estimate."""
         return _buffer(self.task, self.bank.start(initial))
 
-    def update(self, state: Any, given: FilterInput) -> Any:
+    def update(self, state: Any, inputs: FilterInput) -> Any:
         """Predict and update, without evidence of an action."""
-        return _in_order(state, given.measurement, self.take)
+        return _in_order(state, inputs.measurement, self.take)
 
     def take(self, state: Mixture, one: Past) -> Mixture:
         """Predict to a measurement and update with it."""

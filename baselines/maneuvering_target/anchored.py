@@ -55,9 +55,9 @@ class DeadReckoning(KalmanModel):
         """Start from the initial estimate, with an unknown slow error."""
         return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
         """Move by the odometry and update with the measured position."""
-        measurement = given.measurement
+        measurement = inputs.measurement
         odometry = measurement.odometry
         if odometry is None:
             raise ValueError(

@@ -54,11 +54,11 @@ class ConstantVelocity(KalmanModel):
         super().__init__(task)
         self.variance: float = acceleration**2
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
         """Predict and update."""
-        F, Q = self.motion(given.measurement.interval)
+        F, Q = self.motion(inputs.measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
+        return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))
 
 
 class KalmanMixture(NamedTuple):
@@ -125,9 +125,9 @@ class KalmanInteractingMultipleModel(KalmanModel):
             + 0.0 * mean[:1],
         )
 
-    def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
+    def update(self, state: KalmanMixture, inputs: FilterInput) -> KalmanMixture:
         """Run one IMM cycle. Its normalised innovation squared is the filters' mean by their posterior weights."""
-        xp, measurement = self.xp, given.measurement
+        xp, measurement = self.xp, inputs.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
         mixed = imm.mix(state.means, state.covariances, prediction.mixing)
         results = self.predict_and_update(*mixed, measurement)
@@ -238,11 +238,11 @@ class UnscentedTurn(TurnModel, KalmanModel):
         """Start from the initial estimate, with a turn rate of mean zero."""
         return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
         """Propagate the sigma points through the turn and update with the measured position."""
-        T = given.measurement.interval
+        T = inputs.measurement.interval
         mean, covariance = unscented.transform(
             state.mean, state.covariance, lambda points: coordinated_turn.propagate(points, T)
         )
         predicted = mean, covariance + self.noise(T)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
+        return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))

@@ -49,9 +49,9 @@ class KnownTurn(KalmanModel):
 
     disturbances = DISTURBANCES
 
-    def initialise(self, given: FilterInput) -> TurnMemory:
+    def initialise(self, inputs: FilterInput) -> TurnMemory:
         """Start from the initial estimate; a coloured error is stationary from the start."""
-        (mean, covariance), truth = given.measurement, given.truth
+        (mean, covariance), truth = inputs.measurement, inputs.truth
         if "coloured" in truth.disturbances:
             none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2
             mean = self.xp.concat([mean, none])
@@ -68,9 +68,9 @@ class KnownTurn(KalmanModel):
             ]
         )
 
-    def update(self, state: TurnMemory, given: FilterInput) -> TurnMemory:
+    def update(self, state: TurnMemory, inputs: FilterInput) -> TurnMemory:
         """Predict with the known flight since the scan before, and update with the measured position."""
-        measurement, truth = given.measurement, given.truth
+        measurement, truth = inputs.measurement, inputs.truth
         xp, world, disturbances = self.xp, self.task.world, truth.disturbances
         assert isinstance(world, RadarWorld)
         early = None

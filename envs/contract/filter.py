@@ -134,28 +134,28 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     def start(self, initial: Any) -> State:
         """Return the filter's state at the start of the track, from the initial mean and covariance."""
 
-    def initialise(self, given: FilterInput) -> State:
+    def initialise(self, inputs: FilterInput) -> State:
         """Return the filter's state at the start of the track from a whole input, whose measurement is the initial
         estimate.
         """
-        return self.start(given.measurement)
+        return self.start(inputs.measurement)
 
     def predict(self, state: State, measurement: Measurement) -> State:
         """Predict the state to the time of a measurement and compute its innovation; by default return it unchanged."""
         return state
 
     @abstractmethod
-    def update(self, state: State, given: FilterInput) -> State:
+    def update(self, state: State, inputs: FilterInput) -> State:
         """Update the predicted state with the measurement (step 4 of the clock).
 
         Args:
             state: after :meth:`predict`.
-            given: the same measurement, and the further input of this filter.
+            inputs: the same measurement, and the further input of this filter.
         """
 
-    def step(self, state: State, given: FilterInput) -> State:
+    def step(self, state: State, inputs: FilterInput) -> State:
         """Predict the state to a measurement and update it with that measurement, without an action."""
-        return self.update(self.predict(state, given.measurement), given)
+        return self.update(self.predict(state, inputs.measurement), inputs)
 
     def mean(self, state: State) -> Array:
         """Return the mean of the task's components, ``(C, N)``; by default the state's ``mean``."""
@@ -224,6 +224,6 @@ class Bank(Filter[TaskT, Measurement, State]):
             action: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space.
         """
 
-    def update(self, state: State, given: FilterInput) -> State:
+    def update(self, state: State, inputs: FilterInput) -> State:
         """Update the predicted state with the measurement and the action of the input."""
-        return self.act(state, given.measurement, given.action)
+        return self.act(state, inputs.measurement, inputs.action)

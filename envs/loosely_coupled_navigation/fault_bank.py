@@ -288,13 +288,13 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
         return predicted, self.weigh(predicted, measurement, evidence, receiver, levels)
 
-    def update(self, state: FaultState, given: FilterInput) -> FaultState:
+    def update(self, state: FaultState, inputs: FilterInput) -> FaultState:
         """Weight and update the predicted hypotheses with a fix, and compute the moments of the bank."""
-        predicted, measurement = state.memory, given.measurement
-        if given.action is None:
+        predicted, measurement = state.memory, inputs.measurement
+        if inputs.action is None:
             weighing = self.weigh(predicted, measurement)
         else:
-            predicted, weighing = self.apply_factors(predicted, measurement, given.action)
+            predicted, weighing = self.apply_factors(predicted, measurement, inputs.action)
         return self.take(predicted, measurement, weighing)
 
     def likelihood(self, weighing: Weighing, measurement: Measurement) -> Likelihood:

@@ -309,16 +309,16 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
             first = last
         return scaled
 
-    def update(self, state: SemiMarkovState, given: FilterInput) -> SemiMarkovState:
+    def update(self, state: SemiMarkovState, inputs: FilterInput) -> SemiMarkovState:
         """Update all hypotheses and their weights with a measurement.
 
         Its normalised innovation squared is the mean of the filters', by their posterior weights.
         """
-        xp, measurement = self.xp, given.measurement
+        xp, measurement = self.xp, inputs.measurement
         tables = [table.unpack() for table in state.track]
-        if given.action is not None:
-            tables = self.apply_factors(tables, given.action[:5])
-            measurement = measurement._replace(variance=xp.exp(given.action[5]) * measurement.variance)
+        if inputs.action is not None:
+            tables = self.apply_factors(tables, inputs.action[:5])
+            measurement = measurement._replace(variance=xp.exp(inputs.action[5]) * measurement.variance)
         results = [self.update_table(table, measurement) for table in tables]
         logarithms = xp.concat(
             [xp.log(table.probability) + r.log_likelihood for table, r in zip(tables, results, strict=True)]

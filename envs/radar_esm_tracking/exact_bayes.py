@@ -301,13 +301,13 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         P = packed_covariance.unpack(memory.covariance, self.states)
         return kalman.predict(memory.mean, P, self.F, process * self.Q)
 
-    def update(self, state: ClassState, given: FilterInput) -> ClassState:
+    def update(self, state: ClassState, inputs: FilterInput) -> ClassState:
         """Update with a scan: motion and radar, change of class, then ESM; the likelihood is that of the radar."""
-        xp, prior, memory, measurement = self.xp, self.prior, state.tracks, given.measurement
+        xp, prior, memory, measurement = self.xp, self.prior, state.tracks, inputs.measurement
         process, variance = 1.0, self.variance
-        if given.action is not None:
-            memory = self.apply_factors(memory, given.action)
-            process, factor = xp.exp(given.action[-2:])
+        if inputs.action is not None:
+            memory = self.apply_factors(memory, inputs.action)
+            process, factor = xp.exp(inputs.action[-2:])
             variance = factor * variance
         mean, P = self.predict_motion(memory, process)
         radar = contaminated_normal.update_position(

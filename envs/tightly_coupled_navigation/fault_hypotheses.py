@@ -241,13 +241,13 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         )
         return FaultState(initial.mean, initial.covariance, hypotheses, Likelihood.unknown(none))
 
-    def update(self, state: FaultState, given: FilterInput) -> FaultState:
+    def update(self, state: FaultState, inputs: FilterInput) -> FaultState:
         """Predict to a measurement, weight hypotheses, levels and renewals, and compute the moments of the bank."""
-        if given.action is None:
-            return self.examine(state, given.measurement).after
-        factors = Factors(*self.xp.exp(given.action))
-        levels = self.xp.exp(self.heights * given.action[Factors._fields.index("levels")])
-        return self.examine(state, given.measurement, factors._replace(levels=levels)).after
+        if inputs.action is None:
+            return self.examine(state, inputs.measurement).after
+        factors = Factors(*self.xp.exp(inputs.action))
+        levels = self.xp.exp(self.heights * inputs.action[Factors._fields.index("levels")])
+        return self.examine(state, inputs.measurement, factors._replace(levels=levels)).after
 
     def _predict(
         self, memory: Hypotheses, measurement: Measurement, between: Array, factors: Factors

@@ -99,14 +99,14 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
         members = tuple(member.start(initial) for member in self.members)
         return SatelliteFaultState(members, weights, Likelihood.unknown(none))
 
-    def update(self, state: SatelliteFaultState, given: FilterInput) -> SatelliteFaultState:
+    def update(self, state: SatelliteFaultState, inputs: FilterInput) -> SatelliteFaultState:
         """Update every member with a measurement, and weight them by their likelihoods."""
-        xp, S, measurement = self.xp, self.task.satellites, given.measurement
+        xp, S, measurement = self.xp, self.task.satellites, inputs.measurement
         between = xp.any(measurement.cn0 != self.task.parameters.clear_cn0, axis=0)
         beginning = xp.where(between, 0.0, self.begins) * state.weights[0]
         predicted = [state.weights[0] - beginning, *(state.weights[1 + j] + beginning / S for j in range(S))]
         members = tuple(
-            member.update(own, given) for member, own in zip(self.members, state.members, strict=True)
+            member.update(own, inputs) for member, own in zip(self.members, state.members, strict=True)
         )
         log_prior = imm.log_probabilities(xp.stack(predicted))
         log_likelihood, nis, degrees = (

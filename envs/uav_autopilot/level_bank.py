@@ -218,13 +218,13 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
             covariance=h.covariance + (xp.exp(logarithms[2]) - 1.0) * self.process,
         )
 
-    def update(self, state: Levels, given: FilterInput) -> Levels:
+    def update(self, state: Levels, inputs: FilterInput) -> Levels:
         """Update all hypotheses with one reading after the other, and combine them."""
-        xp, n, measurement, predicted = self.xp, self.n, given.measurement, state.hypotheses
+        xp, n, measurement, predicted = self.xp, self.n, inputs.measurement, state.hypotheses
         scaled = self.variances
-        if given.action is not None:
-            predicted = self.apply_factors(predicted, given.action[:3])
-            factors = xp.exp(given.action[3:])
+        if inputs.action is not None:
+            predicted = self.apply_factors(predicted, inputs.action[:3])
+            factors = xp.exp(inputs.action[3:])
             scaled = [factors[k] * variances for k, variances in enumerate(self.variances)]
         mean, covariance = predicted.mean, predicted.covariance
         log_density, nis, sensors = 0.0, 0.0, []

@@ -228,11 +228,11 @@ class FileTrack(Filter[Task, Any, FileState]):
         none = numpy.zeros(width)
         return FileState(0, none, numpy.full(width, -1), none, none, initial)
 
-    def update(self, state: FileState, given: FilterInput) -> FileState:
+    def update(self, state: FileState, inputs: FilterInput) -> FileState:
         """Find the row of each episode: the newest that is not later than the measurement."""
-        width = given.measurement[0].shape[-1]
+        width = inputs.measurement[0].shape[-1]
         lane = numpy.minimum(numpy.arange(width), len(self.names) - 1)
-        seconds = self._times(state, given.measurement)
+        seconds = self._times(state, inputs.measurement)
         at = numpy.clip(seconds - self._begin + self._tolerance, 0.0, self._span - 0.5)
         found = numpy.searchsorted(self._keys, at + lane * self._span, side="right") - 1
         there = found >= self._first[lane]

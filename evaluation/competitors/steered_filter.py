@@ -154,11 +154,11 @@ class SteeredFilter(AroundBank[PolicyFilterState]):
         """Start the bank; the policy begins at its first decision."""
         return PolicyFilterState(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
 
-    def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
+    def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
         """Update the bank with the policy's action, chosen anew where a decision is due."""
-        observation = self.model.observe(Episode(None, given.measurement, state.bank))
+        observation = self.model.observe(Episode(None, inputs.measurement, state.bank))
         action, decisions = self.decider.decide(observation, state.policy)
-        return PolicyFilterState(self.bank.act(state.bank, given.measurement, action), decisions)
+        return PolicyFilterState(self.bank.act(state.bank, inputs.measurement, action), decisions)
 
     def records(self, state: PolicyFilterState, measurement: Any) -> dict[str, Array]:
         """Return the records of the bank."""

@@ -30,7 +30,7 @@ class NoFilter(Filter[Task, Any, Initial]):
         """Return the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
-    def update(self, state: Initial, given: FilterInput) -> Initial:
+    def update(self, state: Initial, inputs: FilterInput) -> Initial:
         """Return the state unchanged."""
         return state
 
