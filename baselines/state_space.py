@@ -180,7 +180,7 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task)
-        self.equations: Equations = task.believed[0]
+        self.equations: Equations = task.filter_equations[0]
         self.factor = process_noise
         self.of_sources, of_sensors = _split(task, noises)
         self.sensor_factors: tuple[Any, dict[str, Any]] = measurement_noise, of_sensors

@@ -15,8 +15,8 @@ from .companions import find_companion
 from .observation import Array
 
 LARGE_ERROR = 4.0
-"""Stated standard deviations beyond which the error of a reading is an outlier: of white normal errors that state them
-rightly, one of 16,000."""
+"""Number of stated standard deviations beyond which the error of a reading is an outlier: one of 16,000 white
+normal errors with the stated deviation."""
 
 
 MOST_CAUSES = 50

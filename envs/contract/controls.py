@@ -94,14 +94,14 @@ class SettingsBank(Bank[Any, Any, Any]):
     prediction, ``action``, the last one, ``(n, N)``, and further values of the observation.
     """
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]]
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]]
     """Class of the steered filter."""
     own: Any
     """The steered filter."""
 
     def __init__(self, task: Any, control: str) -> None:
         super().__init__(task, control)
-        self.own = self.strong(task)
+        self.own = self.filter_class(task)
         factors = self.own.settings.values()
         self.log_reach: Array = task.constant([math.log(factor) for factor in factors])[:, None]
 
@@ -111,12 +111,12 @@ class SettingsBank(Bank[Any, Any, Any]):
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.own.settings),), numpy.float32)
 
     @abstractmethod
-    def add_observed(self, state: Any, found: Any, measurement: Any) -> Any:
+    def add_observed(self, state: Any, result: Any, measurement: Any) -> Any:
         """Return the bank's state with the values that the agent observes at a measurement filled in.
 
         Args:
             state: contains that of the filter after :meth:`predict`.
-            found: result of the measurement in the filter, see :meth:`SteerableFilter.examine`.
+            result: result of the measurement in the filter, see :meth:`SteerableFilter.examine`.
             measurement: the current one.
         """
 

@@ -2,7 +2,7 @@
 
 A world draws its quantities in a fixed order. A first pass without random numbers counts how many numbers that takes
 (:meth:`Draws.counting`). Each draw is stored by name: the levels, times and kinds of an episode are its context. A
-draw may be in force within a window of time, or change in steps: :func:`is_within`, :class:`StepSignal`.
+draw may apply within a window of time, or change in steps: :func:`is_within`, :class:`StepSignal`.
 """
 
 import math

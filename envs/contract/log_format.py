@@ -116,7 +116,7 @@ class TrackLog(NamedTuple):
     start: float
     """Time of the start of the track, s, as in the table."""
     time: numpy.ndarray
-    """Time of each measurement as it stands in the table, ``(T,)``."""
+    """Time of each measurement as written in the table, ``(T,)``."""
     notes: tuple[str, ...] = ()
     """Changes made to the table, a line each."""
     typical: Mapping[str, float] = {}

@@ -470,7 +470,7 @@ def last_action_block(
 def last_weight_block(
     parts: Sequence[str],
     value: Callable[[Any], Array] = lambda f: f.probabilities,
-    text: str = "weight in force before this scan",
+    text: str = "weight before this scan",
 ) -> Block:
     """Return the observation block of the hypotheses' weights before this measurement; by default ``probabilities``."""
     return Block("last_weight", lambda f, _: value(f), text, parts, SHARE)

@@ -49,7 +49,7 @@ class ReadingLimits(NamedTuple):
 
 
 def limits() -> ReadingLimits:
-    """Return the limits of memory and processor time in force, from environment variables or defaults.
+    """Return the limits of memory and processor time from environment variables, else the defaults.
 
     Raises:
         ValueError: if an environment variable is not a valid limit.

@@ -2,12 +2,12 @@
 
 * ``cost``: minus the counted cost of the estimate, in units of its mean for the paper's algorithm, and compressed: of a
   cost ``x`` in that unit the reward is ``-30 log(1 + x / 30)``. That is about ``-x`` while the estimator works, and
-  falls by 30 log(2) with every doubling once the track is lost. So it is always better to find the track again, and
-  one lost track does not drown all that can be learned elsewhere.
-* ``log-likelihood``: the logarithm of the reported Gaussian's density at the truth. It rewards an honest covariance,
-  too.
-* ``cost-and-likelihood``: the sum of ``cost`` and of ``log-likelihood`` over the number of components, for what must
-  be both accurate and consistent.
+  falls by 30 log(2) with every doubling once the track is lost. So recovering a track always pays, and
+  one lost track does not dominate the gradient of all others.
+* ``log-likelihood``: the logarithm of the reported Gaussian's density at the truth. It also rewards a consistent
+  covariance.
+* ``cost-and-likelihood``: the sum of ``cost`` and of ``log-likelihood`` over the number of components, for
+  estimates that must be both accurate and consistent.
 * ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
   positive where the agent does better than the paper.
 * ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is the counted cost of the agent and ``x0`` that of the

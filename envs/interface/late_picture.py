@@ -15,8 +15,8 @@ from ..engine.lanes import Lanes
 class LatePicture:
     """Picture of one episode, computed on request from its identity and actions.
 
-    Libraries set a render mode for environments that are not shown (Stable-Baselines3's ``make_vec_env`` always), and
-    recording the values of a picture takes far longer than a step. So only the actions are stored: they and the
+    Libraries set a render mode for environments that are not displayed (Stable-Baselines3's ``make_vec_env`` always),
+    and recording the values of a picture takes far longer than a step. So only the actions are stored: they and the
     identity determine an episode.
 
     Args:

@@ -71,7 +71,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             cost and the further records of an evaluation.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
             return.
-        context: whether ``info["context"]`` contains the random draws of the episode and those in force now
+        context: whether ``info["context"]`` contains the random draws of the episode and their current values
             (:meth:`.World.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
             and of "privileged" values, the context and the error after the last action in units of its reported

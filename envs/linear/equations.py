@@ -272,7 +272,7 @@ class StateSpaceProblem(Task):
     def set_up(self) -> None:
         """Compute the filters' models on the task's arrays."""
         own = self.definition
-        self.believed: list[Equations] = [Equations(self, model) for model in own.filters]
+        self.filter_equations: list[Equations] = [Equations(self, model) for model in own.filters]
         count = len(own.filters)
         self.modes: tuple[str, ...] = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
         self.transition: Array = self.constant([list(row) for row in own.transition])

@@ -49,7 +49,7 @@ class StateSpaceTruth(NamedTuple):
     state: Array
     """``(n, N)``."""
     hypothesis: Array
-    """Index of the model in force since the previous measurement, ``(N,)``."""
+    """Index of the model that holds since the previous measurement, ``(N,)``."""
     process_noise: Array
     """Ratio of the true Q to the model's, ``(N,)``."""
     measurement_noise: Array
@@ -257,7 +257,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         values = measurement.values
         mean = self.task.constant(self.task.definition.mean)
         x = self.xp.stack([mean[i] + 0.0 * values[0] for i in range(self.states)])
-        R = self.task.believed[0].sensor_noise(x, measurement)
+        R = self.task.filter_equations[0].sensor_noise(x, measurement)
         return self.xp.stack([self.xp.sqrt(R[j, j]) + 0.0 * values[j] for j in range(values.shape[0])])
 
     def component_readings(self, measurement: StateSpaceMeasurement) -> Array | None:
@@ -278,7 +278,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         )
 
     def context(self, truth: StateSpaceTruth) -> dict[str, Array]:
-        """Return the index of the model in force and the factors on Q and R, by name."""
+        """Return the index of the current model and the factors on Q and R, by name."""
         return {
             "hypothesis": truth.hypothesis,
             "process_noise": truth.process_noise,
@@ -342,7 +342,7 @@ REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("ev
 def _explain_loss(
     task: StateSpaceProblem, mean: Array, covariance: Array, measurement: StateSpaceMeasurement
 ) -> str:
-    return task.believed[0].explain_loss(mean, covariance, measurement)
+    return task.filter_equations[0].explain_loss(mean, covariance, measurement)
 
 
 def state_space_attributes(

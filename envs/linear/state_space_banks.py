@@ -78,7 +78,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
     def __init__(self, task: StateSpaceProblem, control: str) -> None:
         super().__init__(task, control)
-        self.equations: Equations = task.believed[0]
+        self.equations: Equations = task.filter_equations[0]
         own = self.equations.model
         self.states: int = own.f.size
         self.sensors: int = own.h.size
@@ -381,7 +381,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         of_sensors: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(task, control)
-        self.count: int = len(task.believed)
+        self.count: int = len(task.filter_equations)
         self.factor = process_noise
         self.of_sources = of_sources
         self.sensor_factors: tuple[Any, Mapping[str, Any] | None] = measurement_noise, of_sensors
@@ -439,7 +439,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
         means, covariances = imm.mix(self._align(state.means), state.covariances, chain.mixing)
         updates = []
-        for j, equations in enumerate(self.task.believed):
+        for j, equations in enumerate(self.task.filter_equations):
             mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
             P = carried + self.factor * equations.process_noise(mean, measurement, self.of_sources)
             R = equations.sensor_noise(mean, measurement, *self.sensor_factors)

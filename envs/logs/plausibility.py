@@ -390,7 +390,7 @@ def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.nda
     if apart > 100.0 * float(numpy.median(sigma)):
         ratio = float(numpy.median(_length(truth)) / numpy.median(_length(position)))
         cause = "kilometres" if 0.5 < 1e3 * ratio < 2.0 else "metres, of the same origin and the same clock"
-        raise ValueError(f"truth lies {apart:,.0f} m from what was measured: is it {cause}?")
+        raise ValueError(f"truth lies {apart:,.0f} m from the measured positions: is it {cause}?")
 
 
 def _check_scale(

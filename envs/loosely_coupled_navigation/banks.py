@@ -1,6 +1,6 @@
 """Kalman-Bucy filters of LooselyCoupledNavigation that an action steers: by noises, by the gain, or by weights.
 
-Equations stand in ``filters/loosely_coupled.py``; (3) is ``Xh' = Xh + dX, nu = Z - Xh', Xh = Xh' + gain nu``.
+The equations are in ``filters/loosely_coupled.py``; (3) is ``Xh' = Xh + dX, nu = Z - Xh', Xh = Xh' + gain nu``.
 """
 
 import math
@@ -470,7 +470,7 @@ class SchemeBank(KalmanBucyBank):
     def last_action(self) -> Block:
         """Return the observation block of the weights before this measurement."""
         names = [name.replace("-", "_") for name in SCHEMES]
-        return last_weight_block(names, value=lambda f: f.weights, text="weight put in force before")
+        return last_weight_block(names, value=lambda f: f.weights, text="weight of the last measurement")
 
     def start(self, initial: Initial) -> Schemes:
         """Return all filters at the start: INS and reference agree, the rate errors have their modelled prior."""
@@ -517,7 +517,7 @@ class SchemeBank(KalmanBucyBank):
                 (state.position[2] + gain.position * innovation[2])[None],
             ]
         )
-        # Neither control asks for likelihoods, only for the shape of the bank.
+        # Neither control uses likelihoods, only the shape of the bank.
         no_evidence = xp.zeros_like(innovation[:, 0])
         return state._replace(
             position=position,

@@ -50,7 +50,7 @@ class HypothesesState(NamedTuple):
 class HypothesesBank(SettingsBank, KalmanBucyBank):
     """Bank of the control ``hypotheses``: the fault bank with factors on its weights, levels and noises."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultBank
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultBank
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
@@ -132,19 +132,19 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         return xp.stack([free[0], *noises, ordered_sum(young), ordered_sum(by_onset - young)])
 
     def add_observed(
-        self, state: HypothesesState, found: Weighing, measurement: Measurement
+        self, state: HypothesesState, result: Weighing, measurement: Measurement
     ) -> HypothesesState:
         """Return the state with the innovations, and the probabilities before and after the fix, filled in."""
-        bank, predicted, p = self.own, state.own.memory, found.weights
+        bank, predicted, p = self.own, state.own.memory, result.weights
         age = bank.age(measurement.number)
         weights = bank.join([predicted.free.weights, predicted.pulled.weights], 0)
-        expected = measurement.ins - found.expected
+        expected = measurement.ins - result.expected
         return state._replace(
-            likelihood=bank.likelihood(found, measurement),
-            seen=self.update_innovations(state.seen, measurement, expected, found.own),
-            prior=0.5 * self.xp.log(found.own / predicted.reported),
+            likelihood=bank.likelihood(result, measurement),
+            seen=self.update_innovations(state.seen, measurement, expected, result.own),
+            prior=0.5 * self.xp.log(result.own / predicted.reported),
             predicted=self.group(weights, age),
             probabilities=self.group(p, age),
-            levels=found.levels,
+            levels=result.levels,
             entropy=-ordered_sum(p * imm.log_probabilities(p)) / math.log(p.shape[0]),
         )

@@ -317,7 +317,7 @@ def check_clocks(inertial: Any, clock: str, other: Any, its_clock: str, what: st
         )
 
 
-# --- what stands beside each other
+# --- alignment of times
 
 
 def fix_deviations(fixes: Any, sigma: float | None) -> numpy.ndarray:

@@ -1,15 +1,14 @@
-r"""The filter of LooselyCoupledNavigation that a recurrent network steers from inside: the learned estimator
-``kalman-net``.
+r"""The filter of LooselyCoupledNavigation inside the learned estimator ``kalman-net``, steered by a recurrent network.
 
-The augmented filter of the position with the rate errors beta and eta. At every measurement the network answers with
+The augmented filter of the position with the rate errors beta and eta. At every measurement the network outputs
 six numbers a in [-1, 1]:
 
     noise    the receiver's, the coloured and the white one, scaled by a1, a2, a3 as under control ``noise`` at its
-             whole reach
+             full range
     gain     K = diag(1, rate_range^a5, rate_range^a6) P' H^T / (H P' H^T + caution^a4 R)
     update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
 
-All zero is the augmented filter. Without a fix K is zero. References and reading stand in
+All zero is the augmented filter. Without a fix K is zero. References and reading are in
 ``maneuvering_target/kalman_net.py``.
 """
 
@@ -39,7 +38,7 @@ class KalmanNetBank(NoiseBank):
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(
         -1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32
     )
-    reach: float = 1.0  # it learns through the filter, and does not explore
+    reach: float = 1.0  # trained through the filter, without exploration
 
     @property
     def blocks(self) -> Sequence[Block]:

@@ -77,7 +77,7 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     change_start: tuple[float, float] = parameter((0.5, 4.5), at_least=0.0, ascending=True)
     """Interval of the times of change, s; ours: both sides of a change are seen."""
     unreported: float = parameter(0.5, at_least=0.0, at_most=1.0)
-    """Probability that the receiver goes on reporting the former noise after a change."""
+    """Probability that the receiver reports the former noise after a change."""
 
     outage_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """Probability that the receiver fails once in the episode."""

@@ -55,7 +55,7 @@ class HypothesesState(NamedTuple):
 class HypothesesBank(SettingsBank, RadarBank):
     """Bank of the control ``hypotheses``: the semi-Markov Gaussian sum with factors on weights, covariances and R."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = SemiMarkov
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = SemiMarkov
 
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
@@ -111,7 +111,7 @@ class HypothesesBank(SettingsBank, RadarBank):
         )
 
     def add_observed(
-        self, state: HypothesesState, found: SemiMarkovState, measurement: Measurement
+        self, state: HypothesesState, result: SemiMarkovState, measurement: Measurement
     ) -> HypothesesState:
         """Return the state with the innovation, and the probabilities before and after it, filled in."""
         xp, tables = self.xp, [table.unpack() for table in state.own.track]
@@ -128,10 +128,10 @@ class HypothesesBank(SettingsBank, RadarBank):
         rotated = [product(product(frame, P), transpose(frame)) for P in (covariance[:2, :2], R)]
         own, sensor = (xp.stack([P[0, 0], P[1, 1]]) for P in rotated)
         innovation = measurement.available * (measurement.position - mean[:2])
-        p = xp.concat([table.probability for table in found.track])
+        p = xp.concat([table.probability for table in result.track])
         surprise = ordered_sum(p * xp.log(xp.clip(p, 1e-300, None)))
         return state._replace(
-            likelihood=found.likelihood,
+            likelihood=result.likelihood,
             innovation=apply(frame, innovation) / xp.sqrt(own + sensor),
             prior=0.5 * xp.log(own / sensor),
             predicted=self.group(weights),

@@ -20,7 +20,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "paper",
             "The paper's flight: straight at 100 m/s, one 90-degree turn at scans 50 to 55, straight again. It is "
-            "always the same and can be learned by heart.",
+            "always the same and can be memorised.",
             {"flight": "maneuver"},
             {
                 "pre": (30, 49),

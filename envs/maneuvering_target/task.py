@@ -2,7 +2,7 @@
 
 Source: P. A. Bakulev, M. I. Sychev and Nguyen Trong Luu, "Tracking a manoeuvring target with an IMM
 algorithm over two alpha-beta filters" (in Russian). Equation numbers are theirs as far as they print them;
-the mathematics stands in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``filters/polar.py``.
+the equations are in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``filters/polar.py``.
 """
 
 from typing import Any, ClassVar
@@ -48,7 +48,7 @@ class ManeuveringTarget(TargetProblem):
 
     ## Action Space
 
-    What each control means stands in ``Actions``. Values outside the box are taken at its edge.
+    ``Actions`` describes each control. Values outside the box are clipped to it.
 
     ## Observation Space
 
@@ -116,7 +116,7 @@ class ManeuveringTarget(TargetProblem):
         Component("velocity_x", "m/s", group="velocity"),
         Component("velocity_y", "m/s", group="velocity"),
     )
-    # What a turn costs rules the noise of the reward, and who does nothing bears it too; a logarithm, because a few
+    # The cost of turns dominates the noise of the reward, also for action zero; a logarithm, because a few
     # hard turns would hide what an action changes on all other flights.
     reward: ClassVar[Reward] = Reward(
         "squared position error over the squared range sigma",
@@ -133,13 +133,13 @@ class ManeuveringTarget(TargetProblem):
             {
                 "evidence": "times 2 nats (`evidence_scale`), added to the log-posterior of each mode; **0 is the paper's IMM**",
                 "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
-                "the beta that belongs to it; **0 is the paper's IMM**",
+                "the beta that follows from it; **0 is the paper's IMM**",
                 "gain": "position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; "
                 "beta = alpha^2 / (2 - alpha)",
                 "hypotheses": "factors r^a in the semi-Markov Gaussian sum at this scan: odds that a manoeuvre has begun (r = 3), "
                 "has ended (9), is a turn (1.5); predicted covariances in straight flight and in manoeuvres (1.25 each); variance "
                 "of the measurement (1.25); **0 is the estimator `semi-markov`**",
-                "mode": "the filter of the bank that is believed; the bank collapses to one filter that switches",
+                "mode": "the selected filter of the bank; the bank collapses to one filter that switches",
                 "weights": "weights of the bank, normalised; all zero is uniform",
             },
             {"evidence": ("evidence_scale",)},

@@ -70,7 +70,7 @@ class Filters(NamedTuple):
     """Number of decisions for each type outside the gate so far, ``(J, N)``."""
     probabilities: Array
     """Weights of the classes after the last action, ``(M, N)``."""
-    believed: Array
+    posterior: Array
     """Probabilities of the classes before the next scan's transition, ``(M, N)``: under ``evidence`` those of Bayes'
     rule
     alone, otherwise the weights."""
@@ -229,7 +229,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
             used_counts=used_counts,
             refused_counts=refused_counts,
             probabilities=probabilities,
-            believed=probabilities,
+            posterior=probabilities,
             expected=probabilities,
         )
 
@@ -238,7 +238,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         xp, models, f = self.xp, self.task.models, state
         if self.mixes:
             mean, covariance, log_predicted, innovation, log_likelihood = class_fusion.advance(
-                f.believed, f.mean, f.covariance, measurement.radar, models, self.class_transition
+                f.posterior, f.mean, f.covariance, measurement.radar, models, self.class_transition
             )
         else:
             scan = xp.clip(measurement.scan, 0, self.last_scan)
@@ -247,7 +247,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
                 f.mean, measurement.radar, models, channels
             )
             covariance = channels.covariance
-            log_predicted = imm.log_probabilities(f.believed) + log_likelihood
+            log_predicted = imm.log_probabilities(f.posterior) + log_likelihood
         log_squared = xp.log1p(ordered_sum(innovation * innovation))
         used, used_counts, refused_counts = self._count_decisions(
             f.used_counts, f.refused_counts, measurement
@@ -266,8 +266,8 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
             used_counts,
             refused_counts,
             f.probabilities,
-            f.believed,
-            f.believed,
+            f.posterior,
+            f.posterior,
         )
 
     def _average(self, old: Array, new: Array) -> Array:
@@ -293,8 +293,8 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         log_predicted, esm = state.log_predicted, self._esm_log_likelihood(state.used, measurement)
         control, scale = self.control, self.parameters.evidence_scale
         probabilities = bank_probabilities(control, action, log_predicted, esm, scale, self.xp)
-        believed = imm.mode_posterior(log_predicted, esm) if control == "evidence" else probabilities
-        return state._replace(probabilities=probabilities, believed=believed)
+        posterior = imm.mode_posterior(log_predicted, esm) if control == "evidence" else probabilities
+        return state._replace(probabilities=probabilities, posterior=posterior)
 
     # --- estimates
 

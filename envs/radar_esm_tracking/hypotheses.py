@@ -65,7 +65,7 @@ class HypothesesState(NamedTuple):
 class HypothesesBank(SettingsBank):
     """Bank of ``hypotheses``: Bayes' rule over classes and emitters, with factors on probabilities and noises."""
 
-    strong = ExactBayes
+    filter_class = ExactBayes
     task: RadarEsmProblem
 
     def __init__(self, task: RadarEsmProblem, control: str) -> None:
@@ -142,7 +142,7 @@ class HypothesesBank(SettingsBank):
         }
 
     def add_observed(
-        self, state: HypothesesState, found: ClassState, measurement: Measurement
+        self, state: HypothesesState, result: ClassState, measurement: Measurement
     ) -> HypothesesState:
         """Return the state with the joint innovation, and the probabilities before and after the scan, filled in."""
         xp, bank, tracks = self.xp, self.own, state.own.tracks
@@ -155,14 +155,14 @@ class HypothesesBank(SettingsBank):
         )
         R, none = bank.variance[:, 0, 0], 0.0 * mean[0]
         noise = xp.stack([xp.stack([R[0] + none, none]), xp.stack([none, R[1] + none])])
-        after = found.tracks
+        after = result.tracks
         disturbed, every = (
             ordered_sum(after.unchanged * bank.class_likelihoods(after.first, points))
             for points in (bank.disturbed_by_type, bank.by_type)
         )
         p = xp.reshape(after.weights, (size, -1))
         return state._replace(
-            likelihood=found.likelihood,
+            likelihood=result.likelihood,
             innovation=class_fusion.whiten(cholesky(P + noise), measurement.radar - mean),
             prior=0.5 * xp.log(xp.stack([P[0, 0], P[1, 1]]) / R),
             predicted=xp.clip(self.group(tracks.weights), LEAST, None),

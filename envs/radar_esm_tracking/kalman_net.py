@@ -62,7 +62,7 @@ class NetFilters(NamedTuple):
     used_counts: Array
     refused_counts: Array
     probabilities: Array
-    believed: Array
+    posterior: Array
     expected: Array
     gain_covariance: Array
     """M after an action, ``(6, M, N)``."""
@@ -145,7 +145,7 @@ class KalmanNetBank(ClassBank):
         return f._replace(
             mean=mean,
             covariance=covariance,
-            log_predicted=imm.log_probabilities(f.believed) + log_likelihood,
+            log_predicted=imm.log_probabilities(f.posterior) + log_likelihood,
             innovation=innovation,
             log_squared=log_squared,
             log_likelihood=log_likelihood,
@@ -155,7 +155,7 @@ class KalmanNetBank(ClassBank):
             used=used,
             used_counts=used_counts,
             refused_counts=refused_counts,
-            expected=f.believed,
+            expected=f.posterior,
         )
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
@@ -195,7 +195,7 @@ class KalmanNetBank(ClassBank):
             covariance=covariance,
             log_predicted=log_predicted,
             probabilities=bank_probabilities("evidence", a[:classes], log_predicted, esm, EVIDENCE, xp),
-            believed=imm.mode_posterior(log_predicted, esm),
+            posterior=imm.mode_posterior(log_predicted, esm),
             gain_covariance=gain_covariance,
             action=a,
         )

@@ -59,7 +59,7 @@ class RadarEsmTracking(RadarEsmProblem):
 
     The agent observes the innovations of the filters and the ESM decisions, and weights the classes. Zero
     ``evidence`` is the paper's algorithm. In order (8)-(10): every filter predicts and updates with the radar
-    measurement under the class at the previous scan; the weights in force times the radar likelihoods go
+    measurement under the class at the previous scan; the last weights times the radar likelihoods go
     through the class transition, and the filters mix on them; the agent observes the result; the ESM
     decision is the last factor, and the action gives P(s(k)) given everything to k. Evidence is added to the
     weights of this scan only: Bayes' rule continues from its own posterior. ``mode`` and ``weights`` replace

@@ -104,7 +104,7 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
         """Names of the components of the action."""
         return self.hypotheses
 
-    # --- what the agent is shown
+    # --- the agent's observation
 
     @property
     def blocks(self) -> Sequence[Block]:

@@ -327,7 +327,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         Args:
             state: after the measurement before.
             measurement: that arrives.
-            factors: of what is expected. Probabilities need not sum to one with them; then neither the log-likelihood
+            factors: on the prior. Probabilities need not sum to one with them; then neither the log-likelihood
                 nor the NIS is that of a density.
         """
         xp, task, S, memory = self.xp, self.task, self.task.satellites, state.hypotheses

@@ -65,7 +65,7 @@ class HypothesesState(NamedTuple):
 class FaultHypothesesBank(SettingsBank, SatelliteBank):
     """Bank of ``hypotheses``: the bank over motion and faults with factors on probabilities and noises."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultHypotheses
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultHypotheses
     hypotheses: Sequence[str] = (*HYPOTHESES, "begun")
 
     @property
@@ -128,26 +128,26 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
         )
 
     def add_observed(
-        self, state: HypothesesState, found: Posterior, measurement: Measurement
+        self, state: HypothesesState, result: Posterior, measurement: Measurement
     ) -> HypothesesState:
         """Return the state with innovation statistics, and probabilities before and after a measurement, filled in."""
         xp, task = self.xp, self.task
-        log_predicted = imm.log_probabilities(found.predicted)
-        change = found.squares / self._present(measurement) - state.average_nis
-        memory = found.after.hypotheses
+        log_predicted = imm.log_probabilities(result.predicted)
+        change = result.squares / self._present(measurement) - state.average_nis
+        memory = result.after.hypotheses
         return state._replace(
-            likelihood=found.after.likelihood,
+            likelihood=result.after.likelihood,
             log_predicted=log_predicted,
-            log_likelihood=found.log_likelihoods,
-            nis=found.squares,
+            log_likelihood=result.log_likelihoods,
+            nis=result.squares,
             average_nis=state.average_nis + (1.0 / self.parameters.averaging_measurements) * change,
-            repeated=xp.astype(found.repeated, xp.float64)
+            repeated=xp.astype(result.repeated, xp.float64)
             * measurement.available[task.sensors[2].readings.start],
-            range_innovation=weighted_sum(found.predicted, found.residual[task.tracked]),
-            expected=imm.mode_posterior(log_predicted, found.log_likelihoods),
+            range_innovation=weighted_sum(result.predicted, result.residual[task.tracked]),
+            expected=imm.mode_posterior(log_predicted, result.log_likelihoods),
             range_error=weighted_sum(memory.probabilities, memory.means[gnss_ins.SIZE :]),
             noisy=1.0 - memory.levels[0],
-            between=xp.astype(found.between, xp.float64),
+            between=xp.astype(result.between, xp.float64),
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:

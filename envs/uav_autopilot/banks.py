@@ -117,7 +117,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
             Block(
                 "control",
                 lambda _, measurement: unit * measurement.control,
-                "the control in force over the output sensor's sigma",
+                "the current control over the output sensor's sigma",
                 compression=SIGNED_LOG,
             ),
             Block(
@@ -134,7 +134,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
                 compression=STORED_AS_LOG,
             ),
             availability_block(
-                "1 where the sensor answered, 0 in a dropout", parts=sensors, over_interval="mean"
+                "1 where the sensor gave a reading, 0 in a dropout", parts=sensors, over_interval="mean"
             ),
             clock_block(self.xp, horizon),
             self.action_block,

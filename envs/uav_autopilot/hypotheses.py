@@ -62,7 +62,7 @@ class HypothesesState(NamedTuple):
 class HypothesesBank(SettingsBank, AutopilotBank):
     """Bank of ``hypotheses``: the bank over noise levels with factors on its weights and noises."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = LevelBank
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = LevelBank
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -150,7 +150,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         return ordered_sum(measurement.available) > 0.0
 
     def add_observed(
-        self, state: HypothesesState, found: Levels, measurement: Measurement
+        self, state: HypothesesState, result: Levels, measurement: Measurement
     ) -> HypothesesState:
         """Return the state with the joint innovation, and the probabilities after the readings, filled in."""
         xp, bank, rows, h = self.xp, self.own, self.own.rows, state.own.hypotheses
@@ -172,16 +172,16 @@ class HypothesesBank(SettingsBank, AutopilotBank):
                 for a, noise in zip(rows, noises, strict=True)
             ]
         )
-        p = found.hypotheses.probability
+        p = result.hypotheses.probability
         n = len(self.task.components)
         compared: HypothesesState = self.compare(state, measurement, readings, S)
         return compared._replace(
-            likelihood=found.likelihood,
+            likelihood=result.likelihood,
             log_trace=xp.log(ordered_sum(self.trace_weights[i] * P[i, i] for i in range(n))),
             predicted=self.group(whole.shares),
             probabilities=self.group(p),
             entropy=-ordered_sum(p * imm.log_probabilities(p)) / math.log(p.shape[0]),
-            sensor_levels=self.expect_levels(found.hypotheses),
+            sensor_levels=self.expect_levels(result.hypotheses),
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:

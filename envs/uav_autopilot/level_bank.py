@@ -169,14 +169,14 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         chances = numpy.full(len(factors), 1.0 / len(factors))
         nearest = numpy.arange(len(factors)) == numpy.abs(numpy.log(factors)).argmin()
         kept = (1.0 - prior.kept) * chances + prior.kept * nearest
-        believed = numpy.concatenate(
+        level_shares = numpy.concatenate(
             [kept[:, None], numpy.repeat(chances[:, None], each - 1, axis=1)], axis=1
         )
         squared = numpy.repeat(factors[:, None] ** 2, each, axis=1)
         squared[:, 0] = 1.0
-        squared, believed = (numpy.tile(values, (1, self.groups)) for values in (squared, believed))
+        squared, level_shares = (numpy.tile(values, (1, self.groups)) for values in (squared, level_shares))
         self.levels: Array = constant(chances)[:, None, None]
-        self.believed: Array = constant(believed)[:, :, None]
+        self.level_shares: Array = constant(level_shares)[:, :, None]
         self.variances: list[Array] = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
         self.wide: list[float] = [R * prior.outlier_factor**2 for R in task.sensor_variances]
         settings = {"gusts": 1.1, "designed": 1.25, "process": 2.0}
@@ -194,7 +194,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
             xp.stack([mean] * self.probability.shape[0], axis=1),
             self.start_covariance + none,
             self.probability + none,
-            tuple(self.believed + none for _ in self.rows),
+            tuple(self.level_shares + none for _ in self.rows),
         )
         return Levels(initial.mean, initial.covariance, Likelihood.unknown(none), hypotheses)
 

@@ -17,7 +17,7 @@ class SensorInput(LiveInput):
         values = {
             "reading": f"of each sensor ({sensors}) in the unit of its coordinate; NaN in a dropout",
             "command": "in the unit of the output",
-            "control": "in force since the previous measurement: the value that was fed back",
+            "control": "control since the previous measurement: the value that was fed back",
         }
         return values, {"command": "at the start, in the unit of the output"}
 

@@ -121,7 +121,7 @@ class UavAutopilotParameters(TaskParameters):
     step_size: float = 0.0
     """Step of the command, in units of the output."""
     step_time: int = parameter(1, at_least=1)
-    """Measurement from which the step is in force."""
+    """First measurement with the step."""
     command_amplitude: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Range of the size of random manoeuvres, in units of the output; zero: none."""
     command_period: int = parameter(150, at_least=1)
