@@ -114,7 +114,7 @@ def _is_missed(moment: Moment) -> Array | None:
 
 
 def _is_outlier(moment: Moment) -> Array | None:
-    """Return booleans ``(N,)``: whether a reading errs by more than ``LARGE_ERROR`` of its stated deviations."""
+    """Return booleans ``(N,)``: whether the error of a reading exceeds ``LARGE_ERROR`` stated standard deviations."""
     if moment.readings is None or moment.deviations is None:
         return None
     error = moment.xp.abs(moment.readings - moment.state)

@@ -126,7 +126,9 @@ class SettingsBank(Bank[Any, Any, Any]):
         return self.add_observed(state._replace(own=own), self.own.examine(own, measurement), measurement)
 
     def act(self, state: Any, measurement: Any, action: Array) -> Any:
-        """Update the filter with a measurement, its settings multiplied by the factors of the action."""
+        """Return the state updated with a measurement by the filter, its settings multiplied by the action's
+        factors.
+        """
         shown = self.xp.clip(self.xp.astype(action, self.xp.float64), -1.0, 1.0)
         logarithms = self.own.has_effect(measurement) * self.log_reach * shown
         own = self.own.update(state.own, FilterInput(measurement, None, logarithms))

@@ -62,26 +62,30 @@ class Draws:
         return values
 
     def unit(self, name: str, count: int | None = None) -> Array:
-        """Draw a quantity uniformly distributed on [0, 1)."""
+        """Draw values of a quantity, uniformly distributed on [0, 1), ``(N,)`` or ``(count, N)``."""
         return self._keep(name, self._rows(count))
 
     def uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Draw a quantity uniformly distributed between two limits."""
+        """Draw values of a quantity, uniformly distributed between two limits, ``(N,)`` or ``(count, N)``."""
         low, high = limits
         return self._keep(name, low + (high - low) * self._rows(count))
 
     def log_uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Draw a quantity between two positive limits whose logarithm is uniformly distributed."""
+        """Draw values whose logarithm is uniformly distributed between two positive limits, ``(N,)`` or ``(count,
+        N)``.
+        """
         low, high = limits
         return self._keep(name, low * self.xp.exp(math.log(high / low) * self._rows(count)))
 
     def integer(self, name: str, limits: Sequence[int], count: int | None = None) -> Array:
-        """Draw an integer from the first to the last limit, all equally probable, as floats."""
+        """Draw integers from the first to the last limit, all equally probable, as floats, ``(N,)`` or ``(count,
+        N)``.
+        """
         first, last = limits
         return self._keep(name, first + self.xp.floor((last - first + 1) * self._rows(count)))
 
     def event(self, name: str, probability: float, count: int | None = None) -> Array:
-        """Draw booleans that are true with a given probability."""
+        """Draw booleans that are true with a given probability, ``(N,)`` or ``(count, N)``."""
         return self._keep(name, self._rows(count) < probability)
 
     def category(self, name: str, thresholds: Sequence[Array]) -> Array:

@@ -207,7 +207,7 @@ class Disturbances:
     def split_noise(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
     ) -> dict[str, DisturbanceInput]:
-        """Split the random numbers of a measurement among the disturbances; return their inputs by name."""
+        """Return the inputs of all disturbances by name, with the random numbers of a measurement split among them."""
         steps, n, u = {}, 0, 0
         for part in self.parts:
             own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
@@ -249,7 +249,7 @@ class Disturbances:
         return changed, measurement
 
     def context(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """Return the random draws of all disturbances by name."""
+        """Return the random draws of all disturbances for the context of an episode, by name."""
         return {name: v for part in self.parts for name, v in part.context(states[part.name]).items()}
 
     def records(self, states: Mapping[str, Any]) -> dict[str, Array]:
@@ -293,7 +293,7 @@ class Outliers(Disturbance):
         return zero + 1.0
 
     def advance(self, state: Array, step: DisturbanceInput) -> Array:
-        """Draw whether this measurement is an outlier; return the factor on its standard deviations, ``(N,)``."""
+        """Return the drawn factor on this measurement's standard deviations, ``(N,)``: one, or that of an outlier."""
         if not self.probability:
             return state
         one = self.xp.ones_like(state)
@@ -388,7 +388,9 @@ class ColouredErrors(Disturbance):
         return normals, zero
 
     def complete(self, state: tuple[Array, Array], draws: Draws) -> ColouredErrorsState:
-        """Draw standard deviation and correlation time; return the process with stationary initial errors."""
+        """Return the process of the errors with drawn standard deviation and correlation time, stationary from the
+        start.
+        """
         normals, zero = state
         deviation, lasting = self.draw(draws, zero)
         process = GaussMarkov.sampled(deviation, lasting, self.interval, self.xp)

@@ -141,12 +141,12 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         return self.start(inputs.measurement)
 
     def predict(self, state: State, measurement: Measurement) -> State:
-        """Predict the state to the time of a measurement and compute its innovation; by default return it unchanged."""
+        """Return the state predicted to the time of a measurement, with its innovation; by default unchanged."""
         return state
 
     @abstractmethod
     def update(self, state: State, inputs: FilterInput) -> State:
-        """Update the predicted state with the measurement (step 4 of the clock).
+        """Return the state updated with the measurement to which it was predicted (step 4 of the clock).
 
         Args:
             state: after :meth:`predict`.
@@ -154,7 +154,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         """
 
     def step(self, state: State, inputs: FilterInput) -> State:
-        """Predict the state to a measurement and update it with that measurement, without an action."""
+        """Return the state predicted to a measurement and updated with it, without an action."""
         return self.update(self.predict(state, inputs.measurement), inputs)
 
     def mean(self, state: State) -> Array:
@@ -212,11 +212,11 @@ class Bank(Filter[TaskT, Measurement, State]):
 
     @abstractmethod
     def predict(self, state: State, measurement: Measurement) -> State:
-        """Predict the state to the time of a measurement and compute its innovations (step 2 of the clock)."""
+        """Return the state predicted to the time of a measurement, with the innovations (step 2 of the clock)."""
 
     @abstractmethod
     def act(self, state: State, measurement: Measurement, action: Array) -> State:
-        """Update the predicted state with the measurement, as the action directs (step 4 of the clock).
+        """Return the predicted state updated with the measurement as the action directs (step 4 of the clock).
 
         Args:
             state: after :meth:`predict`.
@@ -225,5 +225,5 @@ class Bank(Filter[TaskT, Measurement, State]):
         """
 
     def update(self, state: State, inputs: FilterInput) -> State:
-        """Update the predicted state with the measurement and the action of the input."""
+        """Return the predicted state updated with the measurement and the action of the input."""
         return self.act(state, inputs.measurement, inputs.action)

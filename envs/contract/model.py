@@ -165,7 +165,7 @@ class Model:
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Advance the truth, measure it, and predict the filter to the measurement (steps 1 and 2 of the clock).
+        """Return the episode at the next measurement, with the filter predicted to it (steps 1 and 2 of the clock).
 
         Args:
             episode: after :meth:`begin` or :meth:`act`.

@@ -153,7 +153,7 @@ class Task(TaskBase):
         """Compute the constants that world and banks share; an optional method of an environment's author."""
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
-        """Return the feedback of an estimate to the world, in a closed loop.
+        """Return the feedback to the world in a closed loop, computed from an estimate, such as a control command.
 
         A filter may return another one, see :meth:`.Filter.feedback`.
 

@@ -67,7 +67,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     @abstractmethod
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
-        """Advance the true state to the next measurement and return it with the readings (step 1 of the clock).
+        """Return the true state at the next measurement, and that measurement's readings (step 1 of the clock).
 
         Args:
             truth: at the previous measurement.

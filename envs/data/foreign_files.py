@@ -200,7 +200,7 @@ def _has(library: str) -> bool:
 
 
 def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **options: Any) -> Any:
-    """Parse a file in a subprocess with limits of memory and processor time, and return its plain values.
+    """Return the plain values of a file, parsed in a subprocess with limits of memory and processor time.
 
     Args:
         parser: name of one of :data:`.foreign_parsers.PARSERS`.

@@ -355,7 +355,7 @@ class _Bag(NamedTuple):
 
 
 def _open_bag(path: str) -> _Bag:
-    """Open a ROS bag with the library's type definitions; those in a bag would be compiled to code."""
+    """Return an open ROS bag with the library's type definitions; those in a bag would be compiled to code."""
     from rosbags.typesys import Stores, get_typestore
 
     reader: Any

@@ -155,7 +155,7 @@ class RecordedWorld(_ForeignWorld):
         )
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:
-        """Draw which recording each episode replays; return its position and its initial estimate."""
+        """Return a randomly drawn recording's position and initial estimate for each episode."""
         number = draws.integer("recording", (0, len(self.tables.first) - 1))
         first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
         initial = self._fill(self._initial, self.tables.initial, number)
@@ -239,7 +239,7 @@ class Feed:
         return ()
 
     def world(self, task: Task) -> "LiveWorld":
-        """Return the :class:`LiveWorld` of a task."""
+        """Return the world of live measurements that replaces a task's simulated world."""
         return LiveWorld(task, self.second_sensor)
 
 

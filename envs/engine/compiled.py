@@ -135,7 +135,7 @@ class CompiledModel(Model):
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Advance the truth, measure it, and predict the filter to the measurement (steps 1 and 2 of the clock)."""
+        """Return the episode at the next measurement, with the filter predicted to it (steps 1 and 2 of the clock)."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))

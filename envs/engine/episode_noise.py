@@ -31,7 +31,7 @@ BLOCKS_OF_SEEDS = 64
 
 
 def draw_identity(generator: numpy.random.Generator) -> numpy.ndarray:
-    """Draw the identity of an episode, two random 64-bit integers, ``(2,)`` uint64."""
+    """Return the identity of a new episode: two random 64-bit integers, ``(2,)`` uint64."""
     # The generator's raw words: its methods take ten times longer for the same numbers.
     found: numpy.ndarray = generator.bit_generator.random_raw(2)
     return found

@@ -55,15 +55,15 @@ class EpisodeStepper(Protocol):
     """
 
     def begin(self, identities: numpy.ndarray, noise: EpisodeNoise, others: Any) -> tuple[Array, Array]:
-        """Start episodes in all lanes up to their first measurement; return the uniform and normal numbers of the
-        start.
-        """
+        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used."""
         ...
 
     def begin_some(
         self, lanes: numpy.ndarray, identities: numpy.ndarray, noise: EpisodeNoise, others: Any
     ) -> tuple[Array, Array]:
-        """Start episodes in some lanes up to their first measurement; return the random numbers of the start."""
+        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers
+        used.
+        """
         ...
 
     def load(self, episode: Episode, shown: Array = None) -> None:
@@ -137,7 +137,7 @@ class ModelStepper:
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()
     ) -> tuple[Array, Array]:
-        """Start episodes in all lanes up to their first measurement; return the random numbers of the start."""
+        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used."""
         noise.put(identities)
         start = self._start(noise)
         for each in (self, *others):
@@ -161,7 +161,9 @@ class ModelStepper:
         noise: EpisodeNoise,
         others: "Sequence[ModelStepper]" = (),
     ) -> tuple[Array, Array]:
-        """Start episodes in some lanes up to their first measurement; return the random numbers of the start."""
+        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers
+        used.
+        """
         noise.put(identities)
         start = self._start(noise)
         for each in (self, *others):

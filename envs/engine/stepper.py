@@ -178,7 +178,7 @@ class Stepper:
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Start episodes in all lanes, of this and the other steppers, up to their first measurement.
+        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used.
 
         Args:
             identities: of the episodes, ``(2, lanes)``, see :mod:`.episode_noise`; the other lanes are padding.
@@ -235,7 +235,7 @@ class Stepper:
         noise: EpisodeNoise,
         others: "Sequence[Stepper]" = (),
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Start episodes in some lanes, of this and the other steppers, up to their first measurement.
+        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers used.
 
         Args:
             lanes: numbers of the lanes, ascending.
@@ -315,9 +315,10 @@ class Stepper:
     def _let_pass(
         self, turns: Sequence[Sequence[Call]], noise: EpisodeNoise, others: "Sequence[Stepper]"
     ) -> list[tuple[Call, int, int]]:
-        """Bind the temporary values of calls to memory of one tile: noise, and filters between update and prediction.
+        """Bind the temporary values of calls to memory of one tile of lanes, and return their places.
 
-        Returns the places, as of :class:`.CallSequence`.
+        Temporary are the noise, and the filters between update and prediction. The places are those of
+        :class:`.CallSequence`.
         """
         row = noise.call_of_each().arrays[2]
         places = {

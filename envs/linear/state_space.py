@@ -110,7 +110,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
     def begin(self, draws: Draws, normals: Array) -> tuple[StateSpaceTruth, Initial]:
-        """Draw the initial state and the noise factors of the episode; return the truth and the initial estimate."""
+        """Return the drawn truth (initial state, noise factors of the episode) and the initial estimate."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
         process, measurement = (
             draw_between(draws.log_uniform, name, limits) + zero
@@ -135,7 +135,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def advance(
         self, truth: StateSpaceTruth, noise: Array, feedback: Any
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Switch the model, move the state to the next measurement and measure it."""
+        """Return the truth at the next measurement, possibly under another model, and that measurement."""
         xp, n = self.xp, self.states
         uniforms = noise[self.normals :]
         hypothesis = truth.hypothesis
@@ -170,7 +170,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def _delay(
         self, truth: StateSpaceTruth, received: StateSpaceMeasurement, uniforms: Array
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Delay the values of some sensors, and add the delayed values that arrive at this measurement.
+        """Return truth and measurement with some sensors' values delayed, and delayed values that arrive now added.
 
         Args:
             truth: truth at this measurement, with the delayed values of earlier ones.

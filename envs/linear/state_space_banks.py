@@ -132,7 +132,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         return self.equations.sensor_noise(mean, measurement)
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Predict to a measurement, and compute the innovation statistics with the noises of the last action."""
+        """Return the state predicted to a measurement, with innovation statistics for the last action's noises."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
@@ -191,7 +191,7 @@ class StateSpaceNoiseBank(StateSpaceBank):
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with Q and R scaled by the action."""
+        """Return the state updated with Q and R scaled by the action."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
@@ -210,7 +210,7 @@ class StateSpaceGainBank(StateSpaceBank):
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the Kalman gain multiplied by the factors of the action."""
+        """Return the state updated with the Kalman gain multiplied by the action's factors."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
@@ -310,7 +310,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         return outer(scale, scale) * matrix
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Predict with the offset of the last action, and compute the innovation statistics."""
+        """Return the state predicted with the last action's offset, with the innovation statistics."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
@@ -318,7 +318,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the noises, gain factors and offset that the network's action sets."""
+        """Return the state updated with the noises, gain factors and offset that the network's action sets."""
         action = self.xp.clip(action, -1.0, 1.0)
         Q = self.process_noise(state.mean, measurement, action)
         received = self.receive(state, measurement, action)
@@ -434,7 +434,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def predict(self, state: Mixture, measurement: StateSpaceMeasurement) -> Mixture:
-        """Mix, predict and update every hypothesis (IMM); none of that depends on the action."""
+        """Return the IMM's hypotheses mixed, predicted and updated with the measurement, independent of the action."""
         xp = self.xp
         chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
         means, covariances = imm.mix(self._align(state.means), state.covariances, chain.mixing)
@@ -458,7 +458,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         return unwrap(means, means[:, :1], self.task.periods)
 
     def act(self, state: Mixture, measurement: StateSpaceMeasurement, action: Array) -> Mixture:
-        """Weight the hypotheses with the evidence of the action, and combine them into one estimate."""
+        """Return the hypotheses weighted with the evidence of the action and combined into one estimate."""
         probabilities = bank_probabilities(
             self.control,
             action,

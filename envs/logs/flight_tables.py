@@ -102,7 +102,7 @@ class ColumnNames(frozenset[str]):
     prefix: str
 
     def __new__(cls, names: Iterable[str], prefix: str = "") -> "ColumnNames":
-        """Create the set from names and a prefix."""
+        """Return a set of the names, with a prefix of further names."""
         found = super().__new__(cls, names)
         found.prefix = prefix
         return found

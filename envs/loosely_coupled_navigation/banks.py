@@ -317,7 +317,7 @@ class NoiseBank(KalmanBucyBank):
         return scale * measurement.reported_deviation * measurement.reported_deviation
 
     def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
-        """Add the INS increment less the estimated rate errors; compute innovations with the last action's noises."""
+        """Return the state predicted by the INS increment less rate errors, with innovation statistics."""
         s = self.parameters.sampling
         position = state.position + measurement.increment - (s.step * state.drift + s.drive * state.coloured)
         variance = self.predict_covariance(state, state.action).position
@@ -329,7 +329,7 @@ class NoiseBank(KalmanBucyBank):
         )
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
-        """Update with the Kalman gain that follows from the noises of the action."""
+        """Return the state updated with the Kalman gain that follows from the noises of the action."""
         innovation = state.seen.innovation
         action = self.xp.clip(action, -1.0, 1.0)
         R = self.receiver_variance(measurement, action)
@@ -353,7 +353,7 @@ class NoiseBank(KalmanBucyBank):
         return self.eye * state.covariance.position
 
     def records(self, state: Augmented, measurement: Measurement) -> dict[str, Array]:
-        """Return the NIS and log-likelihood to record, by name; NaN without a measurement."""
+        """Return the values to record at a measurement, by name: NIS and log-likelihood, NaN without a fix."""
         return self.consistency(state, measurement)
 
 
@@ -384,7 +384,7 @@ class GainBank(KalmanBucyBank):
         return GainState(initial.mean, variance, self.no_innovations(zero), zero, zero)
 
     def predict(self, state: GainState, measurement: Measurement) -> GainState:
-        """Add the increment of the INS to the position, and compute the innovation statistics."""
+        """Return the state predicted by the INS increment, with innovation statistics."""
         position = state.position + measurement.increment
         variance = ins_gnss.predict_plain(state.variance, *self.error_model)
         seen = self.update_innovations(state.seen, measurement, position, variance.assumed)
@@ -412,7 +412,7 @@ class GainBank(KalmanBucyBank):
         return numpy.where(gain <= smallest, -1.0, action)
 
     def act(self, state: GainState, measurement: Measurement, action: Array) -> GainState:
-        """Update with the gain that the action sets; without a measurement the gain is zero."""
+        """Return the state updated with the gain that the action sets; without a measurement the gain is zero."""
         action = self.xp.clip(action, -1.0, 1.0)
         gain = measurement.available * self.gain(action)
         R = measurement.reported_deviation * measurement.reported_deviation
@@ -435,7 +435,9 @@ class GainBank(KalmanBucyBank):
         return self.eye * state.variance.modelled
 
     def records(self, state: GainState, measurement: Measurement) -> dict[str, Array]:
-        """Return the NIS, log-likelihood (NaN without a measurement), gain and K to record, by name."""
+        """Return the values to record at a measurement, by name: NIS, log-likelihood (NaN without a fix), gain and
+        K.
+        """
         found = self.consistency(state, measurement)
         for i, ending in enumerate([f"_{axis}" for axis in self.axes] or [""]):
             found[f"gain{ending}"] = state.gain[i]
@@ -488,7 +490,7 @@ class SchemeBank(KalmanBucyBank):
         )
 
     def predict(self, state: Schemes, measurement: Measurement) -> Schemes:
-        """Predict every filter by the increment of the INS; the augmented one subtracts its rate errors."""
+        """Return every filter predicted by the INS increment; the augmented one subtracts its rate errors."""
         xp, s = self.xp, self.parameters.sampling
         position = state.position + measurement.increment
         corrected = position[2] - (s.step * state.drift + s.drive * state.coloured)
@@ -505,7 +507,7 @@ class SchemeBank(KalmanBucyBank):
         )
 
     def act(self, state: Schemes, measurement: Measurement, action: Array) -> Schemes:
-        """Update each filter with its own Kalman gain, and set the weights of the action."""
+        """Return every filter updated with its own Kalman gain, and the weights of the action."""
         xp, available, innovation = self.xp, measurement.available, state.seen.innovation
         R = measurement.reported_deviation * measurement.reported_deviation
         plain = state.plain_variance
@@ -541,7 +543,7 @@ class SchemeBank(KalmanBucyBank):
         return imm.combine(position, self.eye[..., None] * variance, state.weights)[1]
 
     def records(self, state: Schemes, measurement: Measurement) -> dict[str, Array]:
-        """Return the weights, NIS, degrees of freedom and the mixture's log-likelihood to record, by name.
+        """Return the values to record at a measurement, by name: weights, NIS, and the mixture's log-likelihood.
 
         They are NaN without a measurement. The NIS is the weighted mean of the filters', or that of the selected
         filter.

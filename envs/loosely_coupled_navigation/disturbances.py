@@ -73,7 +73,7 @@ class NoiseChanges(Disturbance):
     causes = (Cause("unreported noise", "where the receiver is noisier than it reports", _is_unreported),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Levels:
-        """Draw the noise levels, the times of their changes, and the reported levels."""
+        """Return the drawn noise levels of the receiver, the times of their changes, and the reported levels."""
         xp, p = self.xp, self.parameters
         factor = draws.log_uniform("receiver_factor", p.receiver_factor)
         changes = draws.integer("noise_changes", p.noise_changes)
@@ -91,7 +91,7 @@ class NoiseChanges(Disturbance):
         return Levels(xp.stack(levels), xp.stack(reported), change, levels[0], reported[0])
 
     def switch_off(self, state: Levels, calm: Array) -> Levels:
-        """Set the true noise to the reported one where ``calm``; the reports do not change."""
+        """Return the state with the true noise equal to the reported one where ``calm``."""
         return state._replace(true=self.xp.where(calm, state.reported, state.true))
 
     def advance(self, state: Levels, step: DisturbanceInput) -> Levels:
@@ -111,11 +111,11 @@ class NoiseChanges(Disturbance):
     def change_measurement(
         self, state: Levels, measurement: Any, step: DisturbanceInput
     ) -> tuple[Levels, Any]:
-        """Write the reported standard deviation into the measurement."""
+        """Return the state, and the measurement with the reported standard deviation filled in."""
         return state, measurement._replace(reported_deviation=state.report)
 
     def context(self, state: Levels) -> dict[str, Array]:
-        """Return the noise levels by name, and the measurements of their changes; -1 where there is none."""
+        """Return the context: noise levels, and the measurements of their changes (-1 where there is none), by name."""
         return {
             "receiver_levels": state.true,
             "reported_levels": state.reported,
@@ -139,18 +139,18 @@ class ReceiverColour(ColouredErrors):
         super().__init__(task, p.sampling_interval, p.axes, p.receiver_coloured[1] > 0.0)
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw the stationary standard deviation, m, and the correlation time, s, of the errors."""
+        """Return the drawn standard deviation, m, and correlation time, s, of the receiver's coloured errors."""
         p = self.parameters
         deviation = draw_between(draws.uniform, "receiver_coloured", p.receiver_coloured)
         lasting = draw_between(draws.log_uniform, "receiver_correlation_time", p.receiver_correlation_time)
         return zero + deviation, zero + lasting
 
     def change_reading(self, state: ColouredErrorsState, reading: Array) -> tuple[ColouredErrorsState, Array]:
-        """Return the fix with the correlated errors added."""
+        """Return the state, and the fix with the correlated errors added."""
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return the errors' decay from one measurement to the next and their driving noise, m, by name."""
+        """Return the context: decay of the errors between measurements, and their driving noise, m, by name."""
         return {"receiver_decay": state.process.decay, "receiver_kick": state.process.kick}
 
 
@@ -175,7 +175,9 @@ class _Once(Disturbance):
         )
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Spell:
-        """Draw whether it occurs, and its first and last measurement."""
+        """Return the drawn window of the disturbance: its first measurement and the first one after it, if it
+        occurs.
+        """
         xp, p = self.xp, self.parameters
         happens = draws.event(self.name, self.probability)
         first = number_at(draws.uniform(f"{self.name}_start", self.start), p)
@@ -188,7 +190,7 @@ class _Once(Disturbance):
         return state._replace(number=step.number)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the window by name: first measurement and first one after it; -1 where there is none."""
+        """Return the context: the disturbance's window of measurements (-1 where it does not occur), by name."""
         return {self.name: _shown(state.window)}
 
 
@@ -202,7 +204,7 @@ class Outage(_Once):
     )
 
     def change_measurement(self, state: Spell, measurement: Any, step: DisturbanceInput) -> tuple[Spell, Any]:
-        """Remove the fix from the measurement within the outage."""
+        """Return the state, and the measurement without a fix during the outage."""
         if not self.probability:
             return state, measurement
         out = is_within(step.number, state.window)
@@ -214,7 +216,7 @@ class _Hidden(_Once):
     """Receiver disturbance that the measurement does not report."""
 
     def switch_off(self, state: Spell, calm: Array) -> Spell:
-        """Remove the disturbance from episodes where ``calm``."""
+        """Return the state without the disturbance in the episodes where ``calm``."""
         return state._replace(window=self.xp.where(calm, NEVER, state.window))
 
 
@@ -225,19 +227,19 @@ class Jamming(_Hidden):
     causes: ClassVar[tuple[Cause, ...]] = (_within("jamming", "under jamming"),)
 
     def complete(self, state: Spell, draws: Draws) -> Spell:
-        """Draw the factor on the standard deviation."""
+        """Return the state with the drawn jamming factor on the receiver's standard deviation."""
         factor = draw_between(draws.log_uniform, "jamming_factor", self.parameters.jamming_factor)
         return state._replace(strength=self.xp.sqrt(state.strength + factor))
 
     def change_deviations(self, state: Spell, deviations: Array) -> Array:
-        """Return the deviations, multiplied by the factor under jamming."""
+        """Return the standard deviations, multiplied by the jamming factor during the jamming."""
         if not self.probability:
             return deviations
         jammed = is_within(state.number, state.window)
         return self.xp.where(jammed, state.strength * deviations, deviations)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the window and the factor on the standard deviation, by name."""
+        """Return the context: the window of the jamming, and its factor on the standard deviation, by name."""
         return {**super().context(state), "jamming_gain": state.strength}
 
 
@@ -248,21 +250,21 @@ class Spoofing(_Hidden):
     causes: ClassVar[tuple[Cause, ...]] = (_within("spoofing", "under spoofing"),)
 
     def complete(self, state: Spell, draws: Draws) -> Spell:
-        """Draw the rate of the drift, m/s."""
+        """Return the state with the drawn rate of the spoofed drift, m/s."""
         rate = draw_between(draws.uniform, "spoofing_rate", self.parameters.spoofing_rate)
         return state._replace(strength=state.strength + rate)
 
     def pull(self, state: Spell) -> Array:
-        """Return the error of the fix on every axis at this measurement, m, ``(N,)``."""
+        """Return the spoofing error of the fix on every axis at this measurement, m, ``(N,)``."""
         run = (state.strength * self.parameters.sampling_interval) * (state.number - state.window[0] + 1.0)
         return self.xp.where(is_within(state.number, state.window), run, 0.0)
 
     def change_reading(self, state: Spell, reading: Array) -> tuple[Spell, Array]:
-        """Return the fix with the spoofing error added."""
+        """Return the state, and the fix with the spoofing error added."""
         return state, reading + self.pull(state) if self.probability else reading
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the window and the rate, m/s, by name."""
+        """Return the context: the window of the spoofing and its rate, m/s, by name."""
         return {**super().context(state), "spoofing_rate": state.strength}
 
 

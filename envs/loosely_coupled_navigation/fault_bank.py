@@ -227,7 +227,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return free, pulled
 
     def merge(self, begun: Hypotheses, pulled: Hypotheses, staying: Array, hazard: Array) -> Hypotheses:
-        """Merge the hypotheses without a pull with the ended ones, by their moments; S = 4, ``(J - 1, 1)``."""
+        """Return the hypotheses without a pull merged with the ended ones, by their moments; S = 4, ``(J - 1, 1)``."""
         xp = self.xp
         weights = xp.concat([begun.weights * staying, pulled.weights * hazard], axis=1)
         mean = xp.concat([begun.mean, pulled.mean], axis=3)[:4]
@@ -244,7 +244,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return Hypotheses(centre[:, :, :, None], faults.from_matrix(moments[:, :, :, None]), total[:, None])
 
     def predict(self, state: FaultState, measurement: Measurement) -> FaultState:
-        """Start and end pulls, and predict hypotheses and receiver levels to the time of a measurement."""
+        """Return the state predicted to a measurement, after pulls have begun and ended."""
         memory = state.memory
         free, pulled = self.change(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
@@ -289,7 +289,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return predicted, self.weigh(predicted, measurement, evidence, receiver, levels)
 
     def update(self, state: FaultState, inputs: FilterInput) -> FaultState:
-        """Weight and update the predicted hypotheses with a fix, and compute the moments of the bank."""
+        """Return the state with the predicted hypotheses weighted and updated by a fix, and the bank's moments."""
         predicted, measurement = state.memory, inputs.measurement
         if inputs.action is None:
             weighing = self.weigh(predicted, measurement)
@@ -451,7 +451,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return Hypotheses(mean, faults.update_fault(h.covariance, along, weight), h.weights)
 
     def join(self, values: Sequence[Array], before: int) -> Array:
-        """Return values of both groups of hypotheses along one axis ``H`` after ``before`` leading axes."""
+        """Return an array ``(..., H, N)`` of values of both groups of hypotheses, with ``before`` leading axes."""
         return self.xp.concat(
             [self.xp.reshape(each, (*each.shape[:before], -1, each.shape[-1])) for each in values],
             axis=before,

@@ -73,12 +73,12 @@ class KalmanNetBank(NoiseBank):
         return state._replace(action=self.xp.concat([state.action, state.action]))
 
     def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
-        """Predict as under control ``noise``, whose action is the first part of this one."""
+        """Return the state predicted as under control ``noise``, whose action is the first part of this one."""
         predicted = super().predict(state._replace(action=state.action[: len(NOISES)]), measurement)
         return predicted._replace(action=state.action)
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
-        """Update with the noises and the gain that the action sets."""
+        """Return the state updated with the noises and the gain that the action sets."""
         xp, innovation = self.xp, state.seen.innovation
         a = xp.clip(action, -1.0, 1.0)
         P = self.predict_covariance(state, a[: len(NOISES)])

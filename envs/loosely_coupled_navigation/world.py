@@ -91,7 +91,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Draw noise levels, disturbances and rate errors; return truth and initial estimate, which agree in
+        """Return the drawn truth (noise levels, disturbances, rate errors) and the initial estimate, equal in
         position.
         """
         xp, p = self.xp, self.parameters
@@ -154,7 +154,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         )
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Advance the motion by one sampling interval, and read INS and receiver.
+        """Return the truth after one sampling interval, and the readings of INS and receiver.
 
         The rows of ``noise`` are: coloured, white, the receiver's white, and those of the disturbances.
         """
@@ -206,7 +206,9 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return ordered_sum(error * error) / self.parameters.receiver_variance
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return whether there is a fix, its true and its reported noise, by name."""
+        """Return the values to record at a measurement, by name: whether there is a fix, its true and reported
+        noise.
+        """
         return {
             "available": truth.available,
             "receiver_deviation": truth.deviation,
@@ -214,7 +216,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return noise levels, disturbances and the receiver's current state, by name.
+        """Return the context by name: noise levels, disturbances and the receiver's current state.
 
         Times are numbers of measurements: the first in a window and the first one after it.
         """

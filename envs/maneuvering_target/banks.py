@@ -252,7 +252,7 @@ class GainBank(RadarBank):
         )
 
     def predict(self, state: AlphaBeta, measurement: Measurement) -> AlphaBeta:
-        """Predict position, velocity and covariance to the scan, and compute the innovation statistics."""
+        """Return the state predicted to the scan, with innovation statistics."""
         xp, f, interval = self.xp, state, self.interval(measurement)
         predicted = alpha_beta.predict(f.mean[:2], f.mean[2:], interval)
         covariance = alpha_beta.predict_covariance(f.covariance, interval)
@@ -285,7 +285,7 @@ class GainBank(RadarBank):
         return (alpha - 0.5 * (low + high)) / (0.5 * (high - low))
 
     def act(self, state: AlphaBeta, measurement: Measurement, action: Array) -> AlphaBeta:
-        """Update with the position gain of the action and the velocity gain beta that follows from it."""
+        """Return the state updated with the position gain of the action and the velocity gain beta that follows."""
         xp, f, alpha, elapsed = self.xp, state, self.alpha(action), self.time_since_last(measurement)
         beta = alpha_beta.benedict_bordner_beta(alpha)
         updated = alpha_beta.update(f.predicted, f.mean[2:], f.innovation, alpha, beta, elapsed)
@@ -323,7 +323,7 @@ class GainBank(RadarBank):
         )
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
-        """Return the NIS and log-likelihood (NaN without a measurement) and the gain to record, by name."""
+        """Return the values to record at a scan, by name: NIS, log-likelihood (NaN without a measurement), gain."""
         nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
         density = -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi)
         return {
@@ -405,7 +405,7 @@ class FilterBank(RadarBank):
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Mix the filters, predict them to the scan, and compute the likelihood of the measurement in each."""
+        """Return the filters mixed, predicted to the scan, with the likelihood of the measurement in each."""
         xp, bank, interval = self.xp, state, self.interval(measurement)
         prediction = imm.predict_mode_probabilities(self.transition, bank.probabilities)
         mean, covariance = imm.mix(bank.mean, bank.covariance, prediction.mixing)
@@ -435,7 +435,7 @@ class FilterBank(RadarBank):
         )
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Update every filter with its fixed gain, and set the weights that follow from the action."""
+        """Return the filters updated with their fixed gains, and the weights that follow from the action."""
         probabilities = bank_probabilities(
             self.control,
             action,
@@ -448,7 +448,7 @@ class FilterBank(RadarBank):
         return self._in_force(state, measurement, after._replace(probabilities=probabilities))
 
     def _update_filters(self, state: Filters, measurement: Measurement, alpha: Array, beta: Array) -> Filters:
-        """Update every filter with its gains."""
+        """Return the filters updated with position gains alpha and velocity gains beta."""
         elapsed = self.time_since_last(measurement)
         updated = alpha_beta.update(state.mean[:2], state.mean[2:], state.innovation, alpha, beta, elapsed)
         covariance = alpha_beta.update_joint_covariance(
@@ -474,9 +474,7 @@ class FilterBank(RadarBank):
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return NIS and log-likelihood of the combined prediction (NaN without a measurement) and the weights, by
-        name.
-        """
+        """Return the values to record at a scan, by name: NIS, log-likelihood (NaN without a measurement), weights."""
         predicted = self.xp.exp(state.log_predicted)
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
         density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
@@ -510,7 +508,9 @@ class GainsBank(FilterBank):
         )
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Update filters with gains ``logit alpha = logit gain + gain_logits a``, and weight them by Bayes' rule."""
+        """Return the filters updated with gains ``logit alpha = logit gain + gain_logits a``, weighted by Bayes'
+        rule.
+        """
         xp = self.xp
         moved = self.logit + self.parameters.gain_logits * xp.clip(action, -1.0, 1.0)
         alpha = 1.0 / (1.0 + xp.exp(-moved))

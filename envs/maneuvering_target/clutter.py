@@ -64,7 +64,7 @@ class Clutter(Disturbance):
         return parameters.cluttered
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ClutterState:
-        """Draw the density of false plots, per square metre."""
+        """Return the state with the drawn density of false plots, per square metre."""
         density = 1e-6 * draws.uniform("clutter_density", self.parameters.clutter_density)
         return ClutterState(
             density, 0.0 * density, Echo(self.xp.stack([zero, zero]), 0.0 * density), 0.0 * density
@@ -87,7 +87,7 @@ class Clutter(Disturbance):
     def change_measurement(
         self, state: ClutterState, measurement: Any, step: DisturbanceInput
     ) -> tuple[ClutterState, Any]:
-        """Add false plots to that of the target, and associate one of all with the filter's track."""
+        """Return the state, and the measurement with false plots added and one of all plots taken for the target."""
         xp, p, uniforms = self.xp, self.parameters, step.uniforms
         track, interval, echo = (
             step.feedback,
@@ -141,9 +141,9 @@ class Clutter(Disturbance):
         return centre, carried + left * identity
 
     def context(self, state: ClutterState) -> dict[str, Array]:
-        """Return the density of false plots per square kilometre, by name."""
+        """Return the context: the density of false plots per square kilometre, by name."""
         return {"clutter_density": 1e6 * state.density}
 
     def records(self, state: ClutterState) -> dict[str, Array]:
-        """Return whether the plot associated with the track is false, by name."""
+        """Return the values to record at a scan, by name: whether the plot taken for the target is false."""
         return {"false_association": state.false_association}

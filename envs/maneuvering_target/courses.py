@@ -39,7 +39,7 @@ class Course(ABC):
 
     @abstractmethod
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
-        """Draw the flight of each episode; return its constants and the motion at the start.
+        """Return the drawn constants of each episode's flight, and the motion at the start.
 
         Args:
             draws: what fixes the scenario of each episode.
@@ -67,8 +67,8 @@ class Course(ABC):
         return self.advance(flight, scan - early, before)
 
     def carry(self, flight: Any, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
-        """Propagate a deviation of the velocity from the previous scan to a scan; return those of position and
-        velocity.
+        """Return deviations of position and velocity at a scan, propagated from a velocity deviation at the previous
+        one.
 
         A coordinated turn rotates the deviation, thrust does not. By default, without known turn rates, it is not
         rotated.
@@ -165,7 +165,9 @@ class Maneuvered(Course):
     def carry(
         self, flight: Maneuvers, scan: Array, early: tuple[Array, Array] | None, velocity: Array
     ) -> Motion:
-        """Propagate a velocity deviation to a scan, rotated at the turn rates of the scan periods in between."""
+        """Return deviations at a scan: a velocity deviation, rotated at the turn rates of the scan periods in
+        between.
+        """
         if not self.turns:
             return super().carry(flight, scan, early, velocity)
         nowhere = 0.0 * velocity
@@ -190,9 +192,9 @@ class Maneuvered(Course):
         return ordered_sum(values[..., slot, :] for slot in range(values.shape[-2]))
 
     def context(self, flight: Maneuvers, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the first and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre, by name.
+        """Return the context by name: first and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre.
 
-        It contains whether one is flown at present.
+        It also contains whether one is flown at present.
         """
         xp = self.xp
         # A manoeuvre that is not flown lies beyond the end.
@@ -224,7 +226,7 @@ class StatedManeuver(Maneuvered):
 
 
 def _draw_start(draws: Draws, p: ManeuveringTargetParameters) -> Motion:
-    """Draw the position and velocity at the start of a random flight."""
+    """Return the drawn position and velocity at the start of a random flight."""
     xp = draws.xp
     start_range, azimuth = draws.uniform("start_range", p.start_range), draws.uniform("azimuth", CIRCLE)
     speed, course = draws.uniform("speed", p.speed), draws.uniform("course", CIRCLE)
@@ -238,7 +240,7 @@ class RandomManeuvers(Maneuvered):
     turns = True
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
-        """Draw the start and the manoeuvres of each flight."""
+        """Return the drawn manoeuvres of each flight, and the motion at its start."""
         xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
         slots = p.maneuver_count[1]
         position, velocity = _draw_start(draws, p)
@@ -286,7 +288,7 @@ class RandomStraight(Course):
     """Random straight flights: start, speed and direction, no manoeuvre."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[None, Motion]:
-        """Draw the start of each flight; one number more is used for the number of manoeuvres, zero."""
+        """Return None, since the flight has no constants, and the drawn motion at its start."""
         motion = _draw_start(draws, self.parameters)
         draws.unit("maneuver_count")
         return None, motion
@@ -339,7 +341,7 @@ class LegCourse(Course):
     """Flights of stated legs, with start, direction, side and durations drawn around the stated ones."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Legs, Motion]:
-        """Draw start, direction, side and durations of each flight."""
+        """Return the legs of each flight, with drawn start, direction, side and durations, and the initial motion."""
         xp, p = self.xp, self.parameters
         spread, course = p.start_spread, math.radians(p.course_spread)
         position = xp.stack(
@@ -372,7 +374,7 @@ class LegCourse(Course):
         return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
 
     def carry(self, flight: Legs, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
-        """Propagate a velocity deviation to a scan, rotated and scaled as the target's velocity is."""
+        """Return deviations at a scan: a velocity deviation, rotated and scaled as the target's velocity is."""
         before, now = early or (0.0, 0.0)
         (position, flown), (there, afterwards) = (
             self.advance(flight, time, (velocity, velocity)) for time in (scan - 1.0 - before, scan - now)
@@ -383,7 +385,7 @@ class LegCourse(Course):
         return _times(there - position, deviation), _times(afterwards, deviation)
 
     def context(self, flight: Legs, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the starts of the legs (s), their turn rates (rad/s), and whether the target turns now, by name."""
+        """Return the context by name: starts of legs (s), turn rates (rad/s), and whether the target turns now."""
         now = self.parameters.sampling_interval * time
         turn = StepSignal(flight.turn, flight.time[1:]).at(now, self.xp)
         return {"leg_time": flight.time, "leg_turn_rate": flight.turn, "maneuvering": turn != 0.0}
@@ -438,7 +440,7 @@ class TableOfSeveral(Table):
         """Columns of the table at which flights begin, and its width."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Tracks, Motion]:
-        """Draw which flight each episode flies."""
+        """Return the drawn choice of a flight for each episode, and the motion at its start."""
         constant = self.task.constant
         number = draws.integer("flight", (0, len(self.ends) - 2))
         row = self.xp.astype(number, self.xp.int64)
@@ -450,7 +452,7 @@ class TableOfSeveral(Table):
         return self._states(self.xp.minimum(flight.first + scan, flight.last))
 
     def context(self, flight: Tracks, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the index of the flight, by name."""
+        """Return the context: the index of the flight, by name."""
         return {"flight": flight.number}
 
 

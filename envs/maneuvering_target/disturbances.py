@@ -37,7 +37,7 @@ class ColouredScanErrors(Disturbance):
         return parameters.coloured
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ColouredScanErrorsState:
-        """Draw standard deviation, correlation time and the stationary initial errors."""
+        """Return the drawn standard deviation, correlation time and stationary initial errors."""
         p = self.parameters
         deviation = draws.uniform("coloured_sigma", p.coloured_sigma)
         calm = draw_undisturbed(draws, p)
@@ -57,7 +57,7 @@ class ColouredScanErrors(Disturbance):
         return errors + state.level
 
     def context(self, state: ColouredScanErrorsState) -> dict[str, Array]:
-        """Return the standard deviation of the coloured errors, by name."""
+        """Return the context: the standard deviation of the coloured errors, by name."""
         return {"coloured_sigma": state.deviation}
 
 
@@ -72,7 +72,7 @@ class Bias(Disturbance):
         return parameters.bias > 0.0
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Draw the constant errors, ``(2, N)``."""
+        """Return the drawn constant errors, ``(2, N)``."""
         return draws.uniform("bias", (-self.parameters.bias, self.parameters.bias), 2)
 
     def change_errors(self, state: Array, errors: Array) -> Array:
@@ -80,7 +80,7 @@ class Bias(Disturbance):
         return errors + state
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return the bias, by name."""
+        """Return the context: the constant errors, by name."""
         return {"bias": state}
 
 

@@ -230,7 +230,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         )
 
     def predict(self, state: KalmanNetState, measurement: Measurement) -> KalmanNetState:
-        """Predict to the scan with the acceleration of the last action, and compute the innovation statistics."""
+        """Return the state predicted to the scan with the last action's acceleration, with innovation statistics."""
         xp, T = self.xp, measurement.interval
         mean, turning = advance(state.mean, state.acceleration, T)
         F = coordinated_turn.jacobian(turning, T)[:4, :4]
@@ -267,7 +267,9 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         return xp.concat([xp.concat([corner, middle], axis=1), xp.concat([middle, velocity], axis=1)])
 
     def act(self, state: KalmanNetState, measurement: Measurement, action: Array) -> KalmanNetState:
-        """Update with the gain that the action sets, and store its acceleration for the next prediction."""
+        """Return the state updated with the gain that the action sets, with its acceleration for the next
+        prediction.
+        """
         xp, available = self.xp, measurement.available
         a = xp.clip(action, -1.0, 1.0)
         frame = frame_of(state.mean[2:])

@@ -48,13 +48,13 @@ class RegularScans:
         self.course = course
 
     def begin(self, draws: Draws, motion: Motion) -> Any:
-        """Draw the scan quantities of an episode, whose track begins with a measurement on time: here none."""
+        """Return the scan quantities of an episode, whose track begins with a measurement on time: here None."""
         return None
 
     def advance(
         self, scans: Any, flight: Any, number: Array, before: Motion, uniforms: Array
     ) -> tuple[Any, Scan]:
-        """Move the target along its course to the next scan; return the state of the scans and the :class:`Scan`.
+        """Return the state of the scans and the next :class:`Scan`, with the target moved along its course.
 
         Args:
             scans: of :meth:`begin`, or the scan before.
@@ -98,7 +98,7 @@ class UnreliableScans(RegularScans):
     row_uniforms = 2
 
     def begin(self, draws: Draws, motion: Motion) -> Reliability:
-        """Draw the probability of detection and the largest share of the period by which scans come early."""
+        """Return the drawn detection probability and the largest share of the period by which scans come early."""
         p, never = self.parameters, 0.0 * motion[0][0]
         seen = draws.uniform("detection_probability", p.detection_probability)
         jitter = draws.uniform("scan_jitter", p.scan_jitter)
@@ -108,9 +108,7 @@ class UnreliableScans(RegularScans):
     def advance(
         self, scans: Reliability, flight: Any, number: Array, before: Motion, uniforms: Array
     ) -> tuple[Reliability, Scan]:
-        """Move the target from its on-time position at the previous scan; return the scans' state and the
-        :class:`Scan`.
-        """
+        """Return the state of the scans and the next :class:`Scan`, which may be early or miss the target."""
         before = scans.position, scans.velocity
         on_time = self.course.advance(flight, number, before)
         early = scans.jitter * uniforms[1]
@@ -129,9 +127,7 @@ class UnreliableScans(RegularScans):
         return number - scans.early
 
     def context(self, scans: Reliability) -> dict[str, Array]:
-        """Return the detection probability and the largest share of the scan period by which scans come early, by
-        name.
-        """
+        """Return the context by name: detection probability, and the largest share of the period of early scans."""
         return {"detection_probability": scans.detection_probability, "scan_jitter": scans.jitter}
 
 

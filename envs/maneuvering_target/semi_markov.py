@@ -282,7 +282,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return tuple(moved)
 
     def predict(self, state: SemiMarkovState, measurement: Measurement) -> SemiMarkovState:
-        """Begin and end manoeuvres, and predict all hypotheses to the scan."""
+        """Return the hypotheses predicted to the scan, after manoeuvres have begun and ended."""
         switched = self.switch(*(table.unpack() for table in state.track))
         tables = self.fly(*switched, T=measurement.interval)
         return state._replace(track=tuple(table.pack() for table in tables))
@@ -310,7 +310,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return scaled
 
     def update(self, state: SemiMarkovState, inputs: FilterInput) -> SemiMarkovState:
-        """Update all hypotheses and their weights with a measurement.
+        """Return the state with all hypotheses and their weights updated with a measurement.
 
         Its normalised innovation squared is the mean of the filters', by their posterior weights.
         """

@@ -142,12 +142,12 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         return StudentState(initial.mean, initial.covariance, motion, view)
 
     def predict(self, state: StudentState, measurement: Measurement) -> StudentState:
-        """Predict to the measurement with the last motion output, and compute the innovation."""
+        """Return the state predicted to the measurement with the last motion output, with the innovation."""
         view = self.predict_view(state.mean, state.motion, measurement)
         return state._replace(mean=view.mean, view=view)
 
     def act(self, state: StudentState, measurement: Measurement, action: Array) -> StudentState:
-        """Correct the estimate and set its covariance from the network's outputs."""
+        """Return the state with the estimate corrected and its covariance set by the network's outputs."""
         xp, C, m = self.xp, self.size, self.measured
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         ends = numpy.cumsum([0, C * m, C, C, C * (C - 1) // 2, len(self.motions)])

@@ -98,9 +98,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         self.row_uniforms: int = self.scans.row_uniforms + self.disturbances.row_uniforms
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Draw the flight; return the truth and the initial estimate, with errors of a measurement's size, equation
-        (24).
-        """
+        """Return the drawn truth of the flight, and the initial estimate with errors of a measurement's size (24)."""
         xp, p = self.xp, self.parameters
         ones = xp.ones_like(normals[0])
         flight, (position, velocity) = self.course.begin(draws, ones)
@@ -120,7 +118,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def advance(
         self, truth: Truth, noise: Array, feedback: ReportedTrack | None
     ) -> tuple[Truth, Measurement]:
-        """Move the aircraft to the next scan and measure it; in clutter, return plots around the filter's track."""
+        """Return the truth at the next scan and its measurement; in clutter with plots around the filter's track."""
         p, number, flight = self.parameters, truth.scan + 1.0, truth.flight
         uniforms, before = noise[self.normals :], (truth.position, truth.velocity)
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
@@ -206,7 +204,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the records of the disturbances, by name."""
+        """Return the values of the disturbances to record at a scan, by name."""
         return self.disturbances.records(truth.disturbances)
 
     def context(self, truth: Truth) -> dict[str, Array]:

@@ -234,7 +234,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Predict the filters by one scan and update them with the radar measurement; count the ESM decision."""
+        """Return the filters predicted by one scan and updated with the radar, with the ESM decision counted."""
         xp, models, f = self.xp, self.task.models, state
         if self.mixes:
             mean, covariance, log_predicted, innovation, log_likelihood = class_fusion.advance(
@@ -289,7 +289,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         return self.xp.take(self.log_esm, usable, axis=1)
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Set the class weights that follow from the action; evidence affects this scan's weights only."""
+        """Return the state with the class weights that follow from the action; evidence affects this scan only."""
         log_predicted, esm = state.log_predicted, self._esm_log_likelihood(state.used, measurement)
         control, scale = self.control, self.parameters.evidence_scale
         probabilities = bank_probabilities(control, action, log_predicted, esm, scale, self.xp)
@@ -307,7 +307,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the weights, NIS and log-likelihood of the radar measurement to record, by name.
+        """Return the values to record at a scan, by name: weights, NIS and log-likelihood of the radar measurement.
 
         The NIS of the bank is the mean over the classes by their probability given the radar. If these are
         calibrated, its expectation is 2, that of the true class's filter.

@@ -302,7 +302,10 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return kalman.predict(memory.mean, P, self.F, process * self.Q)
 
     def update(self, state: ClassState, inputs: FilterInput) -> ClassState:
-        """Update with a scan: motion and radar, change of class, then ESM; the likelihood is that of the radar."""
+        """Return the state updated with a scan: motion and radar, change of class, then ESM.
+
+        Its likelihood is that of the radar measurement.
+        """
         xp, prior, memory, measurement = self.xp, self.prior, state.tracks, inputs.measurement
         process, variance = 1.0, self.variance
         if inputs.action is not None:

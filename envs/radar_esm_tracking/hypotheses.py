@@ -173,10 +173,10 @@ class HypothesesBank(SettingsBank):
         )
 
     def act(self, state: HypothesesState, measurement: Measurement, action: Array) -> HypothesesState:
-        """Update the filter with its settings multiplied by the factors of the action."""
+        """Return the state updated by the filter with its settings multiplied by the factors of the action."""
         after = super().act(state, measurement, action)
         return after._replace(**self.class_estimates(after.own))
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return the class probabilities, and the likelihood of the radar measurement, to record, by name."""
+        """Return the values to record at a scan, by name: class probabilities, likelihood of the radar measurement."""
         return {"mode_probability": state.probabilities, **state.likelihood._asdict()}

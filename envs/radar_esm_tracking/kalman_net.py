@@ -126,7 +126,7 @@ class KalmanNetBank(ClassBank):
         return scale[0], [scale[1 + i] * variance for i, variance in enumerate(self.radar_variances)]
 
     def predict(self, state: Any, measurement: Measurement) -> Any:
-        """Predict the filters by one scan, and compute the innovation statistics of the radar measurement."""
+        """Return the filters predicted by one scan, with the innovation statistics of the radar measurement."""
         xp, f = self.xp, state
         mean = apply(self.task.models.Phi[..., None], f.mean)
         covariance = apply(self.propagator, f.covariance)
@@ -159,7 +159,7 @@ class KalmanNetBank(ClassBank):
         )
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
-        """Update the filters with the gains of the action, apply the class transition, and weight the filters."""
+        """Return the filters updated with the action's gains, after the class transition, and weighted."""
         xp, classes, f = self.xp, self.task.classes, state
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         process, radar = self.noises(a)

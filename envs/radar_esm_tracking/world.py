@@ -133,7 +133,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     # --- the target and its emissions
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
-        """Draw the target, its class and the disturbances; return the truth and the start, measured at scan 0."""
+        """Return the drawn truth (target, class, disturbances) and the initial estimate from scan 0."""
         xp, p, own = self.xp, self.parameters, self.own_initial_normals
         distance = draws.uniform("initial_range", p.initial_range)
         closing_speed = draws.uniform("closing_speed", p.closing_speed)
@@ -199,12 +199,12 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return self.xp.take(self.type_thresholds, target_class, axis=1)
 
     def _another_class(self, draws: Draws, name: str, target_class: Array) -> Array:
-        """Draw the index of another class than the given one, all equally probable, ``(N,)``."""
+        """Return a drawn index of another class than the given one, all equally probable, ``(N,)``."""
         step = draws.integer(name, (1, self.task.classes - 1))
         return (target_class + self.xp.astype(step, self.xp.int64)) % self.task.classes
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Move the target by one scan, apply class change and silence, and measure it.
+        """Return the truth at the next scan, after a possible class change and silence, and the measurement.
 
         A row of noise: 3 normal numbers for the motion, 2 for the radar, 2 for the bearings, 2 for the radar's coloured
         errors if there are any; uniform ones for the type, the decision, the source and the silence. Those of the
@@ -330,7 +330,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return ordered_sum(scaled * scaled) * (1.0 / 3.0)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the true class and type, and the time, by name."""
+        """Return the values to record at a scan, by name: true class and type, and the time."""
         xp = self.xp
         return {
             **self.disturbances.records(truth.disturbances),
@@ -340,7 +340,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return class and type of the target, their change, second emitter, radar errors and silence, by name."""
+        """Return the context by name: class and type, their change, second emitter, radar errors and silence."""
         p, xp = self.parameters, self.xp
         never = 0 * truth.change_scan - 1
         changes = (p.class_change is not None) & (truth.change_scan <= p.horizon + 1)

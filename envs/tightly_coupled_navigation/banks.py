@@ -228,7 +228,7 @@ class HypothesisBank(SatelliteBank):
         return weighted_sum(chain.probabilities, mean)
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Predict to a measurement, compute the innovation statistics, and update with the nominal noise."""
+        """Return the filters predicted to a measurement and updated with the nominal noise, with NIS and likelihood."""
         xp, task, predicted = self.xp, self.task, self._predict_hypotheses(state)
         combined = weighted_sum(predicted.probabilities, predicted.mean)
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
@@ -299,7 +299,7 @@ class HypothesisBank(SatelliteBank):
         return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Weight the hypotheses by the action (step 7), and combine them (step 8)."""
+        """Return the hypotheses weighted by the action (step 7) and combined (step 8)."""
         xp, control, dtype = self.xp, self.control, state.log_likelihood.dtype
         probabilities = bank_probabilities(
             control,
@@ -317,7 +317,7 @@ class HypothesisBank(SatelliteBank):
         return self._combine(state, probabilities, last)
 
     def weigh_by_bayes(self, state: Filters, last_action: Array) -> Filters:
-        """Weight the hypotheses by Bayes' rule (step 7), as the paper does, and combine them (step 8)."""
+        """Return the hypotheses weighted by Bayes' rule (step 7), as in the paper, and combined (step 8)."""
         probabilities = imm.mode_posterior(state.log_predicted, state.log_likelihood)
         return self._combine(state, probabilities, last_action)
 
@@ -377,7 +377,7 @@ class NoiseBank(HypothesisBank):
         return predicted.mean, predicted.covariance
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Update every filter with the noise that the action sets, and weight the hypotheses by Bayes' rule."""
+        """Return the filters updated with the noise that the action sets, weighted by Bayes' rule."""
         xp = self.xp
         exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
         variance, thresholds = self._variance(exponent, state), self._thresholds(exponent)

@@ -43,7 +43,7 @@ class Course:
         self.singer_root: Array = task.constant(numpy.linalg.cholesky(task.models[SINGER].noise))
 
     def begin(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Draw the legs of each episode; return them with the initial velocity and heading.
+        """Return the drawn legs of each episode, the initial velocity and the heading.
 
         Args:
             draws: of the episode.
@@ -79,7 +79,7 @@ class Course:
         return legs, along * speed, heading
 
     def _random_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Draw random legs of rest, straight flight and manoeuvre, the initial velocity and heading."""
+        """Return random legs of rest, straight flight and manoeuvre, the initial velocity and heading."""
         xp, p = self.xp, self.parameters
         columns: list[tuple[Array, ...]] = []
         start: Array = None

@@ -92,7 +92,7 @@ class _Once(_OfSatellites):
     """Prefix of the parameters of its probability and duration."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Draw whether it occurs, its first and last step, and its satellites.
+        """Return the drawn state: first and last step of the disturbance, if it occurs, and its satellites.
 
         The start is uniform over the times that leave room for the duration.
         """
@@ -105,7 +105,7 @@ class _Once(_OfSatellites):
         return Fault(xp.where(happens, window, -1.0), self.draw_satellites(draws), zero, zero)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Draw the indices of the affected satellites, ``(n, N)``; here None."""
+        """Return the drawn indices of the affected satellites, ``(n, N)``; by default None."""
         return None
 
     def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
@@ -121,7 +121,7 @@ class _Once(_OfSatellites):
         return chosen & (state.now > 0.0)
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the first and last step by name; -1 where it does not occur."""
+        """Return the context: first and last step of the disturbance (-1 where it does not occur), by name."""
         window = state.window
         return {self.name: self.xp.where(window[1] >= window[0], window, -1.0)}
 
@@ -130,7 +130,7 @@ class _Hidden(_Once):
     """Temporary disturbance that the measurement does not report."""
 
     def switch_off(self, state: Fault, calm: Array) -> Fault:
-        """Remove the disturbance from episodes where ``calm``."""
+        """Return the state without the disturbance in the episodes where ``calm``."""
         return state._replace(window=self.xp.where(calm, -1.0, state.window))
 
 
@@ -141,11 +141,11 @@ class StuckAccelerometers(_Hidden):
     causes = (Cause("stuck accelerometers", "while the accelerometers are stuck", context_flag("stuck_now")),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Draw whether and when they stick, with zero as the last reading."""
+        """Return the drawn state: whether and when the accelerometers stick, with zero as the last reading."""
         return super().begin(draws, normals, zero)._replace(own=self.xp.stack([zero] * 3))
 
     def change_reading(self, state: Fault, reading: Array) -> tuple[Fault, Array]:
-        """Replace the accelerometer readings by the last ones while they stick; store the reading."""
+        """Return the state with the last reading, and the readings with it repeated while accelerometers stick."""
         rows = self.task.sensors[2].readings
         forces = self.xp.where(state.now > 0.0, state.own, reading[rows])
         return state._replace(own=forces), self.change_rows(reading, rows.start, forces)
@@ -156,7 +156,7 @@ class StuckAccelerometers(_Hidden):
         return state._replace(now=self.xp.where(step.number > 1.0, state.now, 0.0))
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the window and whether they stick now, by name."""
+        """Return the context: window of the fault, and whether the accelerometers stick now, by name."""
         return {**super().context(state), "stuck_now": state.now}
 
 
@@ -167,11 +167,11 @@ class NoisyRate(_Hidden):
     causes = (Cause("noisy rate", "while a pseudorange rate is too noisy", _is_noisy),)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Draw the index of one satellite, ``(1, N)``."""
+        """Return the drawn index of the satellite with a noisy rate, ``(1, N)``."""
         return draws.integer("noisy_satellite", (0, self.satellites - 1))[None]
 
     def complete(self, state: Fault, draws: Draws) -> Fault:
-        """Draw the factor on the standard deviation."""
+        """Return the state with the drawn factor on the standard deviation of the satellite's rate."""
         factor = draw_between(draws.log_uniform, "rate_fault_factor", self.parameters.rate_fault_factor)
         return state._replace(own=state.own + factor)
 
@@ -182,7 +182,7 @@ class NoisyRate(_Hidden):
         return self.change_rows(deviations, S, factor * deviations[S : 2 * S])
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the window and the satellite, by name."""
+        """Return the context: window and satellite of the noisy rate, by name."""
         return {**super().context(state), "noisy_satellite": state.satellites[0]}
 
 
@@ -193,19 +193,19 @@ class HiddenSatellites(_Once):
     causes = (Cause("range lost", "where a pseudorange is missing", _lacks_range),)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Draw the indices of two satellites, ``(2, N)``."""
+        """Return the drawn indices of the two hidden satellites, ``(2, N)``."""
         S = self.satellites
         first = draws.integer("hidden_satellite", (0, S - 1))
         second = (first + 1.0 + draws.integer("other_hidden_satellite", (0, max(S - 2, 0)))) % S
         return self.xp.stack([first, second])
 
     def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
-        """Mark the pseudoranges and rates of both satellites as missing."""
+        """Return the state, and the measurement with both satellites' pseudoranges and rates missing."""
         seen = self.xp.where(self.is_at(state), 0.0, self.xp.ones_like(state.now))
         return state, self.change_available(measurement, 0, self.xp.concat([seen, seen]))
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the window and the satellites, by name."""
+        """Return the context: window and satellites of the outage, by name."""
         return {**super().context(state), "hidden_satellites": state.satellites}
 
 
@@ -216,7 +216,7 @@ class LostRates(_Once):
     causes = (Cause("rate lost", "where a pseudorange rate is missing", _lacks_rate),)
 
     def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
-        """Mark the rates of all satellites as missing."""
+        """Return the state, and the measurement with the rates of all satellites missing."""
         kept = self.xp.stack([1.0 - state.now] * self.satellites)
         return state, self.change_available(measurement, self.satellites, kept)
 
@@ -229,7 +229,7 @@ class RangeColour(ColouredErrors):
         super().__init__(task, p.sampling_interval, task.satellites, p.pseudorange_coloured[1] > 0.0)
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw the stationary standard deviation, m, and the correlation time, s, ``(N,)`` each."""
+        """Return the drawn standard deviation, m, and correlation time, s, of pseudorange errors, ``(N,)`` each."""
         p = self.parameters
         draw_undisturbed(draws, p)  # comes first among the random numbers
         if not self.normals:
@@ -245,7 +245,7 @@ class RangeColour(ColouredErrors):
         return errors + state.level
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return the standard deviation, m, and the decay between measurements, by name."""
+        """Return the context: standard deviation, m, and decay of the pseudorange errors, by name."""
         return {"coloured_deviation": state.deviation, "coloured_decay": state.process.decay}
 
 
@@ -276,13 +276,16 @@ class Reflections(_OfSatellites):
         self.normals: int = 2 * self.row_uniforms
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Reception:
-        """Draw the initial C/N0, also under an open sky, so that all scenarios use the same random numbers."""
+        """Return the state with the drawn initial C/N0 of each satellite.
+
+        It is drawn under an open sky, too, so that all scenarios use the same random numbers.
+        """
         cn0 = draws.uniform("cn0", self.parameters.cn0_limits, self.satellites)
         none = self.xp.stack([zero] * self.satellites)
         return Reception(zero, cn0, none, none)
 
     def complete(self, state: Reception, draws: Draws) -> Reception:
-        """Draw whether the episode is between houses."""
+        """Return the state with the drawn choice whether the episode is between houses."""
         urban = _draw_share(draws, "urban", self.parameters, state.urban)
         return state._replace(
             urban=urban, cn0=self.xp.where(urban < 0.5, self.parameters.clear_cn0, state.cn0)
@@ -320,17 +323,17 @@ class Reflections(_OfSatellites):
     def change_measurement(
         self, state: Reception, measurement: Any, step: DisturbanceInput
     ) -> tuple[Reception, Any]:
-        """Write the C/N0 into the measurement."""
+        """Return the state, and the measurement with the C/N0 filled in."""
         return state, measurement._replace(cn0=state.cn0)
 
     def context(self, state: Reception) -> dict[str, Array]:
-        """Return whether the episode is between houses, by name."""
+        """Return the context: whether the episode is between houses, by name."""
         return {"urban": state.urban}
 
 
 def _draw_share(draws: Draws, name: str, parameters: Any, zero: Array) -> Array:
-    """Draw 1 with the probability ``name_probability``, else 0, ``(N,)``; without a random number at probability 0 or
-    1.
+    """Return ones with the probability ``name_probability``, else zeros, ``(N,)``; at 0 or 1 no random number is
+    used.
     """
     share = getattr(parameters, f"{name}_probability")
     if not getattr(parameters, name) or share == 1.0:
@@ -352,7 +355,7 @@ class Ramp(_Hidden):
         return Fault(self.xp.stack([zero - 1.0] * 2), zero[None], self.xp.stack([zero] * 2), zero)
 
     def complete(self, state: Fault, draws: Draws) -> Fault:
-        """Draw start, satellite and initial error of the ramp."""
+        """Return the state with the drawn start, satellite and initial error of the ramp."""
         xp, p, zero = self.xp, self.parameters, state.now
         if not p.ramp_probability:
             return state
@@ -364,7 +367,7 @@ class Ramp(_Hidden):
         return Fault(window, satellite[None], xp.stack([jump, zero]), zero)
 
     def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
-        """Return the state with the error of this step."""
+        """Return the state with the ramp's error at this step."""
         p, jump = self.parameters, state.own[0]
         run = jump + (p.ramp_rate * p.sampling_interval) * (step.number - state.window[0] + 1.0)
         return super().advance(state._replace(own=self.xp.stack([jump, run])), step)
@@ -376,7 +379,7 @@ class Ramp(_Hidden):
         return errors + self.xp.where(self.is_at(state), state.own[1], 0.0)
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the window, the satellite and the initial error, by name."""
+        """Return the context: window, satellite and initial error of the ramp, by name."""
         own = {"ramp_satellite": state.satellites[0], "ramp_jump": state.own[0]}
         return {**super().context(state), **own}
 
@@ -393,11 +396,14 @@ class Aperture(_OfSatellites):
         return zero
 
     def complete(self, state: Array, draws: Draws) -> Array:
-        """Draw whether the tracking loops of an episode have an aperture."""
+        """Return ones where the tracking loops of a drawn episode have an aperture, else zeros, ``(N,)``."""
         return _draw_share(draws, "aperture", self.parameters, state)
 
     def change_measurement(self, state: Array, measurement: Any, step: DisturbanceInput) -> tuple[Array, Any]:
-        """Mark ranges and rates as missing that are outside the aperture around the predicted state ``(17, N)``."""
+        """Return the state, and the measurement with ranges and rates outside the aperture missing.
+
+        The aperture is centred on the predicted state ``(17, N)``.
+        """
         feedback = step.feedback
         if feedback is None:
             return state, measurement
@@ -408,7 +414,7 @@ class Aperture(_OfSatellites):
         return state, self.change_available(measurement, 0, self.xp.astype(kept, feedback.dtype))
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return whether the tracking loops have an aperture, by name."""
+        """Return the context: whether the tracking loops have an aperture, by name."""
         return {"aperture": state}
 
 

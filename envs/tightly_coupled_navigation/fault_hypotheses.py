@@ -242,7 +242,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         return FaultState(initial.mean, initial.covariance, hypotheses, Likelihood.unknown(none))
 
     def update(self, state: FaultState, inputs: FilterInput) -> FaultState:
-        """Predict to a measurement, weight hypotheses, levels and renewals, and compute the moments of the bank."""
+        """Return the state predicted and updated with a measurement: hypotheses, levels, renewals, moments."""
         if inputs.action is None:
             return self.examine(state, inputs.measurement).after
         factors = Factors(*self.xp.exp(inputs.action))

@@ -110,7 +110,7 @@ class KalmanNetBank(RobustBank):
         return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Update with the noises and the gain that the action sets."""
+        """Return the state updated with the noises and the gain that the action sets."""
         xp = self.xp
         exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
         caution = xp.exp(2.0 * math.log(CAUTION) * exponent[self.manoeuvre + 1 :])

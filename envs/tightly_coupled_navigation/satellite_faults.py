@@ -100,7 +100,7 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
         return SatelliteFaultState(members, weights, Likelihood.unknown(none))
 
     def update(self, state: SatelliteFaultState, inputs: FilterInput) -> SatelliteFaultState:
-        """Update every member with a measurement, and weight them by their likelihoods."""
+        """Return every member updated with a measurement, and weighted by its likelihood."""
         xp, S, measurement = self.xp, self.task.satellites, inputs.measurement
         between = xp.any(measurement.cn0 != self.task.parameters.clear_cn0, axis=0)
         beginning = xp.where(between, 0.0, self.begins) * state.weights[0]

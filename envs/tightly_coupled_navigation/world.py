@@ -103,7 +103,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return self.task.sensor_sigma + 0.0 * measurement.readings
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Draw legs, disturbances and initial errors; return the truth and the initial estimate."""
+        """Return the drawn truth (legs, disturbances, initial errors) and the initial estimate."""
         xp, p = self.xp, self.parameters
         zeros = xp.zeros_like(normals[0])
         legs, velocity, heading = self.course.begin(draws, zeros)
@@ -136,7 +136,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     # --- one measurement
 
     def advance(self, truth: Truth, noise: Array, feedback: Array | None) -> tuple[Truth, Measurement]:
-        """Move the user by one step, and measure with noise and disturbances.
+        """Return the truth after one step, and the measurement with noise and disturbances.
 
         Args:
             truth: at the measurement before.
@@ -196,7 +196,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the time, the true hypothesis, and one where a sensor fails, by name.
+        """Return the values to record at a measurement, by name: time, true hypothesis, and one where a sensor fails.
 
         Failures are a rate noisier than stated, stuck accelerometers, and a pseudorange with an error above five
         standard
@@ -214,7 +214,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the legs, the disturbances, the true hypothesis, and the noise and errors of readings, by name."""
+        """Return the context by name: legs, disturbances, true hypothesis, and noise and errors of readings."""
         return {
             "leg_start": truth.legs.start,
             "leg_kind": truth.legs.kind,

@@ -191,7 +191,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
-        """Return NIS, log-likelihood, number of readings, and the output's normalised innovation to record, by name.
+        """Return the values to record at a measurement, by name: NIS, log-likelihood, normalised innovation.
 
         NIS and log-density are NaN in a dropout of all sensors. The innovation is that of the first sensor if the
         output is not measured.
@@ -255,7 +255,7 @@ class _KalmanBank(AutopilotBank):
         )
 
     def predict(self, state: KalmanState, measurement: Measurement) -> KalmanState:
-        """Predict by equation (10), and compute the innovations with the process noise of the last action."""
+        """Return the state predicted by equation (10), with innovations for the process noise of the last action."""
         m = len(self.task.sensors)
         mean = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         covariance = self.xp.matmul(self.propagator, state.covariance)
@@ -279,7 +279,7 @@ class _KalmanBank(AutopilotBank):
         return update.mean, update.covariance
 
     def act(self, state: KalmanState, measurement: Measurement, action: Array) -> KalmanState:
-        """Update by equations (12) and (11) with the process and sensor noises that the action sets."""
+        """Return the state updated by equations (12) and (11) with the process and sensor noises of the action."""
         shown, scale = self.decode_action(action)
         update = packed_covariance.update_coordinates(
             state.mean,

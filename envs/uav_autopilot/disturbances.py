@@ -28,9 +28,7 @@ def draw_steps(
     zero: Array,
     count: int | None = None,
 ) -> StepSignal:
-    """Draw a piecewise constant signal: its level in each part of the episode, and the first measurements of the
-    parts.
-    """
+    """Return a drawn step signal: its level in each part of the episode, and the first measurement of each part."""
     values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
     begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
     return StepSignal(draws.xp.stack(values), draws.xp.stack([zero, *begins])[1:])
@@ -72,14 +70,14 @@ class NoisySensors(_OfSensors):
     )
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> SensorLevels:
-        """Draw the factors on the sensors' noise and the times of their changes."""
+        """Return the drawn factors on the sensors' noise and the times of their changes."""
         p, chosen = self.parameters, self.chosen(self.parameters.changing_sensors)
         levels = draw_steps(draws, "sensor", p.sensor_levels, p.sensor_times, zero, self.count)
         levels = levels._replace(values=1.0 + chosen * (levels.values - 1.0))
         return SensorLevels(levels, levels.values[0])
 
     def switch_off(self, state: SensorLevels, calm: Array) -> SensorLevels:
-        """Set the factors to one in the episodes where ``calm``."""
+        """Return the state with factors of one in the episodes where ``calm``."""
         values = self.xp.where(calm, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
 
@@ -92,7 +90,7 @@ class NoisySensors(_OfSensors):
         return deviations * state.level
 
     def context(self, state: SensorLevels) -> dict[str, Array]:
-        """Return all factors, and the measurements at which they change, by name."""
+        """Return the context: all factors on the noise, and the measurements at which they change, by name."""
         return {"sensor_levels": state.levels.values, "sensor_level_times": state.levels.times}
 
 
@@ -114,7 +112,7 @@ class Dropouts(_OfSensors):
     causes: ClassVar[tuple[Cause, ...]] = (MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Holds:
-        """Draw the first and last measurements of the dropouts."""
+        """Return the drawn first and last measurements of the sensors' dropouts."""
         xp, p = self.xp, self.parameters
         none = xp.stack([zero] * self.count)
         starts, stops = [none], [none]
@@ -126,7 +124,7 @@ class Dropouts(_OfSensors):
         return Holds(xp.stack(starts)[1:], xp.stack(stops)[1:], none)
 
     def change_measurement(self, state: Holds, measurement: Any, step: DisturbanceInput) -> tuple[Holds, Any]:
-        """Replace the reading of each sensor in a dropout by its last valid one, and mark it unavailable."""
+        """Return the state, and the measurement with each sensor's last valid reading repeated during a dropout."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
             out = is_within(step.number, (state.starts[i], state.stops[i]))
@@ -136,7 +134,7 @@ class Dropouts(_OfSensors):
         return state._replace(reading=reading), measurement
 
     def context(self, state: Holds) -> dict[str, Array]:
-        """Return the first measurements of the dropouts and those after them, by name."""
+        """Return the context: first measurements of the dropouts and those after them, by name."""
         return {"dropout_starts": state.starts, "dropout_stops": state.stops}
 
 
@@ -146,7 +144,7 @@ class SensorBias(_OfSensors):
     name = "bias"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Draw magnitude and sign of the constant errors, ``(m, N)``."""
+        """Return the drawn constant errors of the sensors, ``(m, N)``."""
         xp, limits = self.xp, self.parameters.sensor_bias
         if not limits[1]:
             return xp.stack([zero] * self.count)
@@ -155,15 +153,15 @@ class SensorBias(_OfSensors):
         return self.sigmas * self.chosen(self.parameters.biased_sensors) * side * size
 
     def switch_off(self, state: Array, calm: Array) -> Array:
-        """Set the errors to zero in the episodes where ``calm``."""
+        """Return the constant errors, zero in the episodes where ``calm``."""
         return self.xp.where(calm, 0.0, state)
 
     def change_reading(self, state: Array, reading: Array) -> tuple[Array, Array]:
-        """Return the readings with the constant errors added."""
+        """Return the state, and the readings with the constant errors added."""
         return state, reading + state if self.parameters.sensor_bias[1] else reading
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return the constant errors, by name."""
+        """Return the context: the constant errors, by name."""
         return {"sensor_bias": state}
 
 
@@ -176,9 +174,7 @@ class SensorColour(ColouredErrors):
         self.sigmas: Array = task.constant(p.value("sensor_sigmas"))[:, None]
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw the stationary standard deviation, in the sensor's unit, and the correlation time, s, ``(m, N)``
-        each.
-        """
+        """Return the drawn standard deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
         p, none = self.parameters, self.xp.stack([zero] * self.count)
         if not self.normals:
             return none, none + 1.0
@@ -186,11 +182,11 @@ class SensorColour(ColouredErrors):
         return deviation, draws.log_uniform("correlation_time", p.sensor_correlation_time, self.count)
 
     def change_reading(self, state: ColouredErrorsState, reading: Array) -> tuple[ColouredErrorsState, Array]:
-        """Return the readings with the coloured errors added."""
+        """Return the state, and the readings with the coloured errors added."""
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return the coloured errors at this measurement, by name."""
+        """Return the context: the coloured errors at this measurement, by name."""
         return {"sensor_coloured": state.level}
 
 

@@ -109,7 +109,7 @@ class KalmanNetBank(NoiseBank):
         return NetFilter(**fields, gain_covariance=fields["covariance"])
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
-        """Update with the noises and the gain that the action sets."""
+        """Return the state updated with the noises and the gain that the action sets."""
         xp, p, parts = self.xp, self.parameters, len(self.noise_parts)
         count = parts + len(self.task.sensors)
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)

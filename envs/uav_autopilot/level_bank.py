@@ -199,7 +199,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         return Levels(initial.mean, initial.covariance, Likelihood.unknown(none), hypotheses)
 
     def predict(self, state: Levels, measurement: Measurement) -> Levels:
-        """Mix the hypotheses for changes of the levels, and predict each to the time of a measurement."""
+        """Return the hypotheses mixed for changes of noise levels, and predicted to the time of a measurement."""
         h = self.switch(state.hypotheses)
         mean, covariance = self.propagate(h, measurement)
         return state._replace(hypotheses=h._replace(mean=mean, covariance=covariance))
@@ -219,7 +219,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def update(self, state: Levels, inputs: FilterInput) -> Levels:
-        """Update all hypotheses with one reading after the other, and combine them."""
+        """Return the hypotheses updated with one reading after the other, and their combined estimate."""
         xp, n, measurement, predicted = self.xp, self.n, inputs.measurement, state.hypotheses
         scaled = self.variances
         if inputs.action is not None:

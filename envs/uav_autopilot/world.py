@@ -110,7 +110,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return self.task.constant(self.parameters.value("sensor_sigmas"))[:, None] + 0.0 * measurement.reading
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
-        """Draw noise levels, commands, disturbances and the initial state; return truth and initial estimate."""
+        """Return the drawn truth (noise levels, commands, disturbances, initial state) and the initial estimate."""
         xp, p, size = self.xp, self.parameters, len(self.task.components)
         state = self.initial_sigmas * normals[:size]
         zero = xp.zeros_like(state[0])
@@ -137,7 +137,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return truth, Start(xp.zeros_like(state), covariance, zero)
 
     def _commands(self, draws: Draws, zero: Array) -> StepSignal:
-        """Draw the command signal, a step or random manoeuvres.
+        """Return the drawn command signal, a step or random manoeuvres.
 
         Each period of random manoeuvres has, at a random time, a step to a new level or a doublet about the present
         one, with
@@ -164,7 +164,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return StepSignal(xp.stack(values), xp.stack(times)[1:])
 
     def advance(self, truth: Truth, noise: Array, feedback: Array) -> tuple[Truth, Measurement]:
-        """Move the aircraft by one interval under the control that is fed back, and measure it.
+        """Return the truth after one interval under the control that is fed back, and the measurement.
 
         Args:
             truth: truth at the previous measurement.
@@ -238,7 +238,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return (float(self.optimal.regret[0, 0]) / task.cost_unit) * lost * lost
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the output and the command to record, by name."""
+        """Return the values to record at a measurement, by name: output and command."""
         return {
             **self.disturbances.records(truth.disturbances),
             "output": truth.state[self.task.output],
@@ -246,7 +246,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return noise levels, commands, dropouts with the times of their changes, and sensor errors, by name."""
+        """Return the context by name: noise levels, commands, dropouts with their times, and sensor errors."""
         return {
             "levels": truth.levels.values,
             "level_times": truth.levels.times,
