@@ -120,7 +120,7 @@ class StepSignal(NamedTuple):
     """Times of the steps, ascending, ``(J, N)``: numbers of measurements, or s."""
 
     def at(self, time: Array, xp: ModuleType) -> Array:
-        """Return the value of the signal at a time, ``(..., N)``."""
+        """Return the value of the piecewise constant signal at a time, ``(..., N)``."""
         value = self.values[0]
         for i in range(self.times.shape[0]):
             value = xp.where(time >= self.times[i], self.values[i + 1], value)

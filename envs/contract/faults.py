@@ -220,19 +220,19 @@ class Disturbances:
         return {part.name: part.advance(states[part.name], steps[part.name]) for part in self.parts}
 
     def change_deviations(self, states: Mapping[str, Any], deviations: Array) -> Array:
-        """Return the relative standard deviations of the white errors after every disturbance, ``(..., N)``."""
+        """Return the relative deviations of the white errors, ``(..., N)``, as changed by every disturbance in turn."""
         for part in self.parts:
             deviations = part.change_deviations(states[part.name], deviations)
         return deviations
 
     def change_errors(self, states: Mapping[str, Any], errors: Array) -> Array:
-        """Return the sensor errors after every disturbance, ``(n, N)``."""
+        """Return the sensor errors, ``(n, N)``, as changed by every disturbance in turn."""
         for part in self.parts:
             errors = part.change_errors(states[part.name], errors)
         return errors
 
     def change_reading(self, states: Mapping[str, Any], reading: Array) -> tuple[dict[str, Any], Array]:
-        """Return the states and the sensor reading after every disturbance."""
+        """Return the states, and the sensor reading, ``(n, N)``, as changed by every disturbance in turn."""
         changed = dict(states)
         for part in self.parts:
             changed[part.name], reading = part.change_reading(changed[part.name], reading)
@@ -241,7 +241,7 @@ class Disturbances:
     def change_measurement(
         self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, DisturbanceInput]
     ) -> tuple[dict[str, Any], Any]:
-        """Return the states and the measurement after every disturbance."""
+        """Return the states, and the measurement as changed by every disturbance in turn."""
         changed = dict(states)
         for part in self.parts:
             own = changed[part.name], measurement, steps[part.name]
@@ -253,7 +253,7 @@ class Disturbances:
         return {name: v for part in self.parts for name, v in part.context(states[part.name]).items()}
 
     def records(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """Return the values to record of all disturbances by name."""
+        """Return the values of all disturbances to record at each measurement, by name."""
         return {name: v for part in self.parts for name, v in part.records(states[part.name]).items()}
 
 
@@ -316,7 +316,7 @@ class Glint(Outliers):
         return parameters.glint_probability, parameters.glint_factor
 
     def change_errors(self, state: Array, errors: Array) -> Array:
-        """Return the errors multiplied by the factor of this measurement."""
+        """Return the errors multiplied by this measurement's glint factor, which is one without glint."""
         return state * errors
 
 
@@ -405,7 +405,7 @@ class ColouredErrors(Disturbance):
         return ColouredErrorsState(deviation, state.process._replace(kick=kick), level)
 
     def advance(self, state: ColouredErrorsState, step: DisturbanceInput) -> ColouredErrorsState:
-        """Return the state with the errors of the next measurement."""
+        """Return the state with the coloured errors of the next measurement."""
         return (
             state._replace(level=state.process.advance(state.level, step.normals)) if self.normals else state
         )

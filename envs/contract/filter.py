@@ -203,7 +203,7 @@ class Bank(Filter[TaskT, Measurement, State]):
     @property
     @abstractmethod
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gymnasium space of the actions."""
+        """Gymnasium space of the actions that steer the filters."""
 
     @property
     @abstractmethod

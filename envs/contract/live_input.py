@@ -218,7 +218,7 @@ class LiveValues:
         return numpy.atleast_1d(self.input.read(self.values, name))
 
     def place(self, number: int) -> str:
-        """Return the track of a value in words, for an error message."""
+        """Return the name of the track with this index, for an error message."""
         return f"track {number}"
 
     def deviations(self, name: str) -> Any:

@@ -28,7 +28,7 @@ class Column(NamedTuple):
 
     @property
     def live_text(self) -> str:
-        """Unit and meaning of the live value."""
+        """Unit and meaning of the column as a live value."""
         return self.live or self.text
 
 
@@ -40,7 +40,7 @@ class Readings(Protocol):
         ...
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the numbers of a column, ``(n,)``; NaN where one is missing."""
+        """Return the numbers of a column by its name, ``(n,)``; NaN where one is missing."""
         ...
 
     def place(self, number: int) -> str:

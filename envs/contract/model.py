@@ -132,7 +132,7 @@ class Model:
     # --- the filter's part of a step
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
-        """Return the filter's state at the start of the track."""
+        """Return the filter's state at the start of the track, from the initial estimate."""
         return self.filter.initialise(FilterInput(initial, truth))
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:

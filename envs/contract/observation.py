@@ -82,7 +82,7 @@ def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
 
 
 def bounded_exponential(shown: numpy.ndarray) -> numpy.ndarray:
-    """Return the values of which :func:`bounded_logarithm` gives these."""
+    """Return the values whose :func:`bounded_logarithm` is given: its inverse."""
     return symexp(shown / (1.0 - numpy.abs(shown) / LIMIT), numpy)
 
 

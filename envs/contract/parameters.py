@@ -146,7 +146,7 @@ def quote_shortened(value: Any, most: int = 80) -> str:
 
 
 def read_numbers(name: str, value: Any) -> numpy.ndarray:
-    """Return an array of floats from a user's input.
+    """Return a user's number or nested list of numbers as an array of floats.
 
     Raises:
         ValueError: for a value that is no number, or rows of several lengths.

@@ -92,7 +92,7 @@ class TaskBase(ABC):
 
     @abstractmethod
     def set_up(self) -> None:
-        """Compute the constants that world and banks share."""
+        """Compute the constants that the world and the banks of a task share; an author defines it."""
 
     @abstractmethod
     def _writes_feedback(self) -> bool:

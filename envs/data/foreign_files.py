@@ -154,7 +154,7 @@ def parse_json(content: bytes) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Return the value of a JSON file.
+    """Return the decoded value of a JSON file, within the memory limit.
 
     Raises:
         FileNotFoundError: if there is none.

@@ -137,7 +137,7 @@ def _item_size(variable: Any) -> int:
 
 
 def _check_links(group: Any, h5py: Any) -> None:
-    """Raise ValueError if a variable of the group refers to another file."""
+    """Raise ValueError if a variable of an HDF5 group has its values in another file."""
     for name in group:
         link = group.get(name, getlink=True)
         if isinstance(link, h5py.ExternalLink):

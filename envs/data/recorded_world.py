@@ -183,7 +183,7 @@ class RecordedWorld(_ForeignWorld):
         return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
 
     def _at(self, table: Array, column: Array) -> Array:
-        """Return the entries of a table at columns ``(N,)``, as ``(..., N)``."""
+        """Return the entries of a table at measurements with these column numbers ``(N,)``, as ``(..., N)``."""
         return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
 
     def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
@@ -201,11 +201,11 @@ class RecordedWorld(_ForeignWorld):
         return self._at(self.tables.truth, self._column(truth))
 
     def records(self, truth: Replayed) -> dict[str, Array]:
-        """Return the time since the start of the track, s, by name."""
+        """Return the values to record at a measurement, by name: the time since the start of the track, s."""
         return {"seconds": self._at(self.tables.seconds, self._column(truth))}
 
     def context(self, truth: Replayed) -> dict[str, Array]:
-        """Return the index of the replayed recording, by name."""
+        """Return the context by name: the index of the recording that each episode replays."""
         return {"recording": truth.number}
 
 
@@ -284,7 +284,7 @@ class LiveWorld(_ForeignWorld):
         return fill_arrays(like, parts.__getitem__, self.xp)
 
     def state(self, truth: Unknown) -> Array:
-        """Raise ValueError: the truth is unknown."""
+        """Raise ValueError, since the truth of live measurements is unknown."""
         raise ValueError(
             "the truth of what comes from outside is not known, so there is no error and no cost"
         )

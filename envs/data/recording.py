@@ -180,7 +180,7 @@ class Recording(ScenarioData):
     # --- as a scenario
 
     def fields(self) -> dict[str, Any]:
-        """Return the constructor's arguments by name."""
+        """Return the arrays and other constructor arguments of the recording, by name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
@@ -310,7 +310,7 @@ class Recording(ScenarioData):
 
     @functools.cached_property
     def tables(self) -> RecordedArrays:
-        """Arrays of all episodes, concatenated, as floats."""
+        """Arrays of all recorded episodes, concatenated along the last axis, as floats."""
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         ends = numpy.cumsum(self.rows)
 
@@ -480,7 +480,7 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
 
 
 def _first(values: numpy.ndarray) -> int:
-    """Return the index of the first row that is not finite."""
+    """Return the index of the first row of an array that is not finite."""
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 

@@ -59,12 +59,12 @@ class Trajectory(FlightData):
             )
 
     def fields(self) -> dict[str, Any]:
-        """Return the constructor's arguments by name."""
+        """Return the arrays and other constructor arguments of the trajectory, by name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last sample, s."""
+        """Time from the first to the last position of the flight, s."""
         return float(self.time[-1] - self.time[0])
 
     def intervals(self, interval: float) -> int:

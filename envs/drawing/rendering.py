@@ -152,7 +152,7 @@ class Picture:
         return True
 
     def open(self, figure: Figure) -> None:
-        """Create further panels and artists; called once, before the time series are created."""
+        """Create the panels that a subclass draws beside the time series; called once for a figure."""
 
     def begin(self, state: Any) -> None:
         """Prepare for a new episode, from its state after the first measurement."""
@@ -165,7 +165,7 @@ class Picture:
         """Set axis limits for the episode of :meth:`begin`; called before its first drawing."""
 
     def draw(self, history: History, state: Any) -> None:
-        """Update the further panels to the current measurement.
+        """Update the panels of :meth:`open` to the current measurement.
 
         Args:
             history: of the measurements acted on.
@@ -463,7 +463,7 @@ class EpisodePicture:
         return figure
 
     def _arrange(self) -> None:
-        """Set the axis limits for a new episode."""
+        """Set the axis limits of all panels for a new episode."""
         self._fresh = False
         for shade in self._shades:
             shade.remove()
@@ -520,7 +520,7 @@ class EpisodePictures:
         return (*drawn, *[numpy.full_like(drawn[0], 255)] * (self.count - len(drawn)))
 
     def close(self) -> None:
-        """Close the figures."""
+        """Close the figures of all pictures."""
         for picture in self.pictures:
             picture.close()
 

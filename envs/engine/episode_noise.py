@@ -171,7 +171,7 @@ class EpisodeNoise:
     # --- their numbers
 
     def advance(self) -> None:
-        """Advance all lanes to the next measurement."""
+        """Advance all lanes to the next measurement, so that :attr:`row` gives its random numbers."""
         if self._due:
             _ = self.row
         self._due, self._row = True, None

@@ -92,7 +92,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def observation_by_field(self) -> Array:
-        """Return the observation, ``(fields, width)``, valid until the next decision."""
+        """Return the observation of all lanes, ``(fields, width)``, valid until the next decision."""
         ...
 
     def observation(self, count: int) -> Array:
@@ -233,7 +233,7 @@ class ModelStepper:
         return self.observation(1)[0]
 
     def observation_by_field(self) -> Array:
-        """Return the observation, ``(fields, width)``."""
+        """Return the observation of all lanes, ``(fields, width)``, valid until the next decision."""
         if self.shown is None:
             self.shown = self.model.observe(self._episode)
         return self.shown
@@ -478,7 +478,7 @@ class Lanes:
 
     @property
     def has_episodes(self) -> bool:
-        """Whether episodes have been started."""
+        """Whether episodes have been started in the lanes."""
         return bool(self._moving)
 
     @property

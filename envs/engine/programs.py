@@ -130,7 +130,7 @@ class Programs:
         return self._kept[key]
 
     def function(self, function: Callable[..., Any], **options: Any) -> CompiledFunction:
-        """Return the compiled form of ``function(model, ...)``."""
+        """Return the compiled form of ``function(model, ...)``, from a cache."""
         if function not in self._functions:
             options = {"unchanged": 0, **options}
             self._functions[function] = CompiledFunction(
@@ -140,24 +140,24 @@ class Programs:
 
     @_ComputedOnce
     def filter_update(self) -> CompiledFunction:
-        """Compiled filter update; arrays of its state that never change are not written again."""
+        """Compiled function of the filter's update; arrays of its state that never change are not written again."""
         return self.function(_update, unchanged=None)
 
     @_ComputedOnce
     def world_advance(self) -> CompiledFunction:
-        """Compiled step of the world; arrays of the truth that never change are not written again."""
+        """Compiled function of a world's step; arrays of the truth that never change are not written again."""
         if self._of_world is not self:
             return self._of_world.world_advance
         return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
 
     @_ComputedOnce
     def filter_prediction(self) -> CompiledFunction:
-        """Compiled filter prediction with the observation."""
+        """Compiled function of the filter's prediction to a measurement, with the observation."""
         return self.function(_predict, turned=True)
 
     @_ComputedOnce
     def world_start(self) -> Specialised:
-        """Compiled start of the world."""
+        """Compiled function of the world's start: truth and initial estimate."""
         if self._of_world is not self:
             return self._of_world.world_start
         noise = self.traced.task.noise
@@ -166,7 +166,7 @@ class Programs:
 
     @_ComputedOnce
     def start(self) -> tuple[Specialised, Specialised]:
-        """Compiled starts of world and filter."""
+        """Compiled functions of the start of world and of filter."""
         truth, initial = self.world_start.example()
         return self.world_start, self.function(start_filter).specialise(
             initial, self.traced.truth_for_filter(truth)
@@ -174,13 +174,13 @@ class Programs:
 
     @_ComputedOnce
     def first(self) -> Parts:
-        """Compiled parts of the first step: from the start of the track to the first measurement."""
+        """Compiled functions of the first step: from the start of the track to the first measurement."""
         world, started = self.start
         return self._parts(world.example()[0], *started.example())
 
     @_ComputedOnce
     def later(self) -> Parts:
-        """Compiled parts of every later step: from an action to the next measurement.
+        """Compiled functions of every later step: from an action to the next measurement.
 
         Raises:
             NotTraceable: if one is no straight line of arithmetic.
@@ -211,7 +211,7 @@ class Programs:
 
     @property
     def row(self) -> numpy.ndarray:
-        """Array of the shape of a measurement's random numbers."""
+        """Zeros in the shape of a measurement's random numbers, ``(normals + row_uniforms, 8)``."""
         return numpy.zeros((self.traced.task.noise.normals + self.traced.task.noise.row_uniforms, 8))
 
     def _parts(self, truth: Any, state: Any, feedback: Any) -> Parts:

@@ -27,7 +27,7 @@ from .programs import Report
 
 
 def mean_reward(rewards: Sequence[Any]) -> Any:
-    """Return the mean reward over the measurements of one decision."""
+    """Return the mean of the rewards at the measurements of one decision."""
     return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
 
 
@@ -401,14 +401,14 @@ class Stepper:
         return map_arrays(lambda i: reports[i], self._report_template), actions
 
     def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
-        """Return the zero arrays that are a policy's memory before its first action."""
+        """Return zero arrays in the shape of a compiled policy's memory."""
         blank = memory_of(compiled_policy.outputs[1:] if compiled_policy else (), self.width)
         for array in blank:
             array[...] = 0.0
         return blank
 
     def reports(self) -> list[Any]:
-        """Return the reports of the last :meth:`decide`, one a measurement."""
+        """Return the reports of the last :meth:`decide`, one a measurement, of arrays ``(..., width)``."""
         return [
             copy_arrays(self._report_template, [rows[k] for rows in self.reported], self._report_kinds)
             for k in range(self._interval)

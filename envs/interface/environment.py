@@ -97,7 +97,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode and return its first observation and ``info``.
+        """Start a new episode; return the observation of its first measurement, and ``info``.
 
         ``options["scenario"]``: as the argument ``scenario`` of the environment; None: the environment's own again.
         ``options["parameters"]``: parameters that override those of the environment; ``{}`` for none. Each applies
@@ -174,7 +174,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return None if self._late is None else self._late.picture
 
     def render(self) -> numpy.ndarray | None:
-        """Return an image of the episode so far.
+        """Return an image of the episode so far in mode "rgb_array"; None otherwise.
 
         Returns:
             ``(height, width, 3)`` bytes in render mode "rgb_array"; None in "human", whose window is drawn by

@@ -78,7 +78,7 @@ class EnvBase:
         count: int,
         longest: int | None,
     ) -> None:
-        """Create the models, the lanes and the spaces.
+        """Create the models of a scenario, their lanes, and the spaces of the environment.
 
         Args:
             make: function that makes a model from a scenario and parameters.

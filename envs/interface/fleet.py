@@ -113,7 +113,7 @@ class Fleet:
 
     @property
     def only(self) -> Lanes:
-        """Lanes of the only task.
+        """The :class:`.Lanes` of the only task.
 
         Raises:
             ValueError: for several tasks.

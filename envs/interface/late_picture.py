@@ -42,7 +42,7 @@ class LatePicture:
 
     @property
     def picture(self) -> EpisodePicture:
-        """Picture of all steps so far."""
+        """Picture of the episode, after all stored actions have been applied."""
         lanes, picture = self._lanes, self._picture
         if self._identity is not None:
             lanes.begin(self._identity)

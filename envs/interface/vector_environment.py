@@ -313,7 +313,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return lambda state: pictures.keep(state, actions, shown)
 
     def render(self) -> tuple[numpy.ndarray, ...] | None:
-        """Return images of the first few sub-environments' episodes so far (:data:`.rendering.MAX_PICTURES`).
+        """Return images of the first few sub-environments in mode "rgb_array"; None otherwise.
 
         Returns:
             A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few: drawing takes
@@ -332,7 +332,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self.pictures.frames(self.fleet.only.state)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the figures of the pictures."""
+        """Close the figures in which sub-environments are drawn."""
         if self.pictures is not None:
             self.pictures.close()
 

@@ -83,7 +83,7 @@ class StateSpaceModel:
 
     @property
     def is_linear(self) -> bool:
-        """Return whether f and h are matrices."""
+        """Return whether both f and h are given as matrices."""
         maps = (self.f, self.h)
         return all(one.matrix is not None and not numpy.any(one.offset) for one in maps)
 
@@ -270,7 +270,7 @@ class StateSpaceProblem(Task):
     parameters: StateSpaceParameters
 
     def set_up(self) -> None:
-        """Compute the filters' models on the task's arrays."""
+        """Create the :class:`Equations` of the filters' models on the task's arrays."""
         own = self.definition
         self.filter_equations: list[Equations] = [Equations(self, model) for model in own.filters]
         count = len(own.filters)
@@ -542,7 +542,7 @@ class Equations:
         return values
 
     def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
-        """Return a text on the first finite state at which a value is not finite; empty if there is none."""
+        """Return a text on a function's first value that is not finite, at a finite state; empty if there is none."""
         entries = values.reshape(len(values), -1, x.shape[1])
         wrong = numpy.asarray(~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0))
         if not wrong.any():

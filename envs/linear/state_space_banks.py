@@ -90,12 +90,12 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
     @property
     def action_names(self) -> Sequence[str]:
-        """Names of the entries of the action."""
+        """Names of the entries of the action, in order."""
         raise NotImplementedError
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of a filter with one model."""
+        """Observation blocks: normalised innovations, NIS, averages, availability, and the last action."""
         parts = tuple(map(str, range(1, self.sensors + 1))) if self.sensors > 1 else ()
         return (
             innovation_block(parts, text="innovations over their sigma"),
@@ -111,7 +111,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Return the filter's state at the start of the track."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         zero = 0.0 * initial.mean[0]
         return ExtendedKalmanState(
             initial.mean,
@@ -181,11 +181,11 @@ class StateSpaceNoiseBank(StateSpaceBank):
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return Q scaled by the action, ``(n, n, N)``."""
+        """Return the process noise Q scaled by the action, ``(n, n, N)``."""
         return self._scale(action, 0) * self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return R scaled by the action, ``(m, m, N)``."""
+        """Return the measurement noise R scaled by the action, ``(m, m, N)``."""
         return self.equations.sensor_noise(mean, measurement, self._scale(action, 1))
 
     def act(
@@ -286,7 +286,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Return the filter's state at the start of the track."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         return super().start(initial)._replace(correction=0.0 * initial.mean)
 
     def _part(self, action: Array, place: int) -> Array:
@@ -296,12 +296,12 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         return action[ends[place] : ends[place + 1]]
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return Q under the action, ``D Q D``, ``(n, n, N)``."""
+        """Return the process noise ``D Q D`` that the action sets, ``(n, n, N)``."""
         Q = self.equations.process_noise(mean, measurement)
         return self._scaled(Q, NOISE_RANGE, self._part(action, 0))
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return R under the action, ``W R W``, ``(m, m, N)``."""
+        """Return the measurement noise ``W R W`` that the action sets, ``(m, m, N)``."""
         R = self.equations.sensor_noise(mean, measurement)
         return self._scaled(R, NOISE_RANGE, self._part(action, 1))
 

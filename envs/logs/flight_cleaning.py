@@ -23,7 +23,7 @@ class Cleaning(NamedTuple):
     smoothing: float
 
     def check(self) -> None:
-        """Raise ValueError if a limit is out of range."""
+        """Raise ValueError if a limit of the cleaning is out of its range."""
         check("longest_gap", self.longest_gap, float, ParameterLimits(above=0.0))
         check(
             "speeds", freeze(self.speeds), tuple[float, float], ParameterLimits(at_least=0.0, ascending=True)

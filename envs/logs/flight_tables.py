@@ -112,7 +112,7 @@ class ColumnNames(frozenset[str]):
 
     @property
     def request(self) -> dict[str, Any]:
-        """Names in the form of a parser's arguments."""
+        """The names and the prefix as arguments of a parser in a subprocess."""
         return {"names": sorted(self), "prefix": self.prefix}
 
 
@@ -328,7 +328,7 @@ def suffix_of(file: Path) -> str:
 
 
 def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTable:
-    """Return the known columns of a file of a table, all names and notes.
+    """Return the known columns of a file, the names of all its columns, and notes.
 
     Args:
         file: path with one of ``FLIGHT_SUFFIXES``.

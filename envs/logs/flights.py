@@ -88,7 +88,7 @@ class Flights(FlightData):
             object.__setattr__(self, "sources", found)
 
     def fields(self) -> dict[str, Any]:
-        """Return the constructor's arguments by name."""
+        """Return the trajectories and other constructor arguments of the set, by name."""
         flown = [trajectory.fields() for trajectory in self.trajectories]
         return {"trajectories": flown, "name": self.name, "fewest_scans": self.fewest_scans}
 

@@ -381,7 +381,7 @@ def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) ->
 
 
 def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.ndarray) -> None:
-    """Raise ValueError if the truth is far from the measurements."""
+    """Raise ValueError if the truth is much farther from the measurements than their deviations."""
     known = numpy.isfinite(truth).all(axis=1)
     if not known.any():
         return

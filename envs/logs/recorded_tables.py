@@ -82,7 +82,7 @@ class Columns:
 
     @property
     def time(self) -> numpy.ndarray:
-        """Times, s, ``(rows,)``."""
+        """Times of the rows, s, ``(rows,)``."""
         return self["time"]
 
     @property
@@ -99,7 +99,7 @@ class Columns:
         return f"row {self.table.index[number]}"
 
     def only(self, rows: numpy.ndarray) -> "Columns":
-        """Return a copy with only some of the rows."""
+        """Return a copy of the columns with only some of the rows."""
         return Columns(self.name, self.table[rows], self.given, self.log_time[rows])
 
     def drop_duplicates(self) -> None:
@@ -315,7 +315,7 @@ def read_columns(
     rename: Mapping[str, str | Sequence[str]] | None = None,
     sort: bool = False,
 ) -> Recording:
-    """Return the recording of a table of measurements.
+    """Return the :class:`.Recording` made of a table of measurements.
 
     Args:
         path: path of a file.
@@ -532,7 +532,7 @@ def _side_by_side(
     reading_notes: Iterable[str],
     original: Mapping[str, str],
 ) -> Recording:
-    """Return one recording of all recordings in a file."""
+    """Return one recording that contains all recordings of a file."""
     first, known = parts[0][0], parts[0][1].parameters
     task = cls(cls.Parameters(**{**known, **keywords}))
     true = _true_columns(task, first)

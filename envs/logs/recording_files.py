@@ -109,7 +109,7 @@ def _whole(name: str, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapping[str, Any]) -> Recording:
-    """Return the recording in a NetCDF file.
+    """Return the recording in a NetCDF file, after checks of environment and parameters.
 
     Args:
         path: path of the file.

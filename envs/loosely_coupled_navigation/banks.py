@@ -287,7 +287,7 @@ class NoiseBank(KalmanBucyBank):
         return last_action_block(NOISES)
 
     def start(self, initial: Initial) -> Augmented:
-        """Return the state at the start: INS and reference agree, the rate errors have their modelled prior."""
+        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
         zero = 0.0 * initial.mean
         covariance = self.parameters.prior_covariance(zero[0])
         return Augmented(
@@ -378,7 +378,7 @@ class GainBank(KalmanBucyBank):
         return last_action_block(self.axes)
 
     def start(self, initial: Initial) -> GainState:
-        """Return the state at the start: INS and reference agree."""
+        """Return the bank's state at the start of the track, where INS and reference agree."""
         zero = 0.0 * initial.mean
         variance = ins_gnss.PlainVariance(zero, zero, zero, zero)
         return GainState(initial.mean, variance, self.no_innovations(zero), zero, zero)
@@ -391,7 +391,7 @@ class GainBank(KalmanBucyBank):
         return state._replace(position=position, variance=variance, seen=seen)
 
     def gain(self, action: Array) -> Array:
-        """Return the gain for an action in [-1, 1].
+        """Return the gain that an action in [-1, 1] sets: 0 at -1, the paper's at 0, 1 at +1, logarithmic in between.
 
         Its logarithm is linear, from the smallest gain over the paper's at 0 to a gain of one at 1; at -1 the gain
         is zero.
@@ -475,7 +475,7 @@ class SchemeBank(KalmanBucyBank):
         return last_weight_block(names, value=lambda f: f.weights, text="weight of the last measurement")
 
     def start(self, initial: Initial) -> Schemes:
-        """Return all filters at the start: INS and reference agree, the rate errors have their modelled prior."""
+        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
         xp, p = self.xp, self.parameters
         zero = 0.0 * initial.mean
         each = xp.stack([zero] * 3)

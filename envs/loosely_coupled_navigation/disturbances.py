@@ -105,7 +105,7 @@ class NoiseChanges(Disturbance):
         return state._replace(level=level, report=report)
 
     def change_deviations(self, state: Levels, deviations: Array) -> Array:
-        """Return the deviations times the true level of this measurement, m."""
+        """Return the standard deviations times the receiver's true level at this measurement, m."""
         return state.level * deviations
 
     def change_measurement(
@@ -123,7 +123,7 @@ class NoiseChanges(Disturbance):
         }
 
     def records(self, state: Levels) -> dict[str, Array]:
-        """Return the reported standard deviation to record, by name."""
+        """Return the values to record at a measurement, by name: the reported standard deviation."""
         return {"reported_deviation": state.report}
 
 
@@ -186,7 +186,7 @@ class _Once(Disturbance):
         return Spell(window, zero, zero)
 
     def advance(self, state: Spell, step: DisturbanceInput) -> Spell:
-        """Return the state with the number of this measurement."""
+        """Return the disturbance's state with the number of this measurement, for comparison with its window."""
         return state._replace(number=step.number)
 
     def context(self, state: Spell) -> dict[str, Array]:
@@ -280,7 +280,7 @@ class ReceiverOutliers(Outliers):
         return parameters.outlier_probability, math.sqrt(parameters.outlier_factor)
 
     def change_deviations(self, state: Array, deviations: Array) -> Array:
-        """Return the deviations times the outlier factor of this measurement."""
+        """Return the standard deviations times the outlier factor of this measurement."""
         return state * deviations if self.probability else deviations
 
 

@@ -149,7 +149,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         self.onsets: Array = task.constant(numpy.arange(float(prior.onsets)))[:, None] * self.spacing
 
     def start(self, initial: Initial) -> FaultState:
-        """Return the bank at the start: INS and reference agree, no pull."""
+        """Return the bank's state at the start of the track: INS and reference agree, no pull (spoofing)."""
         xp, noises = self.xp, self.noises
         none = 0.0 * initial.mean[0]
         zero = none + 0.0 * noises.drift
@@ -258,7 +258,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return state._replace(memory=memory)
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where there is a fix, zero elsewhere, ``(N,)``."""
+        """Return one where there is a fix, so that an action has an effect, zero elsewhere, ``(N,)``."""
         return measurement.available
 
     def examine(self, state: FaultState, measurement: Measurement) -> Weighing:
@@ -307,7 +307,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
 
     def predict_part(self, h: Hypotheses, noises: Noises) -> Hypotheses:
-        """Return some hypotheses with these noises predicted by one step."""
+        """Return some hypotheses predicted by one step, with these noises."""
         xp, s = self.xp, self.parameters.sampling
         one, zero = 0.0 * noises.decay + 1.0, 0.0 * noises.decay
         pulls = h.mean.shape[0] - 4
@@ -463,7 +463,7 @@ def _exponential(power: Any) -> Any:
 
 
 def _flat(h: Hypotheses) -> list[Array]:
-    """Return the arrays of the hypotheses' covariance as a flat list."""
+    """Return the arrays of some hypotheses' covariance as a flat list."""
     return [*h.covariance.ins, h.covariance.cross, h.covariance.faults]
 
 

@@ -99,7 +99,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         return last_action_block(tuple(self.own.settings))
 
     def start(self, initial: Initial) -> HypothesesState:
-        """Return the state at the start of the track."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         own, zero = self.own.start(initial), 0.0 * initial.mean
         memory, none = own.memory, zero[0]
         weights = self.own.join([memory.free.weights, memory.pulled.weights], 0)

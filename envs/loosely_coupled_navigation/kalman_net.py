@@ -68,7 +68,7 @@ class KalmanNetBank(NoiseBank):
         return Block("last_action", lambda f, _: f.action, "action applied before", (*NOISES, *GAINS))
 
     def start(self, initial: Initial) -> Augmented:
-        """Return the state at the start: INS and reference agree, the rate errors have their modelled prior."""
+        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
         state = super().start(initial)
         return state._replace(action=self.xp.concat([state.action, state.action]))
 

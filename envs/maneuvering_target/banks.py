@@ -126,7 +126,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         return self.where_detected(measurement, self.forgetting * old + (1.0 - self.forgetting) * new, old)
 
     def interval(self, measurement: Measurement) -> float | Array:
-        """Return the time since the previous scan, s."""
+        """Return the time since the previous scan, s; one number where scans are regular."""
         return self.T if self.regular else measurement.interval
 
     def time_since_last(self, measurement: Measurement) -> float | Array:
@@ -231,7 +231,7 @@ class GainBank(RadarBank):
         )
 
     def start(self, initial: Initial) -> AlphaBeta:
-        """Return the filter's state at the start of the track, equation (24)."""
+        """Return the bank's state at the start of the track, equation (24)."""
         xp, P = self.xp, initial.covariance
         variance, velocity_variance = xp.stack([P[0, 0], P[1, 1]]), xp.stack([P[2, 2], P[3, 3]])
         zero = 0.0 * variance
@@ -252,7 +252,7 @@ class GainBank(RadarBank):
         )
 
     def predict(self, state: AlphaBeta, measurement: Measurement) -> AlphaBeta:
-        """Return the state predicted to the scan, with innovation statistics."""
+        """Return the filter's state predicted to the scan, with innovation statistics."""
         xp, f, interval = self.xp, state, self.interval(measurement)
         predicted = alpha_beta.predict(f.mean[:2], f.mean[2:], interval)
         covariance = alpha_beta.predict_covariance(f.covariance, interval)
@@ -386,7 +386,7 @@ class FilterBank(RadarBank):
         )
 
     def start(self, initial: Initial) -> Filters:
-        """Return all filters at the start of the track, equation (24)."""
+        """Return the bank's state at the start of the track, equation (24)."""
         xp, m = self.xp, self.count
         zeros = xp.stack([0.0 * initial.mean[:2]] * m, axis=1)
         probabilities = self.task.constant(self.parameters.initial_probabilities)[:, None] + zeros[0]
@@ -495,7 +495,7 @@ class GainsBank(FilterBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gymnasium box with one number for each filter."""
+        """Gymnasium box with one number for each filter, which moves its position gain."""
         return gymnasium.spaces.Box(-1.0, 1.0, (self.count,), numpy.float32)
 
     @property

@@ -60,7 +60,7 @@ class Clutter(Disturbance):
 
     @classmethod
     def is_enabled(cls, parameters: ManeuveringTargetParameters) -> bool:
-        """Return whether the parameters give a density of false plots."""
+        """Return whether the parameters give a density of false plots above zero."""
         return parameters.cluttered
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ClutterState:

@@ -216,7 +216,7 @@ class StatedManeuver(Maneuvered):
     turns = False
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
-        """Return the constant flight and its start, without a random number."""
+        """Return the constant manoeuvre of the flight and the motion at its start, without a random number."""
         p, constant, once = self.parameters, self.task.constant, ones[None]
         first, last = p.maneuver_steps
         effect = constant((0.0, 0.0, 0.0, 0.0, *p.acceleration))[:, None, None] * once
@@ -321,12 +321,12 @@ class Legs(NamedTuple):
 
     @property
     def time(self) -> Array:
-        """Time since the start of the track, s, ``(legs + 1, N)``."""
+        """Start time of each leg since the start of the track, s, ``(legs + 1, N)``."""
         return self.begins[:, 0]
 
     @property
     def turn(self) -> Array:
-        """Turn rate, rad/s, ``(legs + 1, N)``."""
+        """Turn rate of each leg, rad/s, ``(legs + 1, N)``."""
         return self.begins[:, 1]
 
 
@@ -403,7 +403,7 @@ class Table(Course):
         """Rows x, y, vx, vy, ``(4, horizon + 2)``; several flights are concatenated."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
-        """Return the constant flight and its start, without a random number."""
+        """Return the constants of the flight and the motion at its start, without a random number."""
         return None, (self.table[:2, 0, None] * ones, self.table[2:, 0, None] * ones)
 
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:

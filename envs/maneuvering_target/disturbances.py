@@ -48,12 +48,12 @@ class ColouredScanErrors(Disturbance):
         )
 
     def advance(self, state: ColouredScanErrorsState, step: DisturbanceInput) -> ColouredScanErrorsState:
-        """Return the state with the errors of the next scan."""
+        """Return the state with the coloured errors of the next scan."""
         process = GaussMarkov.sampled(state.deviation, state.correlation_time, step.interval, self.xp)
         return state._replace(level=process.advance(state.level, step.normals))
 
     def change_errors(self, state: ColouredScanErrorsState, errors: Array) -> Array:
-        """Return the errors with the coloured ones added."""
+        """Return the sensor errors with the coloured ones added."""
         return errors + state.level
 
     def context(self, state: ColouredScanErrorsState) -> dict[str, Array]:
@@ -72,11 +72,11 @@ class Bias(Disturbance):
         return parameters.bias > 0.0
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Return the drawn constant errors, ``(2, N)``."""
+        """Return the drawn constant sensor errors, ``(2, N)``."""
         return draws.uniform("bias", (-self.parameters.bias, self.parameters.bias), 2)
 
     def change_errors(self, state: Array, errors: Array) -> Array:
-        """Return the errors with the bias added."""
+        """Return the sensor errors with the constant ones added."""
         return errors + state
 
     def context(self, state: Array) -> dict[str, Array]:

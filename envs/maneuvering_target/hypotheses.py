@@ -98,7 +98,7 @@ class HypothesesBank(SettingsBank, RadarBank):
         )
 
     def start(self, initial: Initial) -> HypothesesState:
-        """Return the state at the start of the track."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         own, none = self.own.start(initial), 0.0 * initial.mean[:2]
         groups = self.group(self.xp.concat([table.probability for table in own.track]))
         action = self.xp.stack([none[0]] * len(self.own.settings))

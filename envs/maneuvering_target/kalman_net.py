@@ -221,7 +221,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         )
 
     def start(self, initial: Initial) -> KalmanNetState:
-        """Return the filter's state at the start of the track."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         none = 0.0 * initial.mean[:2]
         sensor = self.xp.stack([initial.covariance[0, 0], initial.covariance[1, 1]])
         deviation = NOMINAL_ACCELERATION + none

@@ -85,7 +85,7 @@ class PlotInput(LiveInput):
         return east_north(self.read(values, "odometry_speed"), heading)
 
     def _position(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return x and y of a plot, m; NaN where there is none."""
+        """Return x and y of a plot from its Cartesian or polar values, m; NaN where there is none."""
         if "latitude" in values or "longitude" in values:
             return self._project(values)
         if "range" not in values:

@@ -144,12 +144,12 @@ class ManeuveringTargetParameters(TaskParameters):
 
     @property
     def cluttered(self) -> bool:
-        """Return whether there are false plots."""
+        """Return whether the radar reports false plots (clutter)."""
         return self.clutter_density[1] > 0.0
 
     @property
     def coloured(self) -> bool:
-        """Return whether errors may be coloured."""
+        """Return whether measurement errors may be correlated from scan to scan."""
         return self.coloured_sigma[1] > 0.0
 
     @property

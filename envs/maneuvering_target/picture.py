@@ -136,7 +136,7 @@ class ManeuveringTargetPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Return the time series of innovation, action and error."""
+        """Return the time series of innovation, gain or weights, and error."""
         axes: Sequence[str] = "xy"
         if self.model.control == "gain":
             steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
@@ -252,7 +252,7 @@ class ManeuveringTargetPicture(Picture):
         self.close_up.set_ylim(-reach, reach)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Update all artists to the current scan."""
+        """Update the track, the close-up and their texts to the current scan."""
         seen = int(state.measurement.available[0])
         self.arrived.set_data(*(state.measurement.position[:, :seen] / 1e3))
         pairs = {name: _pair(history, name) for name in ("true", "measured", "estimated")}

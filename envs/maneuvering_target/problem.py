@@ -11,7 +11,7 @@ class TargetProblem(Task):
     parameters: ManeuveringTargetParameters
 
     def set_up(self) -> None:
-        """Determine whether the scans are regular."""
+        """Determine whether the scans are regular: on time, and all see the target."""
         self.regular: bool = self.parameters.regular and (
             self.recording is None or has_regular_scans(self.recording, self.parameters)
         )

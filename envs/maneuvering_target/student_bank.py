@@ -106,7 +106,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
     @property
     @abstractmethod
     def features(self) -> Sequence[Block]:
-        """Observation blocks beside the innovation, relative to the frame."""
+        """Observation blocks beside the innovation, in units of the frame; a subclass declares them."""
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
@@ -134,7 +134,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         )
 
     def start(self, initial: Initial) -> StudentState:
-        """Return the state at the start of the track."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         frame, none = self.rotate(initial.mean), 0.0 * initial.mean
         motion = self.xp.stack([none[0]] * max(len(self.motions), 1))
         innovation = self.xp.stack([none[0]] * self.measured)

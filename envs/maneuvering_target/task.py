@@ -169,7 +169,7 @@ class ManeuveringTarget(TargetProblem):
         self.closes_loop: bool = self.parameters.cluttered
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> ReportedTrack:
-        """Return the track around which the radar returns plots, in clutter."""
+        """Return the filter's estimate, around which the radar returns plots, in clutter."""
         return ReportedTrack(mean, covariance)
 
 

@@ -109,7 +109,7 @@ class HypothesesBank(SettingsBank):
         )  # fmt: skip
 
     def start(self, initial: Start) -> HypothesesState:
-        """Return the state at the start of the track."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         xp, own, none = self.xp, self.own.start(initial), 0.0 * initial.mean[0]
         groups = self.group(own.tracks.weights)
         return HypothesesState(

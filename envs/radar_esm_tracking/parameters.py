@@ -132,7 +132,7 @@ class RadarEsmTrackingParameters(TaskParameters):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Names of the classes."""
+        """Names of the target classes, S0, S1 and so on."""
         return tuple(f"S{s}" for s in range(len(self.manoeuvrability)))
 
     def check(self) -> None:

@@ -172,7 +172,7 @@ class RadarEsmTrackingPicture(Picture):
         self.acceleration.set_ylim(-self.height, self.height)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Update all artists to the current scan."""
+        """Update accelerations and ESM decisions to the current scan."""
         empty = numpy.empty(0)
         times = numpy.arange(1, len(history.get("true", empty)) + 1)
 

@@ -188,7 +188,7 @@ class HypothesisBank(SatelliteBank):
         return bank_action_space(self.control, len(self.hypotheses))
 
     def start(self, initial: Initial) -> Filters:
-        """Return every filter at the initial estimate, with the initial probabilities."""
+        """Return the bank's state at the start of the track, with the initial probabilities."""
         xp, M, task = self.xp, len(self.hypotheses), self.task
         zeros = 0.0 * initial.mean[0]
         means = xp.stack([initial.mean] * M, axis=1)
@@ -274,7 +274,7 @@ class HypothesisBank(SatelliteBank):
         thresholds: Sequence[Array] | None = None,
         cautions: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
-        """Return steps 5 and 6: the update of every filter with the readings."""
+        """Return steps 5 and 6: every filter updated with the readings."""
         expected, rows = gnss_ins.observe(
             means,
             measurement.satellite_position[:, :, None],
@@ -335,7 +335,7 @@ class HypothesisBank(SatelliteBank):
         return imm.combine(state.means, covariances, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name.
+        """Return the values to record at a measurement, by name: probabilities, NIS, log-likelihood, aperture.
 
         They are the probabilities, the NIS of the combination with its degrees of freedom, the log-density of the
         measurement
@@ -359,7 +359,7 @@ class NoiseBank(HypothesisBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gymnasium box with one number for each group of sensors."""
+        """Gymnasium box with one number for each group of sensors, which scales its noise."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.actions),), numpy.float32)
 
     @property

@@ -109,12 +109,12 @@ class _Once(_OfSatellites):
         return None
 
     def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
-        """Return the state with ``now`` set for this step."""
+        """Return the disturbance's state with ``now`` set: whether it occurs at this step."""
         happens = (step.number >= state.window[0]) & (step.number <= state.window[1])
         return state._replace(now=self.xp.astype(happens, state.now.dtype))
 
     def is_at(self, state: Fault) -> Array:
-        """Return whether it affects each satellite now, booleans ``(S, N)``."""
+        """Return booleans ``(S, N)``: whether the disturbance affects each satellite now."""
         chosen = self.places == state.satellites[0]
         for i in range(1, state.satellites.shape[0]):
             chosen = chosen | (self.places == state.satellites[i])
@@ -351,7 +351,7 @@ class Ramp(_Hidden):
     causes = (Cause("wrong range", f"where a pseudorange is off by more than {PULLED:g} m", _is_pulled),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Return the state without a ramp, which :meth:`complete` draws."""
+        """Return the disturbance's state without a ramp; :meth:`complete` draws one."""
         return Fault(self.xp.stack([zero - 1.0] * 2), zero[None], self.xp.stack([zero] * 2), zero)
 
     def complete(self, state: Fault, draws: Draws) -> Fault:
@@ -392,7 +392,7 @@ class Aperture(_OfSatellites):
     name = "aperture"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Return zeros, the state without an aperture, for :meth:`complete`."""
+        """Return zeros, the disturbance's state without an aperture; :meth:`complete` draws one."""
         return zero
 
     def complete(self, state: Array, draws: Draws) -> Array:

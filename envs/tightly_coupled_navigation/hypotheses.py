@@ -106,7 +106,7 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
         )  # fmt: skip
 
     def start(self, initial: Initial) -> HypothesesState:
-        """Return the state at the start."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         xp, S, M = self.xp, self.task.satellites, len(self.hypotheses)
         own, none = self.own.start(initial), 0.0 * initial.mean[0]
         probabilities = xp.concat([own.hypotheses.probabilities, none[None]])

@@ -89,7 +89,7 @@ class KalmanNetBank(RobustBank):
         return (*shown, sure, last)
 
     def start(self, initial: Initial) -> Filters:
-        """Return the filter at the initial estimate."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         state = super().start(initial)
         certain = state.log_likelihood
         return state._replace(log_predicted=certain, probabilities=1.0 + certain)
@@ -132,7 +132,7 @@ class KalmanNetBank(RobustBank):
         return self._combine(state, state.probabilities, exponent)
 
     def covariance(self, state: Filters) -> Array:
-        """Return the covariance of the filter, ``(17, 17, N)``."""
+        """Return the covariance of the single filter, ``(17, 17, N)``."""
         return unpack(state.covariances[:, 0], gnss_ins.SIZE)
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:

@@ -210,7 +210,7 @@ class TightlyCoupledNavigationPicture(Picture):
         self.course.set_ylim(0.5 * (south + north) - half, 0.5 * (south + north) + half)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Update all artists to the current step."""
+        """Update course, accelerations and sensor faults to the current step."""
         nothing = numpy.empty(0)
         pairs = {}
         for name in ("true", "estimated"):

@@ -234,7 +234,7 @@ class _KalmanBank(AutopilotBank):
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
     def start(self, initial: Start) -> KalmanState:
-        """Return the filter at the initial estimate, with the averages of a consistent filter."""
+        """Return the bank's state at the start of the track, with the averages of a consistent filter."""
         xp = self.xp
         zeros = 0.0 * self.task.readings_of(initial.mean)
         one = zeros[0] + 1.0

@@ -82,11 +82,11 @@ class NoisySensors(_OfSensors):
         return SensorLevels(state.levels._replace(values=values), values[0])
 
     def advance(self, state: SensorLevels, step: DisturbanceInput) -> SensorLevels:
-        """Return the state with the factors of this measurement."""
+        """Return the state with the factors on the sensors' noise at this measurement."""
         return state._replace(level=state.levels.at(step.number, self.xp))
 
     def change_deviations(self, state: SensorLevels, deviations: Array) -> Array:
-        """Return the standard deviations times the factors."""
+        """Return the standard deviations times the factors on the sensors' noise."""
         return deviations * state.level
 
     def context(self, state: SensorLevels) -> dict[str, Array]:
@@ -161,7 +161,7 @@ class SensorBias(_OfSensors):
         return state, reading + state if self.parameters.sensor_bias[1] else reading
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return the context: the constant errors, by name."""
+        """Return the context: the sensors' constant errors, by name."""
         return {"sensor_bias": state}
 
 

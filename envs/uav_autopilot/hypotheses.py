@@ -112,7 +112,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         return state.log_trace
 
     def start(self, initial: Start) -> HypothesesState:
-        """Return the state at the start, with the averages of a consistent filter."""
+        """Return the bank's state at the start of the track, with the averages of a consistent filter."""
         own = self.own.start(initial)
         zeros = 0.0 * self.task.readings_of(initial.mean)
         none = zeros[0]

@@ -187,7 +187,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         """Exponents of the first two factors in each hypothesis' weight, ``(2, H, 1)``."""
 
     def start(self, initial: Initial | Start) -> Levels:
-        """Return all hypotheses at the initial estimate."""
+        """Return the bank's state at the start of the track, all hypotheses at the initial estimate."""
         xp, none = self.xp, 0.0 * initial.mean[0]
         mean = xp.stack([*initial.mean, *[none] * (self.size - self.n)])
         hypotheses = LevelHypotheses(
