@@ -240,6 +240,6 @@ class LogSetup(NamedTuple):
 
     @property
     def assumed(self) -> dict[str, float]:
-        """Parameters by which a log without deviations is read with the same ones; empty if the log stated any."""
+        """Parameter ``range_sigma`` with the deviation assumed for a log that stated none; empty if it stated any."""
         isotropic = self.deviations.get("sigma_x") if is_assumed(self.deviations_from) else None
         return {} if isotropic is None else {"range_sigma": isotropic}

@@ -397,7 +397,7 @@ class Lanes:
     def run(
         self, report: Report, compiled_policy: Specialised | None = None, measurements: int | None = None
     ) -> tuple[Any, Any]:
-        """Run the episodes in native code to the end, and return the reports on every measurement and the actions.
+        """Run the episodes over many measurements in native code; return the reports on each and the actions.
 
         Args:
             report: as of :meth:`decide`; :func:`.compiled.can_step` must be true for it.

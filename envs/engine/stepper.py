@@ -461,7 +461,7 @@ class _Bound(NamedTuple):
 
 
 def _bound(draw: Call, sequences: list[CallSequence], shown: list[list[Call]]) -> _Bound:
-    """Return the combined calls that start from either copy of the episodes."""
+    """Return the native calls that start from either copy of the episodes, combined in one object."""
     sequences[1].count_with(sequences[0])
     return _Bound(draw, sequences, shown)
 

@@ -181,7 +181,7 @@ class Fleet:
         return part
 
     def _arrange(self) -> None:
-        """Delete lanes without episodes, and update the index of every environment's lane."""
+        """Delete the lanes of tasks no longer in use, and update the index of every environment's lane."""
         needed = [
             model.task.parameters for distribution in self._distributions for model in distribution.models
         ]
@@ -248,7 +248,7 @@ class Fleet:
         self._arrange()
 
     def _leave(self, whole: Lanes) -> None:
-        """Convert the index of a single task's lanes into that of several tasks."""
+        """Switch from the lanes of a single task to lanes of several tasks, and keep running episodes."""
         self.whole = None
         if whole.has_episodes:
             whole.grow(whole.width)

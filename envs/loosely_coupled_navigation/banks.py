@@ -391,10 +391,9 @@ class GainBank(KalmanBucyBank):
         return state._replace(position=position, variance=variance, seen=seen)
 
     def gain(self, action: Array) -> Array:
-        """Return the gain that an action in [-1, 1] sets: 0 at -1, the paper's at 0, 1 at +1, logarithmic in between.
+        """Return the gain that an action in [-1, 1] sets: 0 at -1, the paper's at 0, and 1 at +1.
 
-        Its logarithm is linear, from the smallest gain over the paper's at 0 to a gain of one at 1; at -1 the gain
-        is zero.
+        Its logarithm is linear in the action on either side of 0, from ``smallest_gain`` just above -1.
         """
         middle, smallest = self.middle, math.log(self.parameters.smallest_gain)
         # Torch would choose between two numbers in float32.

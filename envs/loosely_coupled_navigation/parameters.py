@@ -192,13 +192,13 @@ class LooselyCoupledNavigationParameters(TaskParameters):
 
     @property
     def plain_growth(self) -> tuple[float, float]:
-        """Variance that the position error gains between measurements, by the two tunings, m^2."""
+        """Variance that the position error gains between measurements, for each of the two tunings, m^2."""
         white, reduced = self.equivalent_intensities
         return white * self.sampling_interval, reduced * self.sampling_interval
 
     @property
     def steady_state_gains(self) -> tuple[float, float]:
-        """Steady-state gains of the plain scheme, by the two tunings."""
+        """Steady-state gains of the plain scheme for each of the two tunings."""
         white, reduced = (ins_gnss.steady_state_gain(q, self.receiver_variance) for q in self.plain_growth)
         return white, reduced
 

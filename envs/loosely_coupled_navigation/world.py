@@ -190,7 +190,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return truth, measurement
 
     def state(self, truth: Truth) -> Array:
-        """Return the true position, m, ``(A, N)``."""
+        """Return the true position of the vehicle, m, ``(A, N)``."""
         return truth.reference
 
     def component_readings(self, measurement: Measurement) -> Array:

@@ -277,7 +277,7 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
 
 
 def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
-    """Return the typical deviations, in the form of columns, and their source."""
+    """Return the typical deviations of the plots by column name, and the source of these numbers in words."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:
         if columns.has(*pair):

@@ -288,7 +288,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return state._replace(track=tuple(table.pack() for table in tables))
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where the scan saw the target, zero elsewhere, ``(N,)``."""
+        """Return one where the scan saw the target, so that an action has an effect, zero elsewhere, ``(N,)``."""
         return measurement.available
 
     def apply_factors(self, tables: Iterable[AgedHypotheses], logarithms: Array) -> list[AgedHypotheses]:

@@ -205,7 +205,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         return state._replace(hypotheses=h._replace(mean=mean, covariance=covariance))
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where any sensor has a reading, zero elsewhere, ``(N,)``."""
+        """Return one where any sensor has a reading, so that an action has an effect, zero elsewhere, ``(N,)``."""
         return self.xp.where(ordered_sum(measurement.available) > 0.0, 1.0, 0.0)
 
     def apply_factors(self, h: LevelHypotheses, logarithms: Array) -> LevelHypotheses:
