@@ -54,7 +54,7 @@ class Cause(NamedTuple):
     phrase: str
     """Completion of the phrase "most of its cost falls", with its preposition: ``in turns``."""
     holds: Callable[[Moment], Array | None]
-    """From a moment to booleans, ``(N,)``; None where it cannot be computed."""
+    """Function from a moment to booleans, ``(N,)``; None where the cause cannot be computed."""
 
 
 def bins(

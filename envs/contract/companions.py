@@ -56,8 +56,9 @@ class LostTracks(NamedTuple):
     cost: float | None = None
     """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
     explain: Callable[[Any, Array, Array, Any], str] | None = None
-    """From the task, the last valid mean ``(C, N)``, its covariance ``(C, C, N)`` and the measurement that the filter
-    took in, of N lanes: a sentence on why it lost an episode there, empty where there is none."""
+    """Function of the task, the last valid mean ``(C, N)``, its covariance ``(C, C, N)`` and the following measurement,
+    of N
+    lanes. It returns a sentence on why the filter lost an episode there, empty if there is no explanation."""
 
 
 class ArrayMeanings(NamedTuple):
@@ -74,22 +75,26 @@ class PictureMaker(NamedTuple):
     """Class that draws an episode where the general picture is not enough."""
 
     make: Callable[[Any], Any]
-    """From a model to its :class:`~.rendering.Picture`, or None for the general one. It imports the drawing library."""
+    """Function from a model to its :class:`~.rendering.Picture`, or None for the general one. It imports the drawing
+    library."""
 
 
 class FlightScenarios(NamedTuple):
     """Function that makes a scenario in which every episode flies one of a user's flights."""
 
     make: Callable[[Any, Mapping[str, Any]], Any]
-    """From a :class:`~.trajectory.Trajectory` or :class:`~.flights.Flights` and the keywords of ``gym.make`` beside the
-    scenario to a :class:`~.task.Scenario`; raises :class:`ValueError` for flights that cannot be flown."""
+    """Function from a :class:`~.trajectory.Trajectory` or :class:`~.flights.Flights` and the keywords of ``gym.make``
+    beside
+    the scenario to a :class:`~.task.Scenario`; raises :class:`ValueError` for flights that cannot be flown."""
 
 
 class LoopRecords(NamedTuple):
     """Further records of each measurement, beside those of filter and world."""
 
     report: Callable[[Any, Any, dict[str, Array]], dict[str, Array]]
-    """From the model, the episode after the action and what filter and world report, see :meth:`.Filter.records`."""
+    """Function of the model, the episode after the action, and the records of filter and world; it returns further
+    records,
+    see :meth:`.Filter.records`."""
 
 
 def trained_banks(task: Any) -> Mapping[str, type]:

@@ -29,7 +29,7 @@ class Initial(NamedTuple):
     mean: Array
     """Mean in the units of the task's components, ``(C, N)``."""
     covariance: Array
-    """Its covariance, ``(C, C, N)``."""
+    """Covariance of the mean, ``(C, C, N)``."""
 
 
 class FilterInput(NamedTuple):

@@ -92,7 +92,7 @@ BOUNDED_LOG = Compression(
     bounded_exponential,
     (-LIMIT, LIMIT),
 )
-"""For values that a wrong hypothesis can make arbitrarily large."""
+"""Compression of values that a wrong hypothesis can make arbitrarily large."""
 STORED_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1, (0.0, LARGEST_LOG))
 """The block's function returns log(1 + x) already, because the filters store that; reading gives x."""
 LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1, STORED_AS_LOG1P.limits)
@@ -141,11 +141,11 @@ class Quantity(NamedTuple):
     unit: str
     text: str
     value: Callable[[Callable[[str], numpy.ndarray]], numpy.ndarray]
-    """From a function that reads blocks and other quantities by name to ``(N, parts)``."""
+    """Function that computes ``(N, parts)``; its argument reads blocks and other quantities by name."""
 
 
 Reader = Callable[[numpy.ndarray], numpy.ndarray]
-"""From observations ``(N, fields)`` to the values of one block or quantity, ``(N, parts)``."""
+"""Function from observations ``(N, fields)`` to the values of one block or quantity, ``(N, parts)``."""
 
 
 class Blocks:
@@ -310,7 +310,7 @@ def _read(
 
 
 Value = Callable[[Any, Any], Array]
-"""From the bank's state and the measurement to the rows of a block."""
+"""Function from the bank's state and the measurement to the rows of a block."""
 Interval = Literal["last", "mean"]
 """Value of a block where one action applies to several measurements, see :class:`.Field`."""
 

@@ -31,9 +31,9 @@ class ParameterLimits:
     at_most: float | None = None
     choices: tuple[str, ...] = ()
     ascending: bool = False
-    """Of a pair: the first must not be larger than the second."""
+    """Whether the first number of a pair must not be larger than the second."""
     stochastic: bool = False
-    """Of a row of numbers: they are probabilities that sum to one."""
+    """Whether a row of numbers must be probabilities that sum to one."""
 
 
 def parameter(default: Any, **limits: Any) -> Any:

@@ -89,7 +89,7 @@ def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None
 _SEARCH_FOLDERS: list[str] = []
 """Folders that are searched for modules that a user names, after ``sys.path``."""
 FOUND_IN: list[str] = []
-"""Those folders in which a module was found; other processes receive them, see :mod:`..evaluation.parallel`."""
+"""Search folders in which a module was found; other processes receive them, see :mod:`..evaluation.parallel`."""
 
 
 @contextmanager

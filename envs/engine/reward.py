@@ -122,9 +122,9 @@ class RewardBaseline(NamedTuple):
     """Model and action whose reward on the same noise is subtracted in a relative reward."""
 
     model: Model
-    """The same task, under a control."""
+    """Model of the same task under the baseline's control."""
     action: tuple[float, ...] | int
-    """Its action in every decision, an element of the control's space."""
+    """Action of the baseline in every decision, an element of the control's space."""
 
 
 def reference(kind: str, model: Model) -> RewardBaseline | None:

@@ -38,7 +38,7 @@ class EpisodeDistribution(NamedTuple):
     names: tuple[str, ...]
     """Names of the scenarios."""
     weights: tuple[float, ...]
-    """Their weights, which sum to one."""
+    """Weights of the scenarios, which sum to one."""
 
     def is_of(self, scenario: Any, parameters: Mapping[str, Any]) -> bool:
         """Return whether the distribution was made from this scenario and these parameters."""

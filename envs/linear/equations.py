@@ -46,13 +46,15 @@ class StateSpaceModel:
     f: VectorFunction
     h: VectorFunction
     Q: numpy.ndarray | VectorFunction
-    """``(n, n)``; or a function that returns its n^2 numbers row by row: then the model is timed."""
+    """Process noise covariance, ``(n, n)``; or a function that returns its n^2 numbers row by row: then the model is
+    timed."""
     R: numpy.ndarray | VectorFunction
-    """``(m, m)``; or a function that returns its m^2 numbers row by row."""
+    """Measurement noise covariance, ``(m, m)``; or a function that returns its m^2 numbers row by row."""
     G: VectorFunction | None = None
-    """f as a function of the inputs first, then of its other arguments; None where no input has noise."""
+    """The function f with the inputs as its first arguments; None where no input has noise."""
     D: VectorFunction | None = None
-    """h as a function of the inputs first; None where no input has noise or h does not depend on the inputs."""
+    """The function h with the inputs as its first arguments; None where no input has noise or h does not depend on
+    inputs."""
     sources: Mapping[str, numpy.ndarray | VectorFunction] = field(default_factory=dict)
     """Terms of which Q is the sum, by the names of the noises; empty where the noises have no names."""
     warned: dict[str, str] = field(default_factory=dict)

@@ -51,7 +51,8 @@ class Sensor:
     """Mahalanobis distance of an innovation from zero beyond which no filter updates with the measurement; None: no
     gate. The likelihood includes the measurement in any case."""
     wraps: str | None = None
-    """``"rad"`` or ``"deg"``: the sensor measures angles, and innovations are between minus and plus half a turn."""
+    """Unit of a sensor that measures angles, ``"rad"`` or ``"deg"``: innovations are between minus and plus half a
+    turn."""
     names: Sequence[str] = ()
     """Names of its m numbers, columns of a table ``SENSOR_NAME``; default: 1, 2 and so on. A single number has the name
     of the sensor."""

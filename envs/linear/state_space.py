@@ -47,7 +47,7 @@ class StateSpaceTruth(NamedTuple):
     """True state, model, noise factors and inputs."""
 
     state: Array
-    """``(n, N)``."""
+    """True state, ``(n, N)``."""
     hypothesis: Array
     """Index of the model that holds since the previous measurement, ``(N,)``."""
     process_noise: Array

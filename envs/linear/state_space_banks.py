@@ -42,20 +42,20 @@ from .parameters import StateSpaceParameters
 AVERAGE_WEIGHT = 0.1
 """Weight of the newest measurement in the observed averages."""
 NOISE_RANGE = 20.0
-"""``kalman-net``: largest factor and divisor of each standard deviation of the process and measurement noise."""
+"""Largest factor and divisor of each standard deviation of the process and measurement noise, in ``kalman-net``."""
 AGILITY = 5.0
-"""``kalman-net``: largest factor and divisor of the standard deviations in the gain alone."""
+"""Largest factor and divisor of the standard deviations in the gain alone, in ``kalman-net``."""
 OFFSET = 5.0
-"""``kalman-net``: largest offset of the predicted state, in standard deviations of the process noise."""
+"""Largest offset of the predicted state, in standard deviations of the process noise, in ``kalman-net``."""
 
 
 class ExtendedKalmanState(NamedTuple):
     """State of an extended Kalman filter."""
 
     mean: Array
-    """``(n, N)``; predicted between ``predict`` and the action."""
+    """Mean, ``(n, N)``; predicted between ``predict`` and the action."""
     covariance: Array
-    """``(n, n, N)``; between ``predict`` and the action predicted without process noise."""
+    """Covariance, ``(n, n, N)``; between ``predict`` and the action predicted without process noise."""
     innovation: Array
     """Innovation over its predicted sigma, ``(m, N)``."""
     nis: Array

@@ -158,9 +158,9 @@ class Spell(NamedTuple):
     """State of a receiver disturbance that occurs at most once in an episode."""
 
     window: Array
-    """Its first measurement and the first one after it, ``(2, N)``."""
+    """First measurement of the disturbance and the first one after it, ``(2, N)``."""
     strength: Array
-    """Its strength, ``(N,)``; zero for a disturbance without one."""
+    """Strength of the disturbance, ``(N,)``; zero where it has none."""
     number: Array
     """Number of the current measurement, ``(N,)``."""
 

@@ -86,7 +86,7 @@ class Filters(NamedTuple):
     """State of M alpha-beta filters with fixed gains, which are mixed before every prediction (IMM)."""
 
     mean: Array
-    """x, y, vx, vy of each filter, ``(4, M, N)``."""
+    """Estimates of x, y (m), vx, vy (m/s) by each filter, ``(4, M, N)``."""
     covariance: Array
     """Covariance of each filter, ``(4, 4, M, N)``."""
     probabilities: Array

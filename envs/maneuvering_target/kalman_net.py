@@ -60,7 +60,8 @@ class KalmanNetState(NamedTuple):
     """State of the extended Kalman filter, with the values that the network observes."""
 
     mean: Array
-    """x, y (m), vx, vy (m/s), ``(4, N)``; predicted between :meth:`KalmanNetBank.predict` and the action."""
+    """Estimate of x, y (m), vx, vy (m/s), ``(4, N)``; predicted between :meth:`KalmanNetBank.predict` and the
+    action."""
     covariance: Array
     """Covariance, ``(4, 4, N)``; between ``predict`` and the action without process noise."""
     acceleration: Array

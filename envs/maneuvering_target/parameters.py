@@ -86,9 +86,10 @@ class ManeuveringTargetParameters(TaskParameters):
     clutter
     (ours)."""
     gate: float = parameter(16.0, above=0.0)
-    """Where there is clutter, the plot that is taken for the target's is the nearest to the predicted position, if its
-    squared distance, normalised with the covariances of prediction and plot, is below this; otherwise the scan missed
-    the target (ours)."""
+    """Gate in clutter: the plot taken for the target's is the nearest to the predicted position, if its squared
+    distance,
+    normalised with the covariances of prediction and plot, is below this; otherwise the scan missed the target (ours).
+    """
     gate_acceleration: float = parameter(3.0, at_least=0.0)
     """Standard deviation of an acceleration that the prediction of the gate allows for, m/s^2 (ours)."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
@@ -100,7 +101,7 @@ class ManeuveringTargetParameters(TaskParameters):
     """"maneuver": one manoeuvre at stated scans (paper). "random": drawn for each episode. "legs": straight
     legs and exact turns. "track": a table of states."""
     initial_position: tuple[float, float] = (-10000.0, 5000.0)
-    """x and y at the start, m, of flights "maneuver" and "legs" (paper)."""
+    """Initial x and y, m, of flights "maneuver" and "legs" (paper)."""
     initial_velocity: tuple[float, float] = (100.0, 0.0)
     """Velocity at the start, m/s, of flights "maneuver" and "legs" (paper)."""
     acceleration: tuple[float, float] = (-2.775, -2.775)

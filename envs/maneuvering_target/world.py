@@ -26,7 +26,7 @@ class Truth(NamedTuple):
     position: Array
     """Position at the time of the scan, m, ``(2, N)``."""
     velocity: Array
-    """m/s, ``(2, N)``."""
+    """Velocity at the time of the scan, m/s, ``(2, N)``."""
     flight: Any
     """Constants of the flight that the course has drawn; None where it draws nothing."""
     scans: Reliability | None

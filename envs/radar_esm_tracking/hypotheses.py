@@ -49,7 +49,7 @@ class HypothesesState(NamedTuple):
     """Probabilities before the scan, at least :data:`LEAST`, of classes that have not changed, then of those that have,
     ``(2 S, N)``."""
     probability: Array
-    """The same probabilities after the scan under the action zero, ``(2 S, N)``."""
+    """Probabilities of these groups after the scan under action zero, ``(2 S, N)``."""
     second_emitter: Array
     """Probability of a second emitter given an unchanged class, after the scan under the action zero, ``(N,)``."""
     entropy: Array
