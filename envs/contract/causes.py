@@ -47,7 +47,7 @@ class Moment(NamedTuple):
 
 
 class Cause(NamedTuple):
-    """A circumstance that may cost an estimate something."""
+    """A circumstance of a measurement, such as a turn, by which an evaluation splits the costs of estimates."""
 
     name: str
     """One word or a few, of the rows of a table: ``turn``."""

@@ -24,14 +24,14 @@ def find_companion(task: Any, kind: type[Companion]) -> Companion | None:
 
 
 class Paper(NamedTuple):
-    """Source of a problem."""
+    """Source paper of a problem."""
 
     source: str
     """Reference of the paper."""
 
 
 class Actions(NamedTuple):
-    """Meanings of actions."""
+    """Descriptions of a task's actions by control, and the parameters that set their range."""
 
     meanings: Mapping[str, str]
     """Meaning of an action in words, by the name of the control."""
@@ -72,7 +72,7 @@ class ArrayMeanings(NamedTuple):
 
 
 class PictureMaker(NamedTuple):
-    """Class that draws an episode where the general picture is not enough."""
+    """Function that creates the picture of an episode where the general picture is not enough."""
 
     make: Callable[[Any], Any]
     """Function from a model to its :class:`~.rendering.Picture`, or None for the general one. It imports the drawing

@@ -129,7 +129,7 @@ class TrackLog(NamedTuple):
 
 
 class PredictedCoordinate(NamedTuple):
-    """A predicted coordinate of a measurement."""
+    """A coordinate of a measurement, compared with its prediction by an estimate."""
 
     name: str
     unit: str
