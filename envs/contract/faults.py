@@ -92,14 +92,14 @@ class Disturbance(ABC):
         """
         return state
 
-    def switch_off(self, state: Any, calm: Array) -> Any:
+    def switch_off(self, state: Any, undisturbed: Array) -> Any:
         """Return the initial state with the disturbance switched off in episodes without hidden disturbances.
 
         A disturbance that the measurement reports leaves its state as it is, see :func:`draw_undisturbed`.
 
         Args:
             state: at the start of the track.
-            calm: whether an episode has no hidden disturbance, booleans ``(N,)``.
+            undisturbed: whether an episode has no hidden disturbance, booleans ``(N,)``.
         """
         return state
 
@@ -198,11 +198,11 @@ class Disturbances:
         states = {part.name: draw(part) for part in self.drawn}
         return {part.name: states[part.name] for part in self.parts}
 
-    def switch_off(self, states: dict[str, Any], calm: Array | None) -> dict[str, Any]:
-        """Return the states with hidden disturbances switched off in the episodes where ``calm`` is true."""
-        if calm is None:
+    def switch_off(self, states: dict[str, Any], undisturbed: Array | None) -> dict[str, Any]:
+        """Return the states with hidden disturbances switched off in the episodes where ``undisturbed`` is true."""
+        if undisturbed is None:
             return states
-        return {part.name: part.switch_off(states[part.name], calm) for part in self.parts}
+        return {part.name: part.switch_off(states[part.name], undisturbed) for part in self.parts}
 
     def split_noise(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
@@ -397,10 +397,11 @@ class ColouredErrors(Disturbance):
         level = deviation * normals if self.normals else self.xp.stack([zero] * self.count)
         return ColouredErrorsState(deviation, process, level)
 
-    def switch_off(self, state: ColouredErrorsState, calm: Array) -> ColouredErrorsState:
-        """Return the state with the errors set to zero in the episodes where ``calm`` is true."""
+    def switch_off(self, state: ColouredErrorsState, undisturbed: Array) -> ColouredErrorsState:
+        """Return the state with the errors set to zero in the episodes where ``undisturbed`` is true."""
         deviation, kick, level = (
-            self.xp.where(calm, 0.0, each) for each in (state.deviation, state.process.kick, state.level)
+            self.xp.where(undisturbed, 0.0, each)
+            for each in (state.deviation, state.process.kick, state.level)
         )
         return ColouredErrorsState(deviation, state.process._replace(kick=kick), level)
 

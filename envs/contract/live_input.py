@@ -120,12 +120,12 @@ class LiveInput:
                 f"unknown value {quote_shortened(unknown[0])}: {self.task.id} takes {listed or 'no more'}"
             )
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the initial estimate from its values by name, and the memory for the first measurement.
 
         Args:
             time: of the start, s, ``(N,)``, of one track a float.
-            given: ``mean``, ``covariance`` and other values by name; arrays of one track, or with N last.
+            initial_values: ``mean``, ``covariance`` and other values by name; arrays of one track, or with N last.
 
         Raises:
             ValueError: for a value that is missing, unknown, or of another shape.
@@ -133,7 +133,7 @@ class LiveInput:
         found = {}
         for name, array in self.initial._asdict().items():
             if array is not None:
-                values = self._read_finite(given, name, array, "at the start")
+                values = self._read_finite(initial_values, name, array, "at the start")
                 found[name] = numpy.reshape(values, (*array.shape[:-1], self.tracks)).astype(array.dtype)
         return type(self.initial)(**found), {"time": time, "count": self.broadcast(0.0)}
 
@@ -141,15 +141,17 @@ class LiveInput:
         """Return an array ``(*shape, N)`` filled with one number; for one track ``shape``, or the number itself."""
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 
-    def _read_finite(self, given: Mapping[str, Any], name: str, like: numpy.ndarray, what: str) -> Any:
+    def _read_finite(
+        self, initial_values: Mapping[str, Any], name: str, like: numpy.ndarray, what: str
+    ) -> Any:
         """Return a value by its name, all of it finite, truncated to integers or booleans where ``like`` is.
 
         Raises:
             ValueError: for a value that is missing or not finite.
         """
-        values, dtype = self.read(given, name, like.shape[:-1]), like.dtype
+        values, dtype = self.read(initial_values, name, like.shape[:-1]), like.dtype
         if numpy.count_nonzero(numpy.isfinite(values)) < numpy.size(values):
-            raise ValueError(f"{self.task.id} needs {name} {what}, finite, got {_listed(given)}")
+            raise ValueError(f"{self.task.id} needs {name} {what}, finite, got {_listed(initial_values)}")
         if dtype.kind == "f":
             return values
         return values > 0.5 if dtype.kind == "b" else numpy.trunc(values)

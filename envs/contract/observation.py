@@ -81,9 +81,9 @@ def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
     return logarithm / (1.0 + (1.0 / LIMIT) * xp.abs(logarithm))
 
 
-def bounded_exponential(shown: numpy.ndarray) -> numpy.ndarray:
+def bounded_exponential(compressed: numpy.ndarray) -> numpy.ndarray:
     """Return the values whose :func:`bounded_logarithm` is given: its inverse."""
-    return symexp(shown / (1.0 - numpy.abs(shown) / LIMIT), numpy)
+    return symexp(compressed / (1.0 - numpy.abs(compressed) / LIMIT), numpy)
 
 
 BOUNDED_LOG = Compression(

@@ -66,7 +66,7 @@ class EpisodeStepper(Protocol):
         """
         ...
 
-    def load(self, episode: Episode, shown: Array = None) -> None:
+    def load(self, episode: Episode, observation: Array = None) -> None:
         """Replace the current episodes; their observation, ``(fields, width)``, is computed if it is None."""
         ...
 
@@ -103,7 +103,7 @@ class EpisodeStepper(Protocol):
         """Set the action of the first lane for the next decisions."""
         ...
 
-    def first_reward(self, beside: Any) -> float:
+    def first_reward(self, baseline: Any) -> float:
         """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
         ...
 
@@ -150,9 +150,9 @@ class ModelStepper:
         uniforms, normals = (task.xp.asarray(numbers, device=task.device) for numbers in noise.start())
         return uniforms, normals
 
-    def load(self, episode: Episode, shown: Array = None) -> None:
+    def load(self, episode: Episode, observation: Array = None) -> None:
         """Replace the current episodes; their observation, ``(fields, width)``, is computed if it is None."""
-        self._episode, self.shown = episode, shown
+        self._episode, self.shown = episode, observation
 
     def begin_some(
         self,
@@ -223,9 +223,9 @@ class ModelStepper:
         """Reports of the last :meth:`decide`, where each is one number, ``(interval, width)``."""
         return self._reports
 
-    def first_reward(self, beside: "ModelStepper | None") -> float:
+    def first_reward(self, baseline: "ModelStepper | None") -> float:
         """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
-        others = [0.0] * len(self._reports) if beside is None else beside._reports
+        others = [0.0] * len(self._reports) if baseline is None else baseline._reports
         return float(mean_reward([a - b for a, b in zip(self._reports, others, strict=True)])[0])
 
     def observation_of_first(self) -> Array:
@@ -251,7 +251,7 @@ class Lanes:
     Args:
         model: task with a filter; the task's namespace determines the device of the arrays.
         count: number of lanes.
-        beside: baseline of a relative reward, run on the same noise.
+        baseline: baseline of a relative reward, run on the same noise.
         on_start: called with new episodes at the start of the track, before their first measurement.
         longest: decisions after which an episode ends at the latest; default: the task's horizon.
         report: function of the later reports; the episodes then start in its code. Default: unknown.
@@ -265,7 +265,7 @@ class Lanes:
         self,
         model: Model,
         count: int,
-        beside: RewardBaseline | None = None,
+        baseline: RewardBaseline | None = None,
         on_start: Callable[[Episode], None] | None = None,
         longest: int | None = None,
         report: Report | None = None,
@@ -275,8 +275,8 @@ class Lanes:
         task = self.task
         self.count: int = count
         self.width: int = round_up_lanes(count)
-        self.beside = beside
-        self._models = [model] if beside is None else [model, beside.model]
+        self.baseline = baseline
+        self._models = [model] if baseline is None else [model, baseline.model]
         self._on_start, self._report = on_start, report
         self._steppers: dict[Report, list[Stepper]] = {}
         """Steppers of compiled models, by report."""
@@ -316,12 +316,12 @@ class Lanes:
         if not self._moving and self._report is not None:
             self._reporting(self._report)
         self._moving = self._moving or self._by_functions()
-        own, *beside = self._moving
+        own, *baseline = self._moving
         if is_whole:
-            start = own.begin(identities, self.noise, beside)
+            start = own.begin(identities, self.noise, baseline)
         else:
             noise = self._noise_of_some(len(index))
-            start = own.begin_some(index, identities, noise, beside)
+            start = own.begin_some(index, identities, noise, baseline)
             self.noise.take(noise, index)
         self.decisions[index] = 0
         if task.flights:
@@ -346,11 +346,11 @@ class Lanes:
             action: batch first, as the action space has it.
             kind: one of :data:`~.reward.REWARDS`.
         """
-        own, *beside = self._take_and_decide(action, REWARD_FUNCTIONS[kind])
+        own, *baseline = self._take_and_decide(action, REWARD_FUNCTIONS[kind])
         rewards = (
             own.rewards
-            if not beside
-            else [a - b for a, b in zip(own.rewards, beside[0].rewards, strict=True)]
+            if not baseline
+            else [a - b for a, b in zip(own.rewards, baseline[0].rewards, strict=True)]
         )
         return mean_reward(rewards)[: self.count]
 
@@ -364,11 +364,11 @@ class Lanes:
         steppers, report = self._moving, REWARD_FUNCTIONS[kind]
         if steppers is not self._steppers.get(report):
             steppers = self._reporting(report)
-        own, beside = steppers[0], steppers[1:]
+        own, baseline = steppers[0], steppers[1:]
         own.take_alone(action)
-        own.decide(self.noise, beside)
+        own.decide(self.noise, baseline)
         self.decisions[0] = taken = self.decisions.item(0) + 1
-        reward = own.first_reward(beside[0] if beside else None)
+        reward = own.first_reward(baseline[0] if baseline else None)
         return own.observation_of_first(), reward, taken >= self._lengths.item(0)
 
     def _take_and_decide(self, action: Array, report: Report) -> Sequence[Any]:
@@ -388,11 +388,11 @@ class Lanes:
 
         Returns:
             The reports on every measurement of the decision, arrays ``(..., width)``: of the model, and of
-            ``beside`` (None without).
+            ``baseline`` (None without).
         """
-        own, *beside = self._take_and_decide(action, report)
+        own, *baseline = self._take_and_decide(action, report)
         reports = own.reports()
-        return list(zip(reports, beside[0].reports() if beside else [None] * len(reports), strict=True))
+        return list(zip(reports, baseline[0].reports() if baseline else [None] * len(reports), strict=True))
 
     def run(
         self, report: Report, compiled_policy: Specialised | None = None, measurements: int | None = None
@@ -426,15 +426,15 @@ class Lanes:
     def _by_functions(self) -> list[Any]:
         """Return new :class:`ModelStepper` objects of task and baseline, without episodes."""
         steppers = [ModelStepper(model, self.width) for model in self._models]
-        if self.beside is not None:
+        if self.baseline is not None:
             steppers[1].take(self._beside_action(self.width))
         return steppers
 
     def _beside_action(self, count: int) -> Array:
         """Return the baseline's action, repeated for ``count`` lanes, batch first."""
-        assert self.beside is not None
-        actions = [self.beside.action] * count
-        discrete = isinstance(self.beside.action, int)
+        assert self.baseline is not None
+        actions = [self.baseline.action] * count
+        discrete = isinstance(self.baseline.action, int)
         return (
             self.task.xp.asarray(actions, device=self.task.device)
             if discrete
@@ -447,9 +447,9 @@ class Lanes:
             return self._moving
         if report not in self._steppers and all(can_step(model, report) for model in self._models):
             steppers = self._steppers[report] = [Stepper(self.model, report, self.width)]
-            if self.beside is not None:
+            if self.baseline is not None:
                 world_of = steppers[0] if share_world(*self._models) else None
-                steppers.append(Stepper(self.beside.model, report, self.width, world_of))
+                steppers.append(Stepper(self.baseline.model, report, self.width, world_of))
                 steppers[1].take(self._beside_action(self.width))
         before, after = self._moving, self._steppers.get(report)
         if after is None:

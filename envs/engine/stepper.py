@@ -161,14 +161,14 @@ class Stepper:
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
         self._action_place, self._report_place = len(update.inputs) - 1, len(report_code.inputs)
 
-    def load(self, episode: Episode, shown: Array = None) -> None:
+    def load(self, episode: Episode, observation: Array = None) -> None:
         """Replace the current episodes and their observation, ``(fields, width)``."""
         own = zip(self._copies[self._now], leaves(episode), strict=True)
         for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values.reshape(memory.shape)
         self._policy_memory = None
-        if shown is not None:
-            self._shown[...] = shown.T
+        if observation is not None:
+            self._shown[...] = observation.T
 
     def episode(self) -> Episode:
         """Return the current episodes of all lanes, in arrays that are never changed."""
@@ -249,8 +249,8 @@ class Stepper:
         steppers = (self, *others)
         for each in steppers:
             if noise.width not in each._small:
-                beside = None if each._world_of is None else self._small[noise.width]
-                each._small[noise.width] = Stepper(each._model, each._report, noise.width, beside)
+                baseline = None if each._world_of is None else self._small[noise.width]
+                each._small[noise.width] = Stepper(each._model, each._report, noise.width, baseline)
         small, *smalls = [each._small[noise.width] for each in steppers]
         start = small.begin(identities, noise, smalls)
         for each, begun in zip(steppers, (small, *smalls), strict=True):
@@ -414,12 +414,12 @@ class Stepper:
             for k in range(self._interval)
         ]
 
-    def first_reward(self, beside: "Stepper | None") -> float:
+    def first_reward(self, baseline: "Stepper | None") -> float:
         """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
         if self._interval == 1:
             own: float = self._first_rewards.item(0)
-            return own if beside is None else own - beside._first_rewards.item(0)
-        rewards = self._first_rewards if beside is None else self._first_rewards - beside._first_rewards
+            return own if baseline is None else own - baseline._first_rewards.item(0)
+        rewards = self._first_rewards if baseline is None else self._first_rewards - baseline._first_rewards
         return mean_reward(rewards.tolist())
 
     @property

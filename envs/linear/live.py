@@ -44,9 +44,9 @@ class StateSpaceInput(LiveInput):
         )
         return {**names, **inputs, **found}, at_start
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the initial estimate and a memory in which the inputs are unknown (NaN)."""
-        initial, memory = super().start(time, given)
+        initial, memory = super().start(time, initial_values)
         return initial, {**memory, "inputs": self.broadcast(numpy.nan, (len(self.inputs),))}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:

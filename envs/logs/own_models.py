@@ -77,7 +77,7 @@ def _read(
             f"nothing was received; if it has another name, give --rename 'NAME={lacking[0]}'"
         )
     known = {name: value for name, value in defaults.items() if name not in SIMULATION_PARAMETERS}
-    parameters = {name: value for name, value in known.items() if name not in columns.given}
+    parameters = {name: value for name, value in known.items() if name not in columns.user_parameters}
     timed = definition.world[0].timed
     typical: dict[str, float] = {}
     notes: tuple[str, ...] = ()
@@ -87,7 +87,7 @@ def _read(
         typical["sampling_interval"] = usual
         rows, time = numpy.arange(len(columns.time)), columns.time
     else:
-        usual = float({"sampling_interval": 1.0, **known, **columns.given}["sampling_interval"])
+        usual = float({"sampling_interval": 1.0, **known, **columns.user_parameters}["sampling_interval"])
         rows, time = _fill_gaps(columns.time, usual)
         missed = int((rows < 0).sum())
         notes = (f"{missed:,} measurements without a row: nothing was received",) * bool(missed)

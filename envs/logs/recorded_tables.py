@@ -64,12 +64,12 @@ class Columns:
         self,
         name: str,
         table: "pandas.DataFrame",
-        given: Mapping[str, Any],
+        user_parameters: Mapping[str, Any],
         log_time: numpy.ndarray | None = None,
     ) -> None:
         self.name = name
         self.table = table
-        self.given = given
+        self.user_parameters = user_parameters
         self.log_time: numpy.ndarray = self.time if log_time is None else log_time
         self.notes: list[str] = []
         """Changes that were made to the table, one line each."""
@@ -100,7 +100,7 @@ class Columns:
 
     def only(self, rows: numpy.ndarray) -> "Columns":
         """Return a copy of the columns with only some of the rows."""
-        return Columns(self.name, self.table[rows], self.given, self.log_time[rows])
+        return Columns(self.name, self.table[rows], self.user_parameters, self.log_time[rows])
 
     def drop_duplicates(self) -> None:
         """Merge rows of one time that fill each other's empty cells, and drop other rows of the same time.
@@ -271,8 +271,8 @@ class Columns:
 
     def interval(self) -> float:
         """Return the sampling interval, s: the user's parameter, or the median of the table."""
-        if "sampling_interval" in self.given:
-            return float(self.given["sampling_interval"])
+        if "sampling_interval" in self.user_parameters:
+            return float(self.user_parameters["sampling_interval"])
         # Rounded as times are, so that files of one sensor have the same interval.
         return float(f"{numpy.median(numpy.diff(self.time)):.6g}")
 

@@ -68,7 +68,7 @@ class GainState(NamedTuple):
 
     ``assumed``, with the coloured noise reduced to white and no drift, scales the observed innovations; ``modelled`` is
     reported."""
-    seen: Innovations
+    innovations: Innovations
     action: Array
     """Last action, ``(A, N)``."""
     gain: Array
@@ -88,7 +88,7 @@ class Augmented(NamedTuple):
     """Covariance after the last update, the same for all axes, ``(N,)`` each."""
     deviation: Array
     """Standard deviation of the position, m, predicted with the noises of the last action, ``(N,)``."""
-    seen: Innovations
+    innovations: Innovations
     action: Array
     """Last action, ``(3, N)``."""
 
@@ -106,7 +106,7 @@ class Schemes(NamedTuple):
     """Estimate of the coloured rate error eta by the augmented filter, m/s, ``(A, N)``."""
     covariance: ins_gnss.AugmentedCovariance
     """Covariance of the augmented filter, the same for all axes, ``(N,)`` each."""
-    seen: Innovations
+    innovations: Innovations
     weights: Array
     """Weights of the filters in the estimate, ``(3, N)``."""
 
@@ -140,34 +140,34 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
         return (
             innovation_block(
                 each,
-                value=lambda f, measurement: measurement.available * f.seen.normalised,
+                value=lambda f, measurement: measurement.available * f.innovations.normalised,
                 text="innovation over its predicted standard deviation",
                 name="innovation_over_sigma",
                 over_interval="mean",
             ),
             innovation_block(
                 each,
-                value=lambda f, measurement: f.seen.innovation / measurement.reported_deviation,
+                value=lambda f, measurement: f.innovations.innovation / measurement.reported_deviation,
                 text="the innovation over the reported noise",
                 name="innovation_over_reported",
                 over_interval="mean",
             ),
             average_block(
                 "average_innovation",
-                lambda f, _: f.seen.average,
+                lambda f, _: f.innovations.average,
                 "short average of the innovation over its predicted standard deviation",
                 each,
             ),
             Block(
                 "average_square",
-                lambda f, _: xp.log(1.0 + f.seen.average_square),
+                lambda f, _: xp.log(1.0 + f.innovations.average_square),
                 "the short average of its square",
                 each,
                 STORED_AS_LOG1P,
             ),
             average_block(
                 "average_product",
-                lambda f, _: f.seen.average_product,
+                lambda f, _: f.innovations.average_product,
                 "short average of its product with the one before",
                 each,
             ),
@@ -211,20 +211,20 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
         """Return the innovation statistics at the start of the track: zeros, in the shape of ``zero``."""
         return Innovations(zero, zero, zero, zero + 1.0, zero, zero + 1.0)
 
-    def log_density(self, seen: Innovations) -> Array:
+    def log_density(self, innovations: Innovations) -> Array:
         """Return the Gaussian log-density of the last innovations, for each axis."""
-        return -0.5 * seen.normalised * seen.normalised - self.xp.log(
-            math.sqrt(2.0 * math.pi) * seen.deviation
+        return -0.5 * innovations.normalised * innovations.normalised - self.xp.log(
+            math.sqrt(2.0 * math.pi) * innovations.deviation
         )
 
     def consistency(self, state: Any, measurement: Measurement) -> dict[str, Array]:
         """Return the records NIS, degrees of freedom and log-likelihood of one filter; NaN without a measurement."""
         xp, there = self.xp, measurement.available > 0.0
-        nis = ordered_sum(state.seen.normalised * state.seen.normalised)
+        nis = ordered_sum(state.innovations.normalised * state.innovations.normalised)
         return {
             "nis": xp.where(there, nis, math.nan),
             "nis_degrees": self.parameters.axes * measurement.available,
-            "log_likelihood": xp.where(there, ordered_sum(self.log_density(state.seen)), math.nan),
+            "log_likelihood": xp.where(there, ordered_sum(self.log_density(state.innovations)), math.nan),
         }
 
     def update_innovations(
@@ -296,7 +296,7 @@ class NoiseBank(KalmanBucyBank):
             coloured=zero,
             covariance=covariance,
             deviation=zero[0],
-            seen=self.no_innovations(zero),
+            innovations=self.no_innovations(zero),
             action=self.xp.stack([zero[0]] * len(NOISES)),
         )
 
@@ -325,12 +325,12 @@ class NoiseBank(KalmanBucyBank):
             position=position,
             coloured=s.decay * state.coloured,
             deviation=self.xp.sqrt(variance),
-            seen=self.update_innovations(state.seen, measurement, position, variance),
+            innovations=self.update_innovations(state.innovations, measurement, position, variance),
         )
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
         """Return the state updated with the Kalman gain that follows from the noises of the action."""
-        innovation = state.seen.innovation
+        innovation = state.innovations.innovation
         action = self.xp.clip(action, -1.0, 1.0)
         R = self.receiver_variance(measurement, action)
         predicted = self.predict_covariance(state, action)
@@ -387,8 +387,8 @@ class GainBank(KalmanBucyBank):
         """Return the state predicted by the INS increment, with innovation statistics."""
         position = state.position + measurement.increment
         variance = ins_gnss.predict_plain(state.variance, *self.error_model)
-        seen = self.update_innovations(state.seen, measurement, position, variance.assumed)
-        return state._replace(position=position, variance=variance, seen=seen)
+        innovations = self.update_innovations(state.innovations, measurement, position, variance.assumed)
+        return state._replace(position=position, variance=variance, innovations=innovations)
 
     def gain(self, action: Array) -> Array:
         """Return the gain that an action in [-1, 1] sets: 0 at -1, the paper's at 0, and 1 at +1.
@@ -416,7 +416,7 @@ class GainBank(KalmanBucyBank):
         gain = measurement.available * self.gain(action)
         R = measurement.reported_deviation * measurement.reported_deviation
         return state._replace(
-            position=state.position + gain * state.seen.innovation,
+            position=state.position + gain * state.innovations.innovation,
             variance=ins_gnss.update_plain(state.variance, R, gain),
             action=action,
             gain=gain,
@@ -484,7 +484,7 @@ class SchemeBank(KalmanBucyBank):
             drift=zero,
             coloured=zero,
             covariance=p.prior_covariance(zero[0]),
-            seen=self.no_innovations(each),
+            innovations=self.no_innovations(each),
             weights=each[:, 0],
         )
 
@@ -502,12 +502,12 @@ class SchemeBank(KalmanBucyBank):
             plain_variance=plain,
             coloured=s.decay * state.coloured,
             covariance=P,
-            seen=self.update_innovations(state.seen, measurement, position, variance),
+            innovations=self.update_innovations(state.innovations, measurement, position, variance),
         )
 
     def act(self, state: Schemes, measurement: Measurement, action: Array) -> Schemes:
         """Return every filter updated with its own Kalman gain, and the weights of the action."""
-        xp, available, innovation = self.xp, measurement.available, state.seen.innovation
+        xp, available, innovation = self.xp, measurement.available, state.innovations.innovation
         R = measurement.reported_deviation * measurement.reported_deviation
         plain = state.plain_variance
         plain_gain = available * plain / (plain + R)
@@ -548,9 +548,9 @@ class SchemeBank(KalmanBucyBank):
         filter.
         """
         there = measurement.available > 0.0
-        of_each = ordered_sum(self.xp.moveaxis(self.log_density(state.seen), 1, 0))
+        of_each = ordered_sum(self.xp.moveaxis(self.log_density(state.innovations), 1, 0))
         log_likelihood = imm.log_mixture_density(imm.log_probabilities(state.weights), of_each)
-        squares = self.xp.moveaxis(state.seen.normalised * state.seen.normalised, 1, 0)
+        squares = self.xp.moveaxis(state.innovations.normalised * state.innovations.normalised, 1, 0)
         nis = weighted_sum(state.weights, ordered_sum(squares))
         return {
             "nis": self.xp.where(there, nis, math.nan),

@@ -90,9 +90,9 @@ class NoiseChanges(Disturbance):
         change = xp.stack([earlier, later])
         return Levels(xp.stack(levels), xp.stack(reported), change, levels[0], reported[0])
 
-    def switch_off(self, state: Levels, calm: Array) -> Levels:
-        """Return the state with the true noise equal to the reported one where ``calm``."""
-        return state._replace(true=self.xp.where(calm, state.reported, state.true))
+    def switch_off(self, state: Levels, undisturbed: Array) -> Levels:
+        """Return the state with the true noise equal to the reported one where ``undisturbed``."""
+        return state._replace(true=self.xp.where(undisturbed, state.reported, state.true))
 
     def advance(self, state: Levels, step: DisturbanceInput) -> Levels:
         """Return the state with the true and reported levels of this measurement."""
@@ -215,9 +215,9 @@ class Outage(_Once):
 class _Hidden(_Once):
     """Receiver disturbance that the measurement does not report."""
 
-    def switch_off(self, state: Spell, calm: Array) -> Spell:
-        """Return the state without the disturbance in the episodes where ``calm``."""
-        return state._replace(window=self.xp.where(calm, NEVER, state.window))
+    def switch_off(self, state: Spell, undisturbed: Array) -> Spell:
+        """Return the state without the disturbance in the episodes where ``undisturbed``."""
+        return state._replace(window=self.xp.where(undisturbed, NEVER, state.window))
 
 
 class Jamming(_Hidden):

@@ -31,7 +31,7 @@ class HypothesesState(NamedTuple):
     own: FaultState
     """State of the fault bank, predicted between :meth:`HypothesesBank.predict` and the action."""
     likelihood: Likelihood
-    seen: Innovations
+    innovations: Innovations
     """Innovations of the whole bank, over the deviation by the reported noise."""
     prior: Array
     """Logarithm of the predicted standard deviation of the position over the reported one, ``(N,)``."""
@@ -107,7 +107,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         return HypothesesState(
             own=own,
             likelihood=own.likelihood,
-            seen=self.no_innovations(zero),
+            innovations=self.no_innovations(zero),
             prior=none,
             predicted=groups,
             probabilities=groups,
@@ -141,7 +141,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         expected = measurement.ins - result.expected
         return state._replace(
             likelihood=bank.likelihood(result, measurement),
-            seen=self.update_innovations(state.seen, measurement, expected, result.own),
+            innovations=self.update_innovations(state.innovations, measurement, expected, result.own),
             prior=0.5 * self.xp.log(result.own / predicted.reported),
             predicted=self.group(weights, age),
             probabilities=self.group(p, age),

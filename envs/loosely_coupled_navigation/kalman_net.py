@@ -79,7 +79,7 @@ class KalmanNetBank(NoiseBank):
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
         """Return the state updated with the noises and the gain that the action sets."""
-        xp, innovation = self.xp, state.seen.innovation
+        xp, innovation = self.xp, state.innovations.innovation
         a = xp.clip(action, -1.0, 1.0)
         P = self.predict_covariance(state, a[: len(NOISES)])
         R = self.receiver_variance(measurement, a)

@@ -18,10 +18,10 @@ class PositionInput(LiveInput):
         values = {name: COLUMNS[name].live_text for name in ("ins", "fix", "sigma")}
         return values, {"ins": "m, position by the INS at the start; default: the mean"}
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the initial estimate, and a memory with the initial position of the INS."""
-        initial, memory = super().start(time, {n: v for n, v in given.items() if n != "ins"})
-        ins = self.read({"ins": initial.mean, **given}, "ins", (self.parameters.axes,))
+        initial, memory = super().start(time, {n: v for n, v in initial_values.items() if n != "ins"})
+        ins = self.read({"ins": initial.mean, **initial_values}, "ins", (self.parameters.axes,))
         return initial, {**memory, "ins": ins}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:

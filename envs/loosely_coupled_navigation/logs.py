@@ -91,7 +91,9 @@ def read_log(columns: Columns) -> TrackLog:
     if not numpy.isfinite(fix[1:]).all(axis=1).any():
         raise ValueError("no row has a fix on every axis")
     check_extents(("ins", "fix"), ins, fix)
-    given = {name: value for name, value in columns.given.items() if name not in ("axes", "horizon")}
+    given = {
+        name: value for name, value in columns.user_parameters.items() if name not in ("axes", "horizon")
+    }
     p = LooselyCoupledNavigationParameters(**{**parameters, **given})
     count = len(ins) - 1
     sigma = columns.sigmas("sigma")[1:, 0] if columns.has("sigma") else numpy.full(count, numpy.nan)
@@ -101,7 +103,7 @@ def read_log(columns: Columns) -> TrackLog:
         measurements,
         {"mean": ins[0], "covariance": numpy.zeros((len(ends), len(ends)))},
         numpy.arange(1, count + 1),
-        {n: v for n, v in parameters.items() if n not in columns.given},
+        {n: v for n, v in parameters.items() if n not in columns.user_parameters},
         float(columns.time[0]),
         columns.time[1:],
     )

@@ -48,12 +48,12 @@ class PlotInput(LiveInput):
         at_start = {name: COLUMNS[name].live_text for name in SECOND_SENSOR[2:]}
         return {name: COLUMNS[name].live_text for name in (*names, *SECOND_SENSOR)}, at_start
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the initial estimate, and a memory as if a scan had just seen the target."""
         initial, memory = super().start(
-            time, {name: given[name] for name in ("mean", "covariance") if name in given}
+            time, {name: initial_values[name] for name in ("mean", "covariance") if name in initial_values}
         )
-        velocity = {} if self.measurement.odometry is None else {"velocity": self._velocity(given)}
+        velocity = {} if self.measurement.odometry is None else {"velocity": self._velocity(initial_values)}
         return initial, {**memory, "last_plot": time, **velocity}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:

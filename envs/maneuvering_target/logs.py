@@ -99,10 +99,12 @@ def read_log(columns: Columns) -> TrackLog:
     parameters: dict[str, Any] = {}
     interval = columns.interval()
     rows, time = _scans(columns, int(first), interval)
-    if "sampling_interval" not in columns.given:
+    if "sampling_interval" not in columns.user_parameters:
         parameters["sampling_interval"] = interval
     seen = (rows >= 0) & there[rows]
-    nominal = (assumed or columns.given.get("range_sigma", ManeuveringTargetParameters.range_sigma)) ** 2
+    nominal = (
+        assumed or columns.user_parameters.get("range_sigma", ManeuveringTargetParameters.range_sigma)
+    ) ** 2
     found = {
         "scan": numpy.arange(1.0, len(rows) + 1.0),
         "position": numpy.where(seen[:, None], position[rows], 0.0),
@@ -245,7 +247,7 @@ def _positions(columns: Columns) -> numpy.ndarray:
     if (distance < 0.0).any():
         row = int(numpy.argmax(distance < 0.0))
         raise ValueError(f"range is a distance, and row {row} has {distance[row]:g} m")
-    stated = columns.given.get("bearing_sigma", ManeuveringTargetParameters.bearing_sigma)
+    stated = columns.user_parameters.get("bearing_sigma", ManeuveringTargetParameters.bearing_sigma)
     sigma = (
         float(numpy.nanmedian(columns["azimuth_sigma"])) if columns.has("azimuth_sigma") else float(stated)
     )
@@ -271,8 +273,8 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
     """
     if not columns.has("x") or columns.has("sigma_x") or columns.has("range_sigma"):
         return 0.0
-    if "range_sigma" in columns.given:
-        return float(columns.given["range_sigma"])
+    if "range_sigma" in columns.user_parameters:
+        return float(columns.user_parameters["range_sigma"])
     return float(f"{scatter_of(time, position):.3g}") if len(time) >= 3 else 0.0
 
 
@@ -284,12 +286,12 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
             medians = {name: float(f"{numpy.nanmedian(columns[name][there]):.6g}") for name in pair}
             return medians, f"columns {pair[0]} and {pair[1]}"
     if assumed:
-        named = "range_sigma" in columns.given
+        named = "range_sigma" in columns.user_parameters
         who = "as --set range_sigma states" if named else "as positions scatter about their neighbours"
         return dict.fromkeys(pairs[0], assumed), f"{NO_DEVIATIONS} of x and y, assumed {who}"
     names = {"range_sigma": "range_sigma", "azimuth_sigma": "bearing_sigma"}
     values = {
-        column: float(columns.given.get(name, getattr(ManeuveringTargetParameters, name)))
+        column: float(columns.user_parameters.get(name, getattr(ManeuveringTargetParameters, name)))
         for column, name in names.items()
     }
     return values, f"{NO_DEVIATIONS}, assumed as of the environment's radar"
@@ -297,7 +299,7 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
 
 def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
     """Return notes on the assumed deviations, where neither a column nor the user states one."""
-    if not is_assumed(source) or "range_sigma" in columns.given:
+    if not is_assumed(source) or "range_sigma" in columns.user_parameters:
         return []
     return [f"{source}: {deviation_words(deviations)}"]
 
@@ -320,7 +322,10 @@ def _variances(
     else:
         names = ("range_sigma", "bearing_sigma")
         sigmas = numpy.array(
-            [float(columns.given.get(name, getattr(ManeuveringTargetParameters, name))) for name in names]
+            [
+                float(columns.user_parameters.get(name, getattr(ManeuveringTargetParameters, name)))
+                for name in names
+            ]
         )
     variance[there] = polar.cartesian_variances(position[there].T, sigmas[0], numpy.radians(sigmas[1])).T
     return variance

@@ -24,16 +24,18 @@ class ScanInput(LiveInput):
         texts = {name: column.live_text for name, column in COLUMNS.items()}
         return texts, texts
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the initial estimate from the first scan, or from given mean and covariance, and the memory."""
-        first = self._scan(numpy.zeros(self.tracks), {n: v for n, v in given.items() if n in COLUMNS})
+        first = self._scan(
+            numpy.zeros(self.tracks), {n: v for n, v in initial_values.items() if n in COLUMNS}
+        )
         measured = {name: numpy.moveaxis(array, -1, 0)[:, None] for name, array in first._asdict().items()}
         twice = {name: numpy.repeat(array, 2, axis=1) for name, array in measured.items()}
         found = start_track(twice, numpy.reshape(time, (-1, 1)), self.parameters).initial
         initial = {name: numpy.moveaxis(found[name], 0, -1) for name in ("mean", "covariance")}
         for name, array in initial.items():
-            if given.get(name) is not None:
-                initial[name] = self.read(given, name, array.shape[:-1]).reshape(array.shape)
+            if initial_values.get(name) is not None:
+                initial[name] = self.read(initial_values, name, array.shape[:-1]).reshape(array.shape)
         return Start(**initial, first=first), {"time": time, "count": self.broadcast(0.0)}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:

@@ -48,7 +48,7 @@ def read_log(columns: Columns) -> TrackLog:
             raise ValueError(f"it lacks the column {name}")
     radar = columns.whole("range", "range_rate")
     interval = columns.regular("the filters of this environment are tabulated by scans")
-    named = {n: v for n, v in columns.given.items() if n not in ("horizon", "decision_interval")}
+    named = {n: v for n, v in columns.user_parameters.items() if n not in ("horizon", "decision_interval")}
     p = RadarEsmTrackingParameters(**{"sampling_interval": interval, **named})
     scans = numpy.arange(len(radar))
     if columns.has("looked"):
@@ -60,7 +60,7 @@ def read_log(columns: Columns) -> TrackLog:
         {name: values[0] for name, values in later.items()},
         {name: values[0] for name, values in initial.items()},
         scans[1:],
-        {} if "sampling_interval" in columns.given else {"sampling_interval": interval},
+        {} if "sampling_interval" in columns.user_parameters else {"sampling_interval": interval},
         float(columns.time[0]),
         columns.time[1:],
     )

@@ -129,9 +129,9 @@ class _Once(_OfSatellites):
 class _Hidden(_Once):
     """Temporary disturbance that the measurement does not report."""
 
-    def switch_off(self, state: Fault, calm: Array) -> Fault:
-        """Return the state without the disturbance in the episodes where ``calm``."""
-        return state._replace(window=self.xp.where(calm, -1.0, state.window))
+    def switch_off(self, state: Fault, undisturbed: Array) -> Fault:
+        """Return the state without the disturbance in the episodes where ``undisturbed``."""
+        return state._replace(window=self.xp.where(undisturbed, -1.0, state.window))
 
 
 class StuckAccelerometers(_Hidden):

@@ -268,12 +268,12 @@ class _KalmanBank(AutopilotBank):
         """Return the action as observed, ``(A, N)``, and the factor that it sets on the process noise, ``(N,)``."""
         raise NotImplementedError
 
-    def sensor_variances(self, shown: Array) -> Any:
+    def sensor_variances(self, action: Array) -> Any:
         """Return the variance of each sensor's reading for the update, numbers or ``(m, N)``."""
         return self.task.sensor_variances
 
     def autopilot_estimate(
-        self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
+        self, update: packed_covariance.PackedUpdate, measurement: Measurement, action: Array
     ) -> tuple[Array, Array]:
         """Return the estimate that the autopilot uses, and its packed covariance."""
         return update.mean, update.covariance
@@ -355,10 +355,10 @@ class NoiseBank(_KalmanBank):
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         return shown, xp.exp(shown[0] * (p.noise_reach * p.process_decades * math.log(10.0)))
 
-    def sensor_variances(self, shown: Array) -> Array:
+    def sensor_variances(self, action: Array) -> Array:
         """Return the nominal variances times ``10 ** (2 noise_reach sensor_decades a)``, ``(m, N)``."""
         p = self.parameters
-        scale = self.xp.exp(shown[1:] * (2.0 * p.noise_reach * p.sensor_decades * math.log(10.0)))
+        scale = self.xp.exp(action[1:] * (2.0 * p.noise_reach * p.sensor_decades * math.log(10.0)))
         return self.nominal_variances * scale
 
 
@@ -389,7 +389,7 @@ class ModeBank(_KalmanBank):
         return shown, 1.0 + (wide + smooth)
 
     def autopilot_estimate(
-        self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
+        self, update: packed_covariance.PackedUpdate, measurement: Measurement, action: Array
     ) -> tuple[Array, Array]:
         """Return the filter's estimate; in mode "raw-sensors" the readings, and zero for other coordinates."""
         xp, reading, measured = self.xp, measurement.reading, self.task.measured
@@ -397,7 +397,7 @@ class ModeBank(_KalmanBank):
         rows = [
             reading[measured.index(i)] if i in measured else zero for i in range(len(self.task.components))
         ]
-        raw = shown[2] > 0.0
+        raw = action[2] > 0.0
         return (
             xp.where(raw, xp.stack(rows), update.mean),
             xp.where(raw, self.raw_covariance, update.covariance),

@@ -76,9 +76,9 @@ class NoisySensors(_OfSensors):
         levels = levels._replace(values=1.0 + chosen * (levels.values - 1.0))
         return SensorLevels(levels, levels.values[0])
 
-    def switch_off(self, state: SensorLevels, calm: Array) -> SensorLevels:
-        """Return the state with factors of one in the episodes where ``calm``."""
-        values = self.xp.where(calm, 1.0, state.levels.values)
+    def switch_off(self, state: SensorLevels, undisturbed: Array) -> SensorLevels:
+        """Return the state with factors of one in the episodes where ``undisturbed``."""
+        values = self.xp.where(undisturbed, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
 
     def advance(self, state: SensorLevels, step: DisturbanceInput) -> SensorLevels:
@@ -152,9 +152,9 @@ class SensorBias(_OfSensors):
         size = draws.uniform("bias", limits, self.count)
         return self.sigmas * self.chosen(self.parameters.biased_sensors) * side * size
 
-    def switch_off(self, state: Array, calm: Array) -> Array:
-        """Return the constant errors, zero in the episodes where ``calm``."""
-        return self.xp.where(calm, 0.0, state)
+    def switch_off(self, state: Array, undisturbed: Array) -> Array:
+        """Return the constant errors, zero in the episodes where ``undisturbed``."""
+        return self.xp.where(undisturbed, 0.0, state)
 
     def change_reading(self, state: Array, reading: Array) -> tuple[Array, Array]:
         """Return the state, and the readings with the constant errors added."""

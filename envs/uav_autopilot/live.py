@@ -21,9 +21,9 @@ class SensorInput(LiveInput):
         }
         return values, {"command": "at the start, in the unit of the output"}
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Return the initial estimate with the given command (default: zero), and the memory."""
-        initial, memory = super().start(time, {"command": 0.0, **given})
+        initial, memory = super().start(time, {"command": 0.0, **initial_values})
         return initial, {**memory, "reading": self.broadcast(0.0, self.measurement.reading.shape[:-1])}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
