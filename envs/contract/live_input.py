@@ -84,7 +84,7 @@ class LiveInput:
         array = read_numbers(name, numpy.nan if value is None else value)
         if numpy.count_nonzero(numpy.abs(array) > LARGEST):  # a tenth of the time of any()
             raise ValueError(
-                f"{name} must be at most {LARGEST:g}, or NaN where it did not come, got {quote_shortened(value)}"
+                f"{name} must be at most {LARGEST:g}, or NaN where it was not received, got {quote_shortened(value)}"
             )
         if value is None:
             array = numpy.full((*shape, 1), numpy.nan)

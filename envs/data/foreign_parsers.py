@@ -103,7 +103,7 @@ def parse_netcdf4(
         total = sum(size(variable) * max(_item_size(variable), 1) for variable in chosen.values())
         if numbers > numbers_limit:
             raise ValueError(
-                f"it holds {numbers:,} numbers, more than the {numbers_limit:,} that it may: split it"
+                f"it holds {numbers:,} numbers, more than the limit of {numbers_limit:,}: split it"
             )
         if total > bytes_limit:
             raise LimitError(f"its values take {total / 1e6:,.0f} MB")

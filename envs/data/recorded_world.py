@@ -285,9 +285,7 @@ class LiveWorld(_ForeignWorld):
 
     def state(self, truth: Unknown) -> Array:
         """Raise ValueError, since the truth of live measurements is unknown."""
-        raise ValueError(
-            "the truth of what comes from outside is not known, so there is no error and no cost"
-        )
+        raise ValueError("the truth of live measurements is unknown, so there is no error and no cost")
 
 
 def _count_numbers(like: Any) -> int:

@@ -251,8 +251,8 @@ class Recording(ScenarioData):
             for name in found:
                 if name not in expected:
                     raise ValueError(
-                        f"recording {self.name!r} has {prefix}{name}, which is nothing that {task.id} {kind}: "
-                        f"{', '.join(prefix + name for name in expected)}"
+                        f"recording {self.name!r} has {prefix}{name}, which is not among the arrays "
+                        f"that {task.id} {kind}: {', '.join(prefix + name for name in expected)}"
                     )
                 shape = found[name].shape[leading:]
                 if shape != expected[name]:

@@ -138,7 +138,7 @@ class EnvBase:
             and not all(t.task.has_whole_truth for t in models)
         ):
             raise ValueError(
-                f"{_no_truth(distribution)}, and this environment gives rewards: make another one of it"
+                f"{_no_truth(distribution)}, and this environment gives rewards: make another environment for it"
             )
         first = getattr(self, "model", models[0])
         for model, name in zip(models, names, strict=True):

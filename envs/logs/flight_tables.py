@@ -208,7 +208,7 @@ def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xa
             numbers = sum(variable.size for variable in data.variables.values())
             if numbers > MOST_NUMBERS:
                 raise ValueError(
-                    f"it holds {numbers:,} numbers, more than the {MOST_NUMBERS:,} that it may: split it"
+                    f"it holds {numbers:,} numbers, more than the limit of {MOST_NUMBERS:,}: split it"
                 )
             return data.load()
     found = parse_apart(

@@ -122,7 +122,7 @@ def match_truth(
     clock, now = clock_seconds(times)
     if clock != truth.clock:
         raise ValueError(
-            f"the times of the log are {clock} and those of the truth {truth.clock}: write both alike"
+            f"the times of the log are {clock} and those of the truth {truth.clock}: use the same form in both"
         )
     then = truth.time + offset
     after = numpy.clip(numpy.searchsorted(then, now), 1, max(len(then) - 1, 1))

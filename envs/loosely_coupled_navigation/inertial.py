@@ -308,7 +308,7 @@ def check_clocks(inertial: Any, clock: str, other: Any, its_clock: str, what: st
     """Raise ValueError if the IMU and another log have different clocks or do not overlap in time."""
     if clock != its_clock:
         raise ValueError(
-            f"times of the IMU are {clock} and those of the {what} {its_clock}: write both alike"
+            f"times of the IMU are {clock} and those of the {what} {its_clock}: use the same form in both"
         )
     if other.index[0] > inertial.index[-1] or other.index[-1] < inertial.index[0]:
         raise ValueError(

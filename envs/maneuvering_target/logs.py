@@ -92,7 +92,7 @@ def read_log(columns: Columns) -> TrackLog:
     plots = numpy.flatnonzero(there)
     if len(plots) < 3:
         raise ValueError(
-            f"it has {len(plots)} plot{'s' * (len(plots) != 1)}: the track starts from the first two, and goes on"
+            f"it has {len(plots)} plot{'s' * (len(plots) != 1)}: the track starts from the first two and needs a third"
         )
     first = plots[1]
     initial = two_plot_start(position[plots[:2]], variance[plots[:2]], numpy.diff(columns.time[plots[:2]]))
