@@ -30,7 +30,7 @@ def draw_undisturbed(draws: Draws, parameters: Any) -> Array | None:
     """Draw booleans ``(N,)``: which episodes have no hidden disturbance; None if every episode may have them.
 
     The first call takes a random number. Disturbances that a measurement reports are drawn in these episodes by the
-    same law as in all others, so that no report shows whether an episode is one of them.
+    same law as in all others, so that no report reveals whether an episode is one of them.
 
     Args:
         draws: random numbers that fix the scenario of each episode.

@@ -23,7 +23,7 @@ The clock of every task:
 
 ``begin`` makes the episode at the start of the track, as if step 4 had just happened: :meth:`World.begin`
 gives the initial estimate to :meth:`Filter.start`. A reset is ``begin``, 1, 2, 3; an
-environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation shows a
+environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation is that of a
 real measurement that is not acted on.
 
 A :class:`Task` is the declaration of an author; :class:`TaskBase` derives the rest from it: the parameters, the

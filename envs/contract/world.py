@@ -19,7 +19,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     """Base class of the truth and the sensors of a task.
 
     Args:
-        task: whose world it is, with the constants that both halves share.
+        task: the estimation problem, with the constants that world and filter share.
 
     Attributes:
         initial_normals: standard normal numbers of the track's start.

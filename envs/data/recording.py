@@ -40,7 +40,7 @@ class Recording(ScenarioData):
         measurements: every array of the environment's ``Measurement`` by its name, ``(E, T, ...)``.
         initial: every array of the initial estimate given to every filter, ``(E, ...)``.
         seconds: times since the start of the track, s, ``(E, T)``; NaN beyond the end of an episode.
-        lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation shows it,
+        lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation is of it,
             otherwise the last measurement again.
         truth: true values of the task's components in their units, ``(E, T, C)``; NaN for an unknown one, None
             where all are unknown.

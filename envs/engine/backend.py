@@ -68,7 +68,7 @@ def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
 
     Args:
         backend: one of ``BACKENDS``; all but "torch" compute on NumPy arrays.
-        device: None for the backend's default (the CPU), or what ``torch.device`` takes, such as "cuda:1".
+        device: None for the backend's default (the CPU), or an argument of ``torch.device``, such as "cuda:1".
 
     Returns:
         Namespace and device; the device is None for NumPy.

@@ -249,7 +249,7 @@ def check_names(cls: "type[Task]", keywords: Iterable[str], others: Iterable[str
     Args:
         cls: the environment.
         keywords: that were given as parameters.
-        others: what could have been meant beside parameters.
+        others: further valid names, for the suggestion.
     """
     known = parameter_names(cls)
     for name in keywords:

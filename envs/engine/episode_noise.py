@@ -229,7 +229,7 @@ class EpisodeNoise:
     # --- copies and growth
 
     def grow(self, count: int, index: numpy.ndarray) -> None:
-        """Enlarge the memory to ``count`` lanes.
+        """Enlarge the memory of random numbers to ``count`` lanes.
 
         Args:
             count: new number of lanes, a multiple of eight.

@@ -1,4 +1,4 @@
-"""Named sensors of a state-space model: what they measure, when, and their faults.
+"""Named sensors of a state-space model: their measurements, rates and faults.
 
 A measurement contains the numbers of all sensors, one after the other, and which of them were received. Filters update
 with simultaneous sensors jointly: their noises are independent, so the order would matter only to linearisation.

@@ -114,7 +114,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
 
     Args:
         task: the problem.
-        prior: what it expects.
+        prior: of faults and noises.
         **changed: fields of the prior.
     """
 

@@ -73,7 +73,7 @@ class KalmanNetBank(NoiseBank):
         return state._replace(action=self.xp.concat([state.action, state.action]))
 
     def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
-        """Return the state predicted as under control ``noise``, whose action is the first part of this one."""
+        """Return the state predicted with the noises of the last action's first part, as under control ``noise``."""
         predicted = super().predict(state._replace(action=state.action[: len(NOISES)]), measurement)
         return predicted._replace(action=state.action)
 

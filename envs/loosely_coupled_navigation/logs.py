@@ -74,7 +74,7 @@ def read_log(columns: Columns) -> TrackLog:
     """Return the measurements of one track from the columns of a table.
 
     Raises:
-        ValueError: for what lacks or cannot be.
+        ValueError: for missing or impossible values.
     """
     ends = [f"_{axis}" for axis in AXES if columns.has(f"ins_{axis}") or columns.has(f"fix_{axis}")]
     if columns.has("ins") or not ends:

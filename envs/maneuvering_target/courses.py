@@ -42,7 +42,7 @@ class Course(ABC):
         """Return the drawn constants of each episode's flight, and the motion at the start.
 
         Args:
-            draws: what fixes the scenario of each episode.
+            draws: random quantities of each episode.
             ones: ``(N,)``.
         """
 
@@ -126,7 +126,7 @@ class Maneuvers(NamedTuple):
 
     @property
     def acceleration(self) -> Array:
-        """Acceleration of thrust, m/s^2, ``(2, manoeuvres, N)``."""
+        """Acceleration of each manoeuvre's thrust along x and y, m/s^2, ``(2, manoeuvres, N)``."""
         return self.effect[4:]
 
 

@@ -107,7 +107,7 @@ def sensor_blocks(
     """Return the observation blocks of a measurement's covariance in the frame of the velocity.
 
     Args:
-        bank: that shows them.
+        bank: with these blocks.
         variances: along and across, ``(2, N)``, m^2, of the bank's state and the measurement.
         coupling: the correlation, ``(N,)``.
     """

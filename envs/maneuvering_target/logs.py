@@ -67,7 +67,7 @@ def read_log(columns: Columns) -> TrackLog:
     """Return the measurements of one track from the columns of a table of plots.
 
     Raises:
-        ValueError: for what lacks or cannot be. Scans without a plot are missing measurements.
+        ValueError: for missing or impossible values. Scans without a plot are missing measurements.
     """
     for pair in PAIRS:
         if sum(columns.has(name) for name in pair) == 1:
@@ -366,7 +366,7 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
 
     Args:
         columns: of one track.
-        rows: of the scans, ``(T,)``, -1 for a scan that has no row: what was moved until the next row is divided
+        rows: of the scans, ``(T,)``, -1 for a scan that has no row: the displacement until the next row is divided
             evenly.
     """
     moved = _displacements(columns)

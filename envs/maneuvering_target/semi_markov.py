@@ -153,7 +153,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
 
     Args:
         task: the problem.
-        prior: what it expects.
+        prior: of flights and measurements.
         **changed: fields of the prior.
     """
 

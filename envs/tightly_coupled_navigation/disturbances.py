@@ -65,10 +65,10 @@ class _OfSatellites(Disturbance):
         """Return the values of all readings, ``(m, N)``, with those of ``changed`` put in from row ``first`` on."""
         return self.xp.concat([values[:first], changed, values[first + changed.shape[0] :]])
 
-    def change_available(self, measurement: Any, first: int, kept: Array) -> Any:
-        """Return the measurement with the availability of readings from ``first`` on multiplied by ``kept``."""
+    def change_available(self, measurement: Any, first: int, factor: Array) -> Any:
+        """Return the measurement with the availability of readings from ``first`` on multiplied by ``factor``."""
         available = measurement.available
-        changed = available[first : first + kept.shape[0]] * kept
+        changed = available[first : first + factor.shape[0]] * factor
         return measurement._replace(available=self.change_rows(available, first, changed))
 
 

@@ -181,7 +181,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
 
     Args:
         task: the problem.
-        prior: what it expects.
+        prior: of motion and faults.
         **changed: fields of the prior.
     """
 

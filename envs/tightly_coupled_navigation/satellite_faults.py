@@ -29,9 +29,9 @@ class OneFault(FaultHypotheses):
 
     Args:
         task: the problem.
-        prior: what it expects; of jumps those of this pseudorange.
+        prior: of motion and faults; its jumps are those of this pseudorange.
         wrong: number of the satellite.
-        walk: m, standard deviation of a step of its error in a second.
+        walk: standard deviation of its error's random walk in a second, m.
     """
 
     def __init__(self, task: NavigationProblem, prior: FaultPrior, wrong: int, walk: float) -> None:
@@ -71,9 +71,9 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
 
     Args:
         task: the problem.
-        prior: what the members expect.
-        begins: faults expected in a second, of all satellites together.
-        walk: m, what the error of a wrong pseudorange moves in a second.
+        prior: of all members.
+        begins: expected number of faults per second, of all satellites together.
+        walk: standard deviation of the wrong pseudorange's random walk in a second, m.
         **changed: fields of the prior.
     """
 

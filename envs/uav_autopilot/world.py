@@ -226,7 +226,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         ``(R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation (see :class:`.Regulator`). Of two filters
         the sums over an episode differ on average by the difference of their costs, including the value ``x^T S x`` of
         their final states. The loss excludes the costs of noise and command under any control and their variance, so
-        that the value of an action shows sooner.
+        that the effect of an action is visible sooner.
         """
         if self.optimal is None:
             return self.cost(truth, mean)
