@@ -82,7 +82,7 @@ def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
 
 
 def bounded_exponential(compressed: numpy.ndarray) -> numpy.ndarray:
-    """Return the values whose :func:`bounded_logarithm` is given: its inverse."""
+    """Return the values x whose ``bounded_logarithm(x)`` is ``compressed``: the inverse of that function."""
     return symexp(compressed / (1.0 - numpy.abs(compressed) / LIMIT), numpy)
 
 

@@ -88,7 +88,7 @@ class EpisodeStepper(Protocol):
 
     @property
     def rewards(self) -> Any:
-        """Reports of the last :meth:`decide`, where each is one number, ``(interval, width)``."""
+        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``."""
         ...
 
     def observation_by_field(self) -> Array:
@@ -220,7 +220,7 @@ class ModelStepper:
 
     @property
     def rewards(self) -> list[Array]:
-        """Reports of the last :meth:`decide`, where each is one number, ``(interval, width)``."""
+        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``."""
         return self._reports
 
     def first_reward(self, baseline: "ModelStepper | None") -> float:

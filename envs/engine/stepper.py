@@ -424,7 +424,7 @@ class Stepper:
 
     @property
     def rewards(self) -> numpy.ndarray:
-        """Reports of the last :meth:`decide`, where each is one number, ``(interval, width)``.
+        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``.
 
         Several rows are valid until the next decision.
         """

@@ -296,7 +296,7 @@ def measurement_indices(h: VectorFunction) -> list[int | None]:
 
 
 class StateSpace(StateSpaceProblem):
-    """A state-space model of your own, and the filters that estimate its state.
+    """A user's state-space model, and the filters that estimate its state.
 
     ## Description
 

@@ -124,11 +124,11 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         )
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return Q at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
+        """Return the process noise Q at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return R at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
+        """Return the measurement noise R at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
         return self.equations.sensor_noise(mean, measurement)
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:

@@ -28,14 +28,14 @@ from .world import InsGnssWorld
 
 
 class LooselyCoupledNavigation(Task):
-    """An inertial system drifts away, a noisy satellite receiver holds it back, one gain decides how much.
+    """Loosely coupled INS/GNSS navigation: steer the gain that weights a drifting INS against a noisy receiver.
 
     ### Description
 
     The inertial navigation system (INS) gives smooth increments of position whose rate error is a random
     constant, a coloured and a white noise; its error grows without limit. The satellite receiver (GNSS)
-    measures the position with strong white noise and no memory. The Kalman-Bucy filter of the paper lets the
-    increments drive the estimate and pulls it to the measurement by a gain. A high gain follows the receiver
+    measures the position with strong white noise and no memory. The Kalman-Bucy filter of the paper adds the
+    increments to the estimate and corrects it towards the measurement by a gain. A high gain follows the receiver
     noise, a low one follows the drift, and the better one depends on unknown noise levels.
 
     With ``control="noise"`` (default) the augmented filter, which also estimates the rate errors, computes its
@@ -53,8 +53,8 @@ class LooselyCoupledNavigation(Task):
     ``Actions`` describes each control. Values outside the box are clipped to it. An action holds for
     ``decision_interval`` measurements, ten by default.
 
-    Without a measurement the gain is zero, whatever the action; under ``noise`` the covariance still grows by
-    the rate errors' noises that the action states.
+    Without a measurement the gain is zero, for any action; under ``noise`` the covariance still grows by
+    the rate errors' noises that the action sets.
 
     ### Observation Space
 

@@ -34,7 +34,7 @@ def _picture(model: Model) -> Any:
 
 
 class ManeuveringTarget(TargetProblem):
-    """Radar tracking of an aircraft that manoeuvres, with fixed-gain filters (Bakulev, Sychev, Nguyen).
+    """Radar tracking of a manoeuvring aircraft: steer an IMM of fixed-gain filters (Bakulev, Sychev, Nguyen).
 
     ## Description
 

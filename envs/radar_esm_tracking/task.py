@@ -44,7 +44,7 @@ def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str
 
 
 class RadarEsmTracking(RadarEsmProblem):
-    """Radar and ESM fused, the target's class recognised (Ivanov, Seliverstov).
+    """Fusion of radar and ESM for tracking and target classification: weight a filter for each class.
 
     ## Description
 

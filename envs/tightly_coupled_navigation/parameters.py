@@ -289,7 +289,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
 
     @property
     def sensors(self) -> tuple[SensorGroup, ...]:
-        """All groups of sensors, in the order of the readings."""
+        """All groups of sensors (:class:`SensorGroup`), in the order of the readings."""
         ranges, rates, forces, angles = gnss_ins.sensor_groups(len(self.satellites))
         return (
             SensorGroup("pseudoranges", ranges, self.pseudorange_sigma, self.range_aperture),

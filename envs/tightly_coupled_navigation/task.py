@@ -44,7 +44,7 @@ def _picture(model: Model) -> Any:
 
 
 class TightlyCoupledNavigation(NavigationProblem):
-    """Steer a bank of extended Kalman filters over pseudoranges, their rates, and inertial sensors.
+    """Tightly coupled INS/GNSS navigation: steer a bank of extended Kalman filters over motion hypotheses.
 
     ## Description
 

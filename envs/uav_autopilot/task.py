@@ -49,7 +49,7 @@ def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str
 
 
 class UavAutopilot(AutopilotProblem):
-    """Steer the Kalman filter that feeds the autopilot of a small unmanned aircraft.
+    """Autopilot of a small unmanned aircraft: steer the Kalman filter in its control loop.
 
     ## Description
 
