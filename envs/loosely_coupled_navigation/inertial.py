@@ -177,7 +177,7 @@ def measurements_beside(
 def read_columns(
     data: Any, what: str, needed: Sequence[str], optional: Sequence[str] = ()
 ) -> tuple["pandas.DataFrame", str]:
-    """Return columns of a file or table as numbers sorted by time, s, and the clock of its times.
+    """Return columns of a file or table as numbers, indexed by time, s, and the kind of clock of its times.
 
     Args:
         data: a file or a table.
