@@ -427,10 +427,10 @@ class Lanes:
         """Return new :class:`ModelStepper` objects of task and baseline, without episodes."""
         steppers = [ModelStepper(model, self.width) for model in self._models]
         if self.baseline is not None:
-            steppers[1].take(self._beside_action(self.width))
+            steppers[1].take(self._baseline_action(self.width))
         return steppers
 
-    def _beside_action(self, count: int) -> Array:
+    def _baseline_action(self, count: int) -> Array:
         """Return the baseline's action, repeated for ``count`` lanes, batch first."""
         assert self.baseline is not None
         actions = [self.baseline.action] * count
@@ -450,7 +450,7 @@ class Lanes:
             if self.baseline is not None:
                 world_of = steppers[0] if share_world(*self._models) else None
                 steppers.append(Stepper(self.baseline.model, report, self.width, world_of))
-                steppers[1].take(self._beside_action(self.width))
+                steppers[1].take(self._baseline_action(self.width))
         before, after = self._moving, self._steppers.get(report)
         if after is None:
             settled = self._settle()
