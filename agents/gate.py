@@ -353,10 +353,10 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
             fallback=self.fallback.predict(state.fallback, measurement),
         )
 
-    def update(self, state: GatedState, given: FilterInput) -> GatedState:
+    def update(self, state: GatedState, inputs: FilterInput) -> GatedState:
         """Return the state with both filters updated by a measurement, and the choice of the trusted one."""
-        xp, measurement = self.xp, given.measurement
-        agent, fallback = self.agent.update(state.agent, given), self.fallback.update(state.fallback, given)
+        xp, measurement = self.xp, inputs.measurement
+        agent, fallback = self.agent.update(state.agent, inputs), self.fallback.update(state.fallback, inputs)
         mean, other_mean = self.agent.mean(agent), self.fallback.mean(fallback)
         own = Likelihood.of_records(self.agent.records(agent, measurement))
         other = Likelihood.of_records(self.fallback.records(fallback, measurement))

@@ -34,9 +34,9 @@ class LearnedEstimator(SteeredFilter):
         """Return the bank's state predicted to a measurement, with zeros for missing values."""
         return super().predict(state, fill_missing(measurement))
 
-    def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
+    def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
         """Run the network on the measurement, update the bank with its action, and return the state."""
-        return super().update(state, FilterInput(fill_missing(given.measurement)))
+        return super().update(state, FilterInput(fill_missing(inputs.measurement)))
 
 
 def fill_missing(measurement: Any) -> Any:

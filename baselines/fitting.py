@@ -116,9 +116,9 @@ class ScaledNoise(Filter[Task, Any, Any]):
         """Return the inner filter's state predicted to the scaled measurement."""
         return self.own.predict(state, self.scaled(measurement, self.factor))
 
-    def update(self, state: Any, given: FilterInput) -> Any:
+    def update(self, state: Any, inputs: FilterInput) -> Any:
         """Return the inner filter's state after an update with the scaled measurement."""
-        return self.own.update(state, FilterInput(self.scaled(given.measurement, self.factor)))
+        return self.own.update(state, FilterInput(self.scaled(inputs.measurement, self.factor)))
 
     def mean(self, state: Any) -> Array:
         """Return the mean of the inner filter's estimate, ``(C, N)``."""
@@ -182,9 +182,9 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         """Return the inner filter's state at the initial estimate, with unknown likelihood."""
         return RobustState(self.own.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: RobustState, given: FilterInput) -> RobustState:
+    def update(self, state: RobustState, inputs: FilterInput) -> RobustState:
         """Return the likelier of two updates, with stated and with wide deviations, and the mixture's likelihood."""
-        (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(given.measurement, state.own)
+        (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(inputs.measurement, state.own)
         nis = None if own.nis is None else self.xp.where(is_outlier, other.nis, own.nis)
         likelihood = Likelihood(log_likelihood, nis, own.nis_degrees).fill_unknown(log_likelihood)
         return RobustState(select_nested(is_outlier, wide, usual), likelihood)

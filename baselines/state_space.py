@@ -177,7 +177,7 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task)
-        self.equations: Equations = task.believed[0]
+        self.equations: Equations = task.filter_equations[0]
         self.factor = process_noise
         self.of_sources, of_sensors = _split(task, noises)
         self.sensor_factors: tuple[Any, dict[str, Any]] = measurement_noise, of_sensors
@@ -195,9 +195,9 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun)
 
-    def update(self, state: Any, given: FilterInput) -> Any:
+    def update(self, state: Any, inputs: FilterInput) -> Any:
         """Predict to a measurement, update with it, and return the state."""
-        return _in_order(state, given.measurement, self.take)
+        return _in_order(state, inputs.measurement, self.take)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
         """Return the state predicted to a measurement and updated with it."""
@@ -312,7 +312,7 @@ class Unscented(Extended):
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task, process_noise, measurement_noise, **noises)
-        usual = task.definition.usual_noise(task.parameters.sampling_interval)
+        usual = task.definition.nominal_process_noise(task.parameters.sampling_interval)
         self.uncertain: Array = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Any:
@@ -357,9 +357,9 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
         """Return the filter's state at the start of a track, from the initial estimate."""
         return _buffer(self.task, self.bank.start(initial))
 
-    def update(self, state: Any, given: FilterInput) -> Any:
+    def update(self, state: Any, inputs: FilterInput) -> Any:
         """Predict to a measurement and update with it, without an action; return the state."""
-        return _in_order(state, given.measurement, self.take)
+        return _in_order(state, inputs.measurement, self.take)
 
     def take(self, state: Mixture, one: Past) -> Mixture:
         """Return the state predicted to a measurement and updated with it."""

@@ -17,7 +17,7 @@ from filtergym.envs.contract.model import Episode, Model
 from filtergym.envs.contract.observation import Array
 from filtergym.envs.engine.catalogue import import_task
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.envs.engine.reward import OWN_REWARDS
+from filtergym.envs.engine.reward import REWARD_FUNCTIONS
 from filtergym.envs.engine.scenario_choice import make_task
 
 
@@ -59,4 +59,4 @@ def step_episodes(
     """Return episodes at the next measurement, the reward of the action, and the observation."""
     after = model.act(episode, action)
     following = model.measure(after, noise)
-    return following, OWN_REWARDS["cost"](model, after), model.observe(following)
+    return following, REWARD_FUNCTIONS["cost"](model, after), model.observe(following)

@@ -23,7 +23,7 @@ from . import __version__
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
 from .compiler.program import without_collection
-from .envs.contract.failures import own_line
+from .envs.contract.failures import user_code_line
 from .envs.engine.catalogue import modules_from
 
 Commands = Mapping[str, Callable[..., None] | str]
@@ -198,7 +198,10 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
         if isinstance(error, MemoryError):
             text = f"Error: not enough memory, run less at once: {error}"
         elif not isinstance(error, ValueError | OSError | ImportError | gymnasium.error.Error):
-            text, code = f"Error: unexpected {type(error).__name__}: {error}{own_line(error)}; {REPORT}", 1
+            text, code = (
+                f"Error: unexpected {type(error).__name__}: {error}{user_code_line(error)}; {REPORT}",
+                1,
+            )
         _print_error(text, "red")
         sys.exit(code)
 

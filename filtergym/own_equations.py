@@ -11,7 +11,7 @@ from .compiler import namespace
 from .compiler.namespace import NotTraceable
 from .compiler.vector_functions import VectorFunction
 from .envs.contract.parameters import read_numbers
-from .envs.linear.equations import StateSpaceModel, process_noise, sensor_noise, usual_sensor_noise
+from .envs.linear.equations import StateSpaceModel, nominal_sensor_noise, process_noise, sensor_noise
 from .envs.linear.inputs import Input
 from .own_drifts import Discretised, discretise_drift
 
@@ -49,7 +49,7 @@ class Surroundings:
     """Number of steps of the Runge-Kutta method in an interval, for a drift that is not linear."""
 
     @property
-    def usual_inputs(self) -> numpy.ndarray:
+    def nominal_inputs(self) -> numpy.ndarray:
         """Means of the distributions of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
@@ -74,7 +74,7 @@ def make_model(equations: Mapping[str, Any], around: Surroundings) -> StateSpace
     model = StateSpaceModel(
         motion.f, h, motion.Q, R, motion.G, _of_inputs(equations["h"], h, around), motion.sources
     )
-    check_covariance("Q", process_noise(model, around.mean, around.interval, around.usual_inputs), n)
+    check_covariance("Q", process_noise(model, around.mean, around.interval, around.nominal_inputs), n)
     _check_sensor_noise(model, blocks, around)
     return model
 
@@ -152,9 +152,9 @@ def _check_sensor_noise(model: StateSpaceModel, blocks: Sequence[NoiseBlock], ar
     if not isinstance(model.R, VectorFunction):
         return
     deviations = numpy.array([one.deviation for one in around.inputs.values()])
-    inputs = around.usual_inputs[:, None] + deviations[:, None] * numpy.linspace(-FAR, FAR, 7)
+    inputs = around.nominal_inputs[:, None] + deviations[:, None] * numpy.linspace(-FAR, FAR, 7)
     R = sensor_noise(model, around.mean, numpy.full(inputs.shape[1], around.interval), inputs)
-    usual = usual_sensor_noise(model, around.mean, around.interval, around.inputs)
+    usual = nominal_sensor_noise(model, around.mean, around.interval, around.inputs)
     first = 0
     for block in blocks:
         own = slice(first, first + block.size)

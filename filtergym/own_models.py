@@ -192,7 +192,7 @@ def state_space(
     columns = dict.fromkeys(measured or [f"z{j + 1}" for j in range(m)], "")
     columns = sensor_columns(sensors, channels) if sensors else columns
     check_columns(measured or tuple(columns), m, inputs)
-    usual = numpy.concatenate([mean, [interval], around.usual_inputs])
+    usual = numpy.concatenate([mean, [interval], around.nominal_inputs])
     warn_of_turns(world[0], usual, {name: i in periods for i, name in enumerate(names)}, channels)
     measures = [units[places.index(j)] if j in places else "1" for j in range(m)]
     definition = StateSpaceDefinition(

@@ -70,7 +70,7 @@ def move_roundings(env, repetition=0):
     """
     lanes = env.unwrapped.fleet.only
     pattern = 1000 * repetition + np.arange(lanes.width)
-    beside = lanes.beside.model if lanes.beside else lanes.model
+    beside = lanes.baseline.model if lanes.baseline else lanes.model
     for model in {id(model): model for model in (lanes.model, beside)}.values():
         parts = ((model.task.world, "world"), (model.filter, "filter"))
         for owner, names in (

@@ -136,7 +136,7 @@ def netcdf4(path, rows=60, dtype="f8", **more):
 def test_netcdf_of_values_that_were_never_written(tmp_path):
     path = netcdf4(tmp_path / "huge.nc", 2 * 10**9)
     assert path.stat().st_size < 20_000
-    refused(path, r"it holds 6,000,000,000 numbers, more than the 50,000,000 that it may: split it")
+    refused(path, r"it holds 6,000,000,000 numbers, more than the limit of 50,000,000: split it")
 
 
 def test_netcdf_of_long_words(tmp_path):

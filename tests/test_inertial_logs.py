@@ -172,7 +172,7 @@ def test_what_no_imu_says_is_refused(pyins, log, change, sentence):
         (lambda t: changed(t, ["latitude"], lambda a: 1e7 * a), "must be degrees"),
         (
             lambda t: t.assign(time=pd.date_range("2026-05-01", periods=len(t), freq="500ms")),
-            "write both alike",
+            "use the same form in both",
         ),
     ],
 )

@@ -136,7 +136,7 @@ def test_of_radar_and_esm_any_answer_is_what_the_description_says():
             noise, gain = a[classes : classes + 3], a[classes + 3 :]
             R = np.diag(fusion.NOISE_RANGE ** (2.0 * noise[1:])) @ models.R
             W = np.diag(fusion.CAUTION ** (2.0 * gain[1:])) @ R
-            posterior = np.log(before.believed[:, i])
+            posterior = np.log(before.posterior[:, i])
             for s in range(classes):
                 Phi, Q = models.Phi[:, :, s], models.Q[:, :, s]
                 x, carried = Phi @ before.mean[:, s, i], Phi @ P_before[:, :, s, i] @ Phi.T
@@ -155,7 +155,7 @@ def test_of_radar_and_esm_any_answer_is_what_the_description_says():
                 theta = H @ (carried + q_before[i] * Q) @ H.T + R_before[:, :, i]
                 posterior[s] += scipy.stats.multivariate_normal(cov=theta).logpdf(delta)
             weights = np.exp(posterior + esm[:, i] - max(posterior + esm[:, i]))
-            np.testing.assert_allclose(state.believed[:, i], weights / weights.sum(), rtol=1e-7, atol=1e-12)
+            np.testing.assert_allclose(state.posterior[:, i], weights / weights.sum(), rtol=1e-7, atol=1e-12)
             weights *= np.exp(fusion.EVIDENCE * a[:classes])
             np.testing.assert_allclose(
                 state.probabilities[:, i], weights / weights.sum(), rtol=1e-7, atol=1e-12

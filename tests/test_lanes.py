@@ -14,7 +14,7 @@ from filtergym.envs.engine import episode_noise
 from filtergym.envs.engine.compiled import share_world
 from filtergym.envs.engine.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.envs.engine.reward import OWN_REWARDS, reference
+from filtergym.envs.engine.reward import REWARD_FUNCTIONS, reference
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -146,7 +146,7 @@ def assert_runs_beside_as_lanes_of_its_own(subject, kind):
     """Also where it has no world of its own: after restarts of few lanes, growth, a snapshot and other reports."""
     model = make_model(subject.id, backend=subject.backend)
     beside = reference(kind, model)
-    count, report, space = 24, OWN_REWARDS[kind], model.action_space
+    count, report, space = 24, REWARD_FUNCTIONS[kind], model.action_space
     lanes, own, other = (
         Lanes(*each) for each in ((model, count, beside), (model, count), (beside.model, count))
     )

@@ -185,11 +185,13 @@ def test_scaled_noises_are_those_of_a_textbook_filter():
             Phi, Qd = linear_systems.van_loan(*before, 0.01)
             shown = Phi @ P @ Phi.T + Qd
             innovation = said.available[lane] * (said.fix[:, lane] - said.ins[:, lane] + (Phi @ error)[0])
-            np.testing.assert_allclose(seen.filter.seen.innovation[:, lane], innovation, atol=1e-11)
+            np.testing.assert_allclose(seen.filter.innovations.innovation[:, lane], innovation, atol=1e-11)
             np.testing.assert_allclose(seen.filter.deviation[lane] ** 2, shown[0, 0], rtol=1e-9)
             if said.available[lane]:
                 np.testing.assert_allclose(
-                    seen.filter.seen.normalised[:, lane], innovation / math.sqrt(shown[0, 0] + R), atol=1e-11
+                    seen.filter.innovations.normalised[:, lane],
+                    innovation / math.sqrt(shown[0, 0] + R),
+                    atol=1e-11,
                 )
             Phi, Qd = linear_systems.van_loan(*scaled, 0.01)
             error, P, before = Phi @ error, Phi @ P @ Phi.T + Qd, scaled
@@ -239,7 +241,7 @@ def test_averages_are_those_of_the_definition():
     for seen, _ in states(model, numbers(model, 1, 400, 4), constant(model, 0.4, 1)):
         said, bank = seen.measurement, seen.filter
         if said.available[0]:
-            n = bank.seen.innovation[0, 0] / math.sqrt(
+            n = bank.innovations.innovation[0, 0] / math.sqrt(
                 bank.variance.assumed[0, 0] + said.reported_deviation[0] ** 2
             )
             mean += weight * (n - mean)

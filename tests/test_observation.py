@@ -9,9 +9,9 @@ from models import begin, make_model, next_row
 
 from filtergym.envs.contract.observation import (
     BOUNDED_LOG,
-    KEPT_AS_LOG1P,
     LOG1P,
     SIGNED_LOG,
+    STORED_AS_LOG1P,
     Block,
     Blocks,
     Quantity,
@@ -21,7 +21,7 @@ from filtergym.envs.contract.observation import (
 BLOCKS = (
     Block("a", lambda state, _: state.a, "two numbers", ("x", "y"), SIGNED_LOG),
     Block("b", lambda state, measurement: state.b + measurement, "one number"),
-    Block("c", lambda state, _: state.c, "kept as a logarithm", compression=KEPT_AS_LOG1P),
+    Block("c", lambda state, _: state.c, "kept as a logarithm", compression=STORED_AS_LOG1P),
     Block("d", lambda state, _: state.d, "four numbers in two axes", ("1x", "1y", "2x", "2y"), SIGNED_LOG),
     Block("e", lambda state, _: state.e, "scaled", compression=linear_scale(0.1, 45.0), unit="10 dB"),
     Block("f", lambda state, _: state.f, "a square", compression=LOG1P),

@@ -156,7 +156,7 @@ def test_weights_that_are_stated_are_the_prior_of_the_next_scan(control):
     model = make("random", control, horizon=20)
     stated = numpy.full(8, 2) if control == "mode" else numpy.tile([[0.0], [0.0], [1.0]], 8)
     for _, _, state in roll(model, draw(model, 8, 4), lambda _: stated):
-        numpy.testing.assert_array_equal(state.filter.believed, [[0.0] * 8, [0.0] * 8, [1.0] * 8])
+        numpy.testing.assert_array_equal(state.filter.posterior, [[0.0] * 8, [0.0] * 8, [1.0] * 8])
 
 
 def test_everyone_is_told_the_first_measurement_and_how_good_it_is():

@@ -182,7 +182,7 @@ def test_without_truth_rewards_are_zero_and_nothing_is_judged(recordings):
         with pytest.raises(ValueError, match="has no truth, so the cost of an estimate is not known"):
             gym.make(TARGET, scenario=recording, **keywords)
     paying = gym.make(TARGET, horizon=24, reward="cost").unwrapped  # also of a scan that missed
-    with pytest.raises(ValueError, match="and this environment gives rewards: make another one"):
+    with pytest.raises(ValueError, match="and this environment gives rewards: make another environment"):
         paying.reset(options={"scenario": recording})
     paying.reset(options={"scenario": recordings[TARGET]}, seed=0)
     assert paying.step(paying.action_space.sample())[1] != 0.0
@@ -543,7 +543,7 @@ NOT_FINITE = "position is not finite at measurement 3; write zero for a missing 
         (lambda d: d.drop_vars("variance"), "lacks variance; filtergym/ManeuveringTarget-v0 measures scan"),
         (lambda d: d.drop_vars("initial_mean"), "lacks initial_mean"),
         (lambda d: d.assign(variance=d["variance"].astype(str)), "variance must be numbers, got "),
-        (lambda d: d.assign(height=d["scan"]), "has height, which is nothing that"),
+        (lambda d: d.assign(height=d["scan"]), "has height, which is not among the arrays that"),
         (lambda d: d.isel(position_axis0=[0]), "position has the shape (1,)"),
         (lambda d: d.drop_vars("seconds"), "lacks the variable seconds"),
         (lambda d: d.assign(seconds=-6.0 * d["scan"]), "seconds must increase, and measurement 2 has -12 s"),

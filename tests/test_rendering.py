@@ -157,7 +157,7 @@ def test_ellipse_axes_of_a_turned_covariance():
     ],
 )
 def test_limits_grow_on_a_ladder(limits, low, high, expected):
-    assert rendering.grown(limits, low, high) == pytest.approx(expected, rel=1e-12)
+    assert rendering.widen_limits(limits, low, high) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize(("face", "many"), [(TaskEnv, {}), (TaskVectorEnv, {"num_envs": 2})])

@@ -144,7 +144,7 @@ def test_what_a_teacher_says_is_the_expected_reward(monkeypatch):
         drawn = truth._replace(position=true[:2], velocity=true[2:])
         episode = Episode(drawn, None, state)
         np.testing.assert_allclose(world.state(drawn), true)
-        own_reward = reward.OWN_REWARDS[kind](model, episode)
+        own_reward = reward.REWARD_FUNCTIONS[kind](model, episode)
         error = own_reward.std() / np.sqrt(draws)
         expected.append((own_reward.mean(), error))
         state = model.filter.start(Initial(x, P[..., None]))

@@ -56,9 +56,9 @@ class AugmentedEstimator(Filter[LooselyCoupledNavigation, Measurement, Navigator
         rates = self.filter.start(0.0 * initial.mean)
         return Navigator(initial.mean, initial.covariance, rates, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: Navigator, given: FilterInput) -> Navigator:
+    def update(self, state: Navigator, inputs: FilterInput) -> Navigator:
         """Predict by the INS increment, update with the fix if there is one, and return the state."""
-        measurement = given.measurement
+        measurement = inputs.measurement
         displacement, predicted = self.filter.predict(state.rates)
         position = state.mean + (measurement.increment - displacement)
         innovation = self.xp.where(measurement.available > 0.0, measurement.fix - position, 0.0)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy
 
-from ...envs.contract.draws import within
+from ...envs.contract.draws import is_within
 from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
@@ -91,7 +91,7 @@ class _Matched:
         )
         spoofing = truth.disturbances["spoofing"]
         since = s.step * (truth.number - spoofing.window[0] + 1.0)
-        pull = xp.where(within(truth.number, spoofing.window), spoofing.strength * since, 0.0)
+        pull = xp.where(is_within(truth.number, spoofing.window), spoofing.strength * since, 0.0)
         available = measurement.available
         innovation = available * ((measurement.ins - (measurement.fix - pull)) - (delta - receiver))
         along = receiver_faults.measured_direction(P, xp.ones((1, 1)))

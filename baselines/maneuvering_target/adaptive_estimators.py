@@ -46,9 +46,9 @@ class SageHusaProcessNoise(KalmanModel):
         level = noise_adaptation.Level(self.variance + nothing, 1.0 + nothing)
         return ProcessNoiseTrack(*self.first_track(initial), level)
 
-    def update(self, state: ProcessNoiseTrack, given: FilterInput) -> ProcessNoiseTrack:
+    def update(self, state: ProcessNoiseTrack, inputs: FilterInput) -> ProcessNoiseTrack:
         """Predict with the process noise estimated so far, update, re-estimate the noise, and return the state."""
-        measurement = given.measurement
+        measurement = inputs.measurement
         F, unit = self.motion(measurement.interval)
         mean, carried = kalman.predict(state.mean, state.covariance, F, 0.0 * unit)
         predicted = carried + unit * state.level.value
@@ -109,9 +109,9 @@ class VariationalBayes(KalmanModel):
         shape = self.shape + 0.0 * initial.mean[:2]
         return MeasurementNoiseTrack(*self.first_track(initial), noise_adaptation.InverseGamma(shape, shape))
 
-    def update(self, state: MeasurementNoiseTrack, given: FilterInput) -> MeasurementNoiseTrack:
+    def update(self, state: MeasurementNoiseTrack, inputs: FilterInput) -> MeasurementNoiseTrack:
         """Predict, update mean and measurement noise together, and return the state."""
-        measurement = given.measurement
+        measurement = inputs.measurement
         xp, variance, available = self.xp, measurement.variance, measurement.available
         F, unit = self.motion(measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * unit)

@@ -56,9 +56,9 @@ class DeadReckoning(KalmanModel):
         """Return the state at the initial estimate, with the prior of the slow error."""
         return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
         """Predict by the odometry, update with the measured position, and return the state."""
-        measurement = given.measurement
+        measurement = inputs.measurement
         odometry = measurement.odometry
         if odometry is None:
             raise ValueError(

@@ -28,11 +28,11 @@ class ConstantVelocity(KalmanModel):
         super().__init__(task)
         self.variance: float = acceleration**2
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
         """Predict to a scan, update with its measurement, and return the state."""
-        F, Q = self.motion(given.measurement.interval)
+        F, Q = self.motion(inputs.measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
+        return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))
 
 
 class KalmanMixture(NamedTuple):
@@ -99,12 +99,12 @@ class KalmanInteractingMultipleModel(KalmanModel):
             + 0.0 * mean[:1],
         )
 
-    def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
+    def update(self, state: KalmanMixture, inputs: FilterInput) -> KalmanMixture:
         """Run one IMM cycle (mix, predict, update) with a scan, and return the state.
 
         The normalised innovation squared is the filters' mean by their posterior weights.
         """
-        xp, measurement = self.xp, given.measurement
+        xp, measurement = self.xp, inputs.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
         mixed = imm.mix(state.means, state.covariances, prediction.mixing)
         results = self.predict_and_update(*mixed, measurement)

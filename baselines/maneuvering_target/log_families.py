@@ -55,9 +55,9 @@ class ConstantAcceleration(KalmanModel):
         augmented = xp.concat([initial.mean, zero[:2]], axis=0), xp.concat([right, below], axis=0)
         return super().start(Initial(*augmented))
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
         """Predict to a scan, update with its measurement, and return the state."""
-        xp, T = self.xp, given.measurement.interval
+        xp, T = self.xp, inputs.measurement.interval
         none, one = 0.0 * T, 1.0 + 0.0 * T
         half = 0.5 * T**2
         kinematic = [[one, T, half], [none, one, T], [none, none, one]]
@@ -76,7 +76,7 @@ class ConstantAcceleration(KalmanModel):
             ]
         )
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
+        return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))
 
 
 def _imm(values: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:

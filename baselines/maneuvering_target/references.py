@@ -49,9 +49,9 @@ class KnownTurn(KalmanModel):
 
     disturbances = DISTURBANCES
 
-    def initialise(self, given: FilterInput) -> TurnMemory:
+    def initialise(self, inputs: FilterInput) -> TurnMemory:
         """Return the state at the initial estimate; a coloured error is stationary from the start."""
-        (mean, covariance), truth = given.measurement, given.truth
+        (mean, covariance), truth = inputs.measurement, inputs.truth
         if "coloured" in truth.disturbances:
             none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2
             mean = self.xp.concat([mean, none])
@@ -68,11 +68,11 @@ class KnownTurn(KalmanModel):
             ]
         )
 
-    def update(self, state: TurnMemory, given: FilterInput) -> TurnMemory:
+    def update(self, state: TurnMemory, inputs: FilterInput) -> TurnMemory:
         """Predict with the known flight since the last scan, update with the measured position, and return the
         state.
         """
-        measurement, truth = given.measurement, given.truth
+        measurement, truth = inputs.measurement, inputs.truth
         xp, world, disturbances = self.xp, self.task.world, truth.disturbances
         assert isinstance(world, RadarWorld)
         early = None

@@ -75,9 +75,9 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         """Return the state at the start of a track: all filters of the bank at the initial estimate."""
         return HuberState(self.bank.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: HuberState, given: FilterInput) -> HuberState:
+    def update(self, state: HuberState, inputs: FilterInput) -> HuberState:
         """Predict and update all filters of the bank with a measurement, and return the state."""
-        xp, measurement = self.xp, given.measurement
+        xp, measurement = self.xp, inputs.measurement
         readings = xp.where(xp.isnan(measurement.readings), 0.0, measurement.readings)
         measurement = measurement._replace(readings=readings)  # the bank weighs each by its availability
         filters = self.bank.predict(state.filters, measurement)
@@ -111,9 +111,9 @@ class HuberStuckCheck(Huber):
     ) -> None:
         super().__init__(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
 
-    def update(self, state: HuberState, given: FilterInput) -> HuberState:
+    def update(self, state: HuberState, inputs: FilterInput) -> HuberState:
         """Predict and update all filters of the bank, without repeated accelerometer readings; return the state."""
-        xp, forces, measurement = self.xp, self.task.sensors[2].readings, given.measurement
+        xp, forces, measurement = self.xp, self.task.sensors[2].readings, inputs.measurement
         available = measurement.available
         fresh = xp.any(measurement.readings[forces] != state.filters.accelerometers, axis=0)
         kept = available[forces] * xp.astype(fresh, available.dtype)

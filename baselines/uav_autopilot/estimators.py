@@ -37,9 +37,9 @@ class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
         """Return the filter's state at the start of a track, from the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
-    def update(self, state: Initial, given: FilterInput) -> Initial:
+    def update(self, state: Initial, inputs: FilterInput) -> Initial:
         """Return the state predicted and updated by (10) and (11), with the gain of the algebraic Riccati equation."""
-        measurement = given.measurement
+        measurement = inputs.measurement
         predicted = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         innovation = measurement.reading - self.task.readings_of(predicted)
         innovation = self.xp.where(measurement.available > 0.0, innovation, 0.0)
@@ -142,10 +142,10 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         """Return the memory at the start of a track: one filter at the initial estimate."""
         return self.start_filter(initial)
 
-    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
+    def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
         """Predict with gusts as designed, update with a measurement, and return the state."""
-        after, log_likelihood, nis, *_ = self.predict_and_update(state.memory, given.measurement, 1.0)
-        likelihood = likelihood_of(given.measurement, log_likelihood, nis, self.xp)
+        after, log_likelihood, nis, *_ = self.predict_and_update(state.memory, inputs.measurement, 1.0)
+        likelihood = likelihood_of(inputs.measurement, log_likelihood, nis, self.xp)
         return AdaptiveState(
             after.mean, packed_covariance.unpack(after.covariance, self.n), likelihood, after
         )
@@ -173,9 +173,9 @@ class AdaptiveGusts(AdaptiveKalman):
         one = 0.0 * initial.mean[0] + 1.0
         return self.start_filter(initial), adaptation.Level(one, self.gust_memory * one)
 
-    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
+    def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
         """Predict, update with a measurement, estimate the gusts' factor for the next one, and return the state."""
-        (before, level), measurement = state.memory, given.measurement
+        (before, level), measurement = state.memory, inputs.measurement
         after, log_likelihood, nis, correction, carried = self.predict_and_update(
             before, measurement, level.value
         )
@@ -223,9 +223,9 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
         return GustModels((self.start_filter(initial),) * 3, third)
 
-    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
+    def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
         """Run one IMM cycle over the gust levels, each with its own sensor noise, and return the state."""
-        xp, memory, measurement = self.xp, state.memory, given.measurement
+        xp, memory, measurement = self.xp, state.memory, inputs.measurement
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
         mean, covariance = imm.mix(*self.stack_filters(memory.filters), prediction.mixing)
         steps = [

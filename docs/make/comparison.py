@@ -229,7 +229,8 @@ def compare_environment(benchmark: BenchmarkRecords, width: int = 2) -> Comparis
             lambda scenario, name: consistency(found.get((scenario, name, "anees", "state"))),
         ),
         grid(
-            f"Nanoseconds a measurement on one core, without the simulated world; {PYTHON_MARK}: in Python, not compiled; "
+            f"Nanoseconds a measurement on one core, without the simulated world; {PYTHON_MARK}: in Python, not "
+            "compiled; "
             f"{FRONT_MARK}: on the front, where no other competitor has a lower error cost in as much time",
             columns,
             lambda scenario, name: times[scenario].get(name, "-"),

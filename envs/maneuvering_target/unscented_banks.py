@@ -33,16 +33,16 @@ from ...filters.small_matrices import outer
 from ..contract.controls import SettingsBank, SteerableFilter
 from ..contract.filter import EstimateState, FilterInput, Initial, Likelihood
 from ..contract.observation import (
-    KEPT_AS_LOG,
     SIGNED_LOG,
+    STORED_AS_LOG,
     Array,
     Block,
     average_block,
     average_log_squared_block,
     innovation_block,
+    limited,
     log_squared_block,
     prior_block,
-    within,
 )
 from .banks import RadarBank
 from .kalman_net import frame_of, speed_of
@@ -82,7 +82,7 @@ class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measure
     def __init__(self, task: TargetProblem) -> None:
         super().__init__(task, **PLAIN_FILTER)
 
-    def heeds(self, measurement: Measurement) -> Array:
+    def has_effect(self, measurement: Measurement) -> Array:
         """Return one where the scan saw the target."""
         return measurement.available
 
@@ -112,11 +112,11 @@ class WeightedUnscentedTurn(SteeredUnscentedTurn):
         **{f"covariance_{name}": 5.0 for name in ("0", *(side + axis for side in "+-" for axis in AXES))},
     }
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Weigh the propagated sigma points as the action answers, and update with the measured position."""
-        if given.action is None:
-            return super().update(state, given)
-        T, factors = given.measurement.interval, self.xp.exp(given.action)
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
+        """Weigh the propagated sigma points by the factors of the action, and update with the measured position."""
+        if inputs.action is None:
+            return super().update(state, inputs)
+        T, factors = inputs.measurement.interval, self.xp.exp(inputs.action)
         for_mean, for_covariance = unscented.weights(STATES)
         total = ordered_sum(factors[: 2 * STATES]) * (0.5 / STATES)
         for_mean = [for_mean[0], *(for_mean[i] * (factors[i - 1] / total) for i in POINTS if i)]
@@ -124,7 +124,7 @@ class WeightedUnscentedTurn(SteeredUnscentedTurn):
         points = coordinated_turn.propagate(unscented.sigma_points(state.mean, state.covariance), T)
         mean, covariance = unscented.combine(points, for_mean, for_covariance)
         predicted = mean, self.limit(covariance + self.noise(T))
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
+        return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))
 
 
 class TunedUnscentedTurn(SteeredUnscentedTurn):
@@ -137,12 +137,12 @@ class TunedUnscentedTurn(SteeredUnscentedTurn):
         "noise": 10.0,
     }
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
         """Predict with the scaling and the noises that the action answers, and update with the measured position."""
-        if given.action is None:
-            return super().update(state, given)
-        xp, measurement, T = self.xp, given.measurement, given.measurement.interval
-        spread, acceleration, turn_rate, noise = xp.exp(given.action)
+        if inputs.action is None:
+            return super().update(state, inputs)
+        xp, measurement, T = self.xp, inputs.measurement, inputs.measurement.interval
+        spread, acceleration, turn_rate, noise = xp.exp(inputs.action)
         mean, covariance = unscented.transform(
             state.mean,
             state.covariance,
@@ -151,7 +151,7 @@ class TunedUnscentedTurn(SteeredUnscentedTurn):
         )
         predicted = mean, self.limit(covariance + self.noise(T, acceleration, turn_rate))
         measurement = measurement._replace(variance=noise * measurement.variance)
-        return self.track(given.measurement, self.update_estimate(predicted, measurement))
+        return self.track(inputs.measurement, self.update_estimate(predicted, measurement))
 
 
 class UnscentedState(NamedTuple):
@@ -195,13 +195,13 @@ class UnscentedBank(SettingsBank, RadarBank):
                 lambda f, _: frame_of(f.mean[2:4])[0],
                 "direction of the predicted velocity",
                 "xy",
-                within(-1.0, 1.0),
+                limited(-1.0, 1.0),
             ),
             Block(
                 "speed",
                 lambda f, _: xp.log(speed_of(f.mean[2:4]) * (1.0 / SPEED)),
                 f"predicted speed over {SPEED:g} m/s",
-                compression=KEPT_AS_LOG,
+                compression=STORED_AS_LOG,
             ),
             Block(
                 "turn",
@@ -219,7 +219,9 @@ class UnscentedBank(SettingsBank, RadarBank):
         action = self.xp.stack([none[0]] * len(self.own.settings))
         return UnscentedState(own, own.likelihood, action, none, none, own.mean, none[0], none, none[0])
 
-    def look(self, state: UnscentedState, found: Prediction, measurement: Measurement) -> UnscentedState:
+    def add_observed(
+        self, state: UnscentedState, found: Prediction, measurement: Measurement
+    ) -> UnscentedState:
         """Show the innovation, its averages, and the prediction."""
         xp = self.xp
         innovation = found.innovation / xp.sqrt(found.innovation_variance)
@@ -239,10 +241,10 @@ class UnscentedBank(SettingsBank, RadarBank):
 class SigmaPointsBank(UnscentedBank):
     """Control ``sigma-points``: factors of the weights of the sigma points."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = WeightedUnscentedTurn
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = WeightedUnscentedTurn
 
 
 class ScalingBank(UnscentedBank):
     """Control ``unscented``: factors of the scaling and of the noises."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = TunedUnscentedTurn
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = TunedUnscentedTurn

@@ -70,7 +70,7 @@ class UnscentedTurn(TurnModel, KalmanModel):
         )
         return mean, covariance + self.noise(T)
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
         """Predict and update with the measured position."""
-        predicted = self.predict_turn(state.mean, state.covariance, given.measurement.interval)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
+        predicted = self.predict_turn(state.mean, state.covariance, inputs.measurement.interval)
+        return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Filter, FilterInput, Stated
+from ...envs.contract.filter import Filter, FilterInput, ReportedParts
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.logs.flight_tables import clock_seconds, describe_time
@@ -205,7 +205,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         table = given.table
         self.given = given
         self.names: list[str] = list(names)
-        self.stated: Stated | None = Stated(table.known, table.deviations)
+        self.stated: ReportedParts | None = ReportedParts(table.known, table.deviations)
         held = {name: numpy.flatnonzero(table.track == name) for name in {*names}}
         if {*table.track.tolist()} == {""}:
             held = {name: numpy.arange(len(table.time)) for name in held}
@@ -228,11 +228,11 @@ class FileTrack(Filter[Task, Any, FileState]):
         none = numpy.zeros(width)
         return FileState(0, none, numpy.full(width, -1), none, none, initial)
 
-    def update(self, state: FileState, given: FilterInput) -> FileState:
+    def update(self, state: FileState, inputs: FilterInput) -> FileState:
         """Find the row of each episode: the newest that is not later than the measurement."""
-        width = given.measurement[0].shape[-1]
+        width = inputs.measurement[0].shape[-1]
         lane = numpy.minimum(numpy.arange(width), len(self.names) - 1)
-        seconds = self._times(state, given.measurement)
+        seconds = self._times(state, inputs.measurement)
         at = numpy.clip(seconds - self._begin + self._tolerance, 0.0, self._span - 0.5)
         found = numpy.searchsorted(self._keys, at + lane * self._span, side="right") - 1
         there = found >= self._first[lane]

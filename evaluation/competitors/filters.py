@@ -14,11 +14,11 @@ import numpy
 
 from ...compiler.namespace import NotTraceable
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, FilterInput, Likelihood, State, Stated
+from ...envs.contract.filter import Filter, FilterInput, Likelihood, ReportedParts, State
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
-from ...envs.engine.compiled import warn_of
+from ...envs.engine.compiled import warn_not_compiled
 from ...filters.small_matrices import cholesky
 from .adapters import select_lanes
 from .kinds import INFORMED_KINDS, Kind, check_competitor, compilation_key, is_program, make_competitor
@@ -65,9 +65,9 @@ class Adapter(Filter[Task, Any, AdaptedState]):
         """Return the state before the first measurement."""
         return AdaptedState(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
+    def update(self, state: AdaptedState, inputs: FilterInput) -> AdaptedState:
         """Update the estimator."""
-        answer = self.call_update(given, state.memory)
+        answer = self.call_update(inputs, state.memory)
         if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
             count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
             raise TypeError(
@@ -86,9 +86,9 @@ class Adapter(Filter[Task, Any, AdaptedState]):
         """Number among ``FAULTS`` of the reason for a missing response, as of a program; 0: none."""
         return getattr(self.own, "fault", 0)
 
-    def call_update(self, given: FilterInput, memory: Any) -> Any:
+    def call_update(self, inputs: FilterInput, memory: Any) -> Any:
         """Call the estimator's ``update``."""
-        return self.own.update(memory, given.measurement)
+        return self.own.update(memory, inputs.measurement)
 
     def smooth(self, measurements: Sequence[Any], states: Sequence[AdaptedState]) -> tuple[Array, Array]:
         """Smooth the track by the smoother's method ``smooth``."""
@@ -103,13 +103,13 @@ class ReferenceAdapter(Adapter):
         super().__init__(task, own)
         self.knows: str = getattr(own, "knows", "") or "the truth"
 
-    def initialise(self, given: FilterInput) -> AdaptedState:
+    def initialise(self, inputs: FilterInput) -> AdaptedState:
         """Start from the initial estimate, with the truth."""
-        return self.first(given.measurement, self.own.start(given.measurement, given.truth))
+        return self.first(inputs.measurement, self.own.start(inputs.measurement, inputs.truth))
 
-    def call_update(self, given: FilterInput, memory: Any) -> Any:
+    def call_update(self, inputs: FilterInput, memory: Any) -> Any:
         """Call the reference's ``update`` with the truth."""
-        return self.own.update(memory, given.measurement, given.truth)
+        return self.own.update(memory, inputs.measurement, inputs.truth)
 
 
 class BoundAdapter(ReferenceAdapter):
@@ -119,9 +119,9 @@ class BoundAdapter(ReferenceAdapter):
         """Return the state before the first measurement, with an infinite limit."""
         return AdaptedState(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
 
-    def call_update(self, given: FilterInput, memory: Any) -> Any:
+    def call_update(self, inputs: FilterInput, memory: Any) -> Any:
         """Call the bound's ``update``; there is no covariance."""
-        limit, memory = super().call_update(given, memory)
+        limit, memory = super().call_update(inputs, memory)
         return limit, None, memory
 
 
@@ -152,13 +152,13 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         own: Any = None,
         name: str = "",
         count: int | None = None,
-        stated: Stated | None = None,
+        stated: ReportedParts | None = None,
     ) -> None:
         super().__init__(task)
         self.own = own
         self.name = name
         self.count = count
-        self.stated: Stated | None = getattr(own, "stated", stated)
+        self.stated: ReportedParts | None = getattr(own, "stated", stated)
         self.memory: Any = None
         self.step_number: int = 0
         self.extra: Mapping[str, Array] = {}
@@ -170,38 +170,38 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         """Number among ``FAULTS`` of the reason for a program's missing response; 0: none."""
         return self.own.fault if isinstance(self.own, Adapter) else 0
 
-    def _repeat_last(self, given: FilterInput) -> FilterInput:
+    def _repeat_last(self, inputs: FilterInput) -> FilterInput:
         """Return the copies, which may be changed in place."""
         if self.count is None:
-            return given
-        width = given.measurement[0].shape[-1]
+            return inputs
+        width = inputs.measurement[0].shape[-1]
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
-        return given._replace(measurement=select_lanes(given.measurement, lanes))
+        return inputs._replace(measurement=select_lanes(inputs.measurement, lanes))
 
-    def initialise(self, given: FilterInput) -> AdaptedState:
+    def initialise(self, inputs: FilterInput) -> AdaptedState:
         """Start the filter and store its state."""
         with explain_errors(f"{self.name} failed at the start of the track"):
-            self.memory = self.own.initialise(self._repeat_last(given))
-        initial = given.measurement
+            self.memory = self.own.initialise(self._repeat_last(inputs))
+        initial = inputs.measurement
         return AdaptedState(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
 
     def start(self, initial: Any) -> AdaptedState:
         """Start from the initial estimate, without the truth."""
         return self.initialise(FilterInput(initial))
 
-    def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
+    def update(self, state: AdaptedState, inputs: FilterInput) -> AdaptedState:
         """Update the filter and check its estimate.
 
         Raises:
             ValueError: if its estimate is no array of the right shape.
         """
         self.step_number += 1
-        given = self._repeat_last(given)
+        inputs = self._repeat_last(inputs)
         with explain_errors(f"{self.name} failed at measurement {self.step_number}"):
-            self.memory = after = self.own.step(self.memory, given)
+            self.memory = after = self.own.step(self.memory, inputs)
             mean, covariance = self.own.mean(after), self.own.covariance(after)
-            self.extra = self.own.records(after, given.measurement)
-        C, width = len(self.task.components), given.measurement[0].shape[-1]
+            self.extra = self.own.records(after, inputs.measurement)
+        C, width = len(self.task.components), inputs.measurement[0].shape[-1]
         # Copies, since the estimator may change its own arrays; in their layout, on which rounding in matrix products
         # depends.
         mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
@@ -271,7 +271,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         super().__init__(task)
         self.own = own
         self.in_python: bool = own.in_python
-        self.stated: Stated | None = own.stated
+        self.stated: ReportedParts | None = own.stated
 
     def start(self, initial: Any) -> Checked:
         """Start from the initial estimate."""
@@ -283,9 +283,9 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         """Predict in the filter."""
         return state._replace(own=self.own.predict(state.own, self.task.world.mask_missing(measurement)))
 
-    def update(self, state: Checked, given: FilterInput) -> Checked:
+    def update(self, state: Checked, inputs: FilterInput) -> Checked:
         """Update the filter, check its estimate, and store the last valid one."""
-        received = self.task.world.mask_missing(given.measurement)
+        received = self.task.world.mask_missing(inputs.measurement)
         own = self.own.update(state.own, FilterInput(received))
         mean, covariance = self.own.mean(own), self.own.covariance(own)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
@@ -423,21 +423,21 @@ class BoundFilter(AroundBank[LimitState]):
         self.in_python: bool = own.in_python
         self.knows: str = own.knows or "the truth"
 
-    def initialise(self, given: FilterInput) -> LimitState:
+    def initialise(self, inputs: FilterInput) -> LimitState:
         """Start from the initial estimate, with the truth."""
-        return LimitState(self.bank.start(given.measurement), self.own.initialise(given))
+        return LimitState(self.bank.start(inputs.measurement), self.own.initialise(inputs))
 
     def start(self, initial: Any) -> LimitState:
         """Start from the initial estimate, without the truth."""
         return self.initialise(FilterInput(initial))
 
-    def update(self, state: LimitState, given: FilterInput) -> LimitState:
+    def update(self, state: LimitState, inputs: FilterInput) -> LimitState:
         """Update the bank, and compute the limit at this measurement."""
-        own = self.own.update(state.own, given)
+        own = self.own.update(state.own, inputs)
         space, N = self.bank.action_space, self.own.mean(own).shape[-1]
         dtype = self.xp.int64 if isinstance(space, gymnasium.spaces.Discrete) else self.xp.float64
         neutral = self.xp.zeros((*(space.shape or ()), N), dtype=dtype)
-        return LimitState(self.bank.act(state.bank, given.measurement, neutral), own)
+        return LimitState(self.bank.act(state.bank, inputs.measurement, neutral), own)
 
     def records(self, state: LimitState, measurement: Any) -> dict[str, Array]:
         """Return the limit."""
@@ -458,7 +458,7 @@ class _Maker:
     kind: Kind
     maker: Any
     """Maker of a competitor that can be traced; None for one that runs in Python."""
-    stated: Stated | None = None
+    stated: ReportedParts | None = None
     """Reported quantities of a competitor that runs in Python."""
 
     def __call__(self, model: Model) -> Filter[Any, Any, Any]:
@@ -531,7 +531,7 @@ def close_loop(
         try:
             return model.with_filter(_Maker(kind, compilation_key(competitor)))
         except NotTraceable as error:
-            warn_of(f"{name!r} of {model.task.id}", error)
+            warn_not_compiled(f"{name!r} of {model.task.id}", error)
     looped = model.with_filter(_Maker(kind, None, own.stated))
     held = PythonFilter(model.task, own, f"{kind} {name!r}", count if kind in TRUTH_FREE_KINDS else None)
     looped.filter = wrap_for_loop(kind, model, held)

@@ -25,7 +25,7 @@ from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.data.recorded_world import fill_arrays, measure_once
 from ...envs.data.recording import Recording
-from ...envs.engine.compiled import AVAILABLE, warn_of
+from ...envs.engine.compiled import AVAILABLE, warn_not_compiled
 from .filters import as_filter
 
 Apply = Callable[[Mapping[str, Any]], tuple[dict[str, Any], Callable[[Task], Any]]]
@@ -280,7 +280,7 @@ class WindowLikelihood:
             try:
                 return found, self._run_compiled(self._compiled, values, measurements, memory, found)
             except NotTraceable as error:
-                warn_of(type(own).__name__, error)
+                warn_not_compiled(type(own).__name__, error)
                 self._compiled = None
         for k in range(len(found)):
             memory, log_likelihood = _step(own, map_arrays(lambda array: array[k], measurements), memory)  # noqa: B023

@@ -42,7 +42,7 @@ class SmoothedTrack(Filter[Task, Any, int]):
         """Return the state before the first measurement."""
         return 0
 
-    def update(self, state: int, given: FilterInput) -> int:
+    def update(self, state: int, inputs: FilterInput) -> int:
         """Count the measurement."""
         return state + 1
 

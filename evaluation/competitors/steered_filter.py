@@ -19,7 +19,7 @@ from ...compiler.program import Graph
 from ...envs.contract.filter import FilterInput
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array, DecisionMeans
-from ...envs.engine.compiled import CompiledModel, warn_of
+from ...envs.engine.compiled import CompiledModel, warn_not_compiled
 from .filters import AroundBank
 from .kinds import Policy, is_traceable
 
@@ -154,11 +154,11 @@ class SteeredFilter(AroundBank[PolicyFilterState]):
         """Start the bank; the policy begins at its first decision."""
         return PolicyFilterState(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
 
-    def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
+    def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
         """Update the bank with the policy's action, chosen anew where a decision is due."""
-        observation = self.model.observe(Episode(None, given.measurement, state.bank))
+        observation = self.model.observe(Episode(None, inputs.measurement, state.bank))
         action, decisions = self.decider.decide(observation, state.policy)
-        return PolicyFilterState(self.bank.act(state.bank, given.measurement, action), decisions)
+        return PolicyFilterState(self.bank.act(state.bank, inputs.measurement, action), decisions)
 
     def records(self, state: PolicyFilterState, measurement: Any) -> dict[str, Array]:
         """Return the records of the bank."""
@@ -222,5 +222,5 @@ def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Po
     try:
         return trace(model, policy)
     except NotTraceable as error:
-        warn_of(f"policy {type(policy).__name__} of {model.task.id}", error)
+        warn_not_compiled(f"policy {type(policy).__name__} of {model.task.id}", error)
         return None

@@ -10,7 +10,7 @@ from ...envs.contract.model import Episode, Model
 from ...envs.contract.task import Task, named_arrays
 from ...envs.data.foreign_files import MOST_NUMBERS
 from ...envs.data.recorded_world import measure_once
-from ...envs.data.recording import Recording, differing
+from ...envs.data.recording import Recording, changed_parameters
 from ...envs.engine.backend import make_model
 from ...envs.engine.compiled import can_step
 from ...envs.engine.episode_noise import uniforms_of_seeds
@@ -30,7 +30,7 @@ class NoFilter(Filter[Task, Any, Initial]):
         """Return the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
-    def update(self, state: Initial, given: FilterInput) -> Initial:
+    def update(self, state: Initial, inputs: FilterInput) -> Initial:
         """Return the state unchanged."""
         return state
 
@@ -75,7 +75,7 @@ def record_experiment(experiment: Experiment, progress: Progress | None = None) 
         times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
     # The measurements with an action, and that of the last observation.
     there = numpy.arange(truth.shape[1]) <= lengths[:, None]
-    parameters = differing(plain.parameters)
+    parameters = changed_parameters(plain.parameters)
     for name in cls.World.own_parameters:
         parameters.pop(name, None)
     names = [str(i) for i in range(episodes)]
