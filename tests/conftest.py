@@ -24,7 +24,7 @@ from filtergym.commands.terminal import console, output_width
 from filtergym.envs.engine import compiled
 from filtergym.envs.engine.catalogue import catalogue
 
-# The process that spreads the tests has imported readline, which tells its children how wide its terminal is.
+# The process that spreads the tests has imported readline, which exports the width of its terminal to its children.
 os.environ.pop("COLUMNS", None)
 console.width = output_width()
 

@@ -94,7 +94,7 @@ def assert_equals_its_vector(
 
 
 Property = Callable[[Any], None]
-"""Function that raises where its subject has not what the function's name says."""
+"""Function that raises where its subject lacks what its name states."""
 
 
 def assert_properties(subject: Any, properties: Iterable[Property]) -> None:

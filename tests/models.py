@@ -77,8 +77,8 @@ class Asked:
 
     def update(self, memory: Any, measurement: Any) -> tuple[Any, ...]:
         own, state = self.filter, self.filter.step(memory, FilterInput(measurement))
-        told = Likelihood.of_records(own.records(state, measurement))
-        return own.mean(state), own.covariance(state), state, told
+        likelihood = Likelihood.of_records(own.records(state, measurement))
+        return own.mean(state), own.covariance(state), state, likelihood
 
 
 LANES = 8

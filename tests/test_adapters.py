@@ -167,7 +167,7 @@ def test_filterpy_closes_the_loop_like_the_papers_filter(plant):
 
 
 class Permuted(SingleTrackEstimator):
-    """Keeps the start, in an order of its own and with a number that nobody asks for."""
+    """Keeps the start, in an order of its own and with an unused number."""
 
     state = ("turn_rate", "velocity_y", "position_x", "position_y", "velocity_x")
 

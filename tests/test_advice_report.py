@@ -140,7 +140,7 @@ def test_profiles_are_zero_at_the_best_value_and_pass_the_ends_of_the_interval(a
             assert drops[values >= high * (1.0 - 1e-5)].max() > 1.9
 
 
-def test_nothing_that_a_log_says_runs(advice):
+def test_no_text_of_a_log_is_executed(advice):
     """Names and notes are text, and the page fetches nothing."""
     hostile = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
     recording = dataclasses.replace(advice.recording, name=hostile, notes=(hostile,), names=(hostile,))

@@ -472,18 +472,18 @@ def test_the_best_agent_is_kept_and_when_the_paper_was_beaten_is_noted(tmp_path)
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "kalman-net"])
-def test_a_run_is_validated_anew_and_can_be_stopped_by_what_it_tells(algorithm, tmp_path):
+def test_a_run_is_validated_anew_and_can_be_stopped_by_its_progress(algorithm, tmp_path):
     """What is compiled of an agent is kept by what makes it, and the network has learned since."""
-    told = []
+    entries = []
 
     def on_validation(entry):
-        told.append(entry)
-        return len(told) == 2
+        entries.append(entry)
+        return len(entries) == 2
 
     run = train(small_run(algorithm, 4000), tmp_path, validate_every=400, on_validation=on_validation)
-    assert run.steps_done == load_run(tmp_path).steps_done == told[1]["steps"] < 1200
+    assert run.steps_done == load_run(tmp_path).steps_done == entries[1]["steps"] < 1200
     assert not run.is_complete
-    assert told[0]["cost"] != told[1]["cost"]
+    assert entries[0]["cost"] != entries[1]["cost"]
 
 
 def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):

@@ -149,7 +149,7 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
     assert "got 'gif'" in capsys.readouterr().err
 
 
-def test_results_that_do_not_fit_are_left_out_and_told(tmp_path, without_figures, monkeypatch, capsys):
+def test_results_that_do_not_fit_are_left_out_and_reported(tmp_path, without_figures, monkeypatch, capsys):
     monkeypatch.setattr("filtergym.commands.evaluation.MOST_BYTES", 1000)
     words = ("evaluate", ENV, "--scenario", "paper", "--policy", "imm", "--episodes", 4, "--out", tmp_path)
     assert run(monkeypatch, *words) == 0

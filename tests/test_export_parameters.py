@@ -88,19 +88,19 @@ class Exported:
     def answers(self, rows, *arguments):
         """Statuses of sets ``(S, numbers)``, and estimates ``(sets that are taken, T, numbers)``."""
         given = np.asarray(rows, dtype=self.scalar.dtype).tobytes()
-        said = subprocess.run(
+        output = subprocess.run(
             [self.folder / "driver", *arguments], input=given, capture_output=True, check=True
         ).stdout
         statuses, estimates, size = [], [], len(self.traced.estimate)
-        while said:
-            statuses.append(np.frombuffer(said[:8])[0])
-            said = said[8:]
+        while output:
+            statuses.append(np.frombuffer(output[:8])[0])
+            output = output[8:]
             if statuses[-1] == 0.0:
                 count = MEASUREMENTS * size * self.scalar.dtype().itemsize
                 estimates.append(
-                    np.frombuffer(said[:count], dtype=self.scalar.dtype).reshape(MEASUREMENTS, size)
+                    np.frombuffer(output[:count], dtype=self.scalar.dtype).reshape(MEASUREMENTS, size)
                 )
-                said = said[count:]
+                output = output[count:]
         return np.array(statuses), np.array(estimates)
 
     def structure(self, template, rows):
@@ -126,8 +126,8 @@ class Exported:
         state = own.start(self.structure(started[0], self.given.initial[:, 0]))
         found = []
         for row in self.given.measurements[:, :, 0]:
-            state, told = steps.update(state, self.structure(lanes.state.measurement, row))
-            found.append(np.concatenate([np.reshape(part, (-1, SETS)) for part in told.values()]))
+            state, records = steps.update(state, self.structure(lanes.state.measurement, row))
+            found.append(np.concatenate([np.reshape(part, (-1, SETS)) for part in records.values()]))
         return np.moveaxis(np.array(found), -1, 0)
 
     def made_anew(self, keywords):

@@ -67,7 +67,7 @@ def test_programs_of_a_filter_answer_what_it_answers(environment, name, keywords
 
 
 class Symmetric:
-    """An estimator whose memory holds numbers twice, constants, and what nobody reads."""
+    """An estimator whose memory holds numbers twice, constants, and unread values."""
 
     kind, traceable = "estimator", True
 
@@ -168,9 +168,9 @@ def test_c_compiles_without_a_warning_and_answers_what_the_filter_answers(
     environment, name, scalar, tmp_path
 ):
     writer, given = writer_of(environment, name, scalar)
-    said = compile_and_test(writer, given, compiler(), (*FLAGS, "-O0"))
+    output = compile_and_test(writer, given, compiler(), (*FLAGS, "-O0"))
     # Measured 4e-13 of all agents, their networks in double; the other figure is that of float.
-    assert float(said.split()[2]) < (1e-9 if scalar is c_source.DOUBLE else 1e-2)
+    assert float(output.split()[2]) < (1e-9 if scalar is c_source.DOUBLE else 1e-2)
     for file, text in files_of(writer, given).items():
         (tmp_path / file).write_text(text, encoding="ascii")
     words = [compiler(), *FLAGS, *SANITIZERS, "main.c", f"{writer.name}.c", "-lm", "-o", "run"]
@@ -202,8 +202,8 @@ def converse(program, given):
     rows = [given.initial.T, *np.moveaxis(given.measurements, -1, 1)]
     frames = b"".join(np.ascontiguousarray(row, dtype="<f8").tobytes() for row in rows)
     spoken = json.dumps(hello).encode() + b"\n"
-    said = subprocess.run([program], input=spoken + frames, capture_output=True, check=True).stdout
-    answer, _, content = said.partition(b"\n")
+    output = subprocess.run([program], input=spoken + frames, capture_output=True, check=True).stdout
+    answer, _, content = output.partition(b"\n")
     assert json.loads(answer) == {"filtergym": 1, "format": "float64"}
     refused = subprocess.run(
         [program], input=spoken.replace(b": 1,", b": 2,"), capture_output=True, check=False
@@ -233,7 +233,7 @@ def test_at_the_ends_of_parameters_c_differs_by_the_last_digit(environment, name
     ("environment", "name", "scenario", "horizon"),
     [
         ("UavAutopilot", "bptt-small", None, 120),  # is shown readings that sensors hold in dropouts
-        # Bearings are told where an emitter is heard.
+        # Bearings are given where an emitter is heard.
         ("RadarEsmTracking", "forgetting-joint-type", None, 60),
     ],
 )
@@ -266,7 +266,7 @@ def test_an_exported_bank_steers_the_tracking_loops(tmp_path, monkeypatch):
     keywords = {"aperture_probability": 1.0, "rate_aperture": 2.0, "horizon": 60}
     own, program = costs_of("TightlyCoupledNavigation", "multi-hypothesis", tmp_path, **keywords)
     np.testing.assert_allclose(program, own, rtol=1e-9)
-    # The loops lose rates here: with what the estimate says alone others, and the costs are others.
+    # The loops lose rates here: by the estimate alone others, and the costs are others.
     monkeypatch.setattr(HypothesisBank, "feedback", lambda *given: None)
     name = "multi-hypothesis"
     other = evaluate("filtergym/TightlyCoupledNavigation-v0", name, None, 16, backend="numpy", **keywords)
@@ -435,7 +435,7 @@ def test_a_strangers_words_cannot_get_into_the_text(tmp_path):
 # --- the export
 
 
-def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch):
+def test_an_export_is_described_also_without_a_compiler(tmp_path, monkeypatch):
     monkeypatch.setattr(c_source.shutil, "which", lambda _: None)
     problem = problem_of("filtergym/ManeuveringTarget-v0")
     maker = find_competitor(problem, "kalman-imm").maker
@@ -458,7 +458,7 @@ def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch
     assert "double" not in (folder / "kalman_imm.c").read_text()
 
 
-def test_the_time_of_an_update_is_that_of_optimised_code_and_says_so(tmp_path, monkeypatch):
+def test_the_time_of_an_update_is_of_optimised_code_and_labelled(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(
         c_source, "compile_and_test", lambda *_, flags: seen.append(flags[-1]) or "5 ns an update"
@@ -471,7 +471,7 @@ def test_the_time_of_an_update_is_that_of_optimised_code_and_says_so(tmp_path, m
     assert [short.test, long.test] == [f"5 ns an update with cc {level}" for level in seen]
 
 
-def test_the_operations_of_a_network_are_told_beside_those_of_the_filter(tmp_path, monkeypatch):
+def test_the_operations_of_a_network_stand_beside_those_of_the_filter(tmp_path, monkeypatch):
     monkeypatch.setattr(c_source.shutil, "which", lambda _: None)
     problem = problem_of("filtergym/ManeuveringTarget-v0")
     # 14 numbers are shown, 6 units, 2 answers: a product and a sum for each weight, and the biases.
@@ -504,11 +504,11 @@ def test_a_precision_in_which_a_filter_is_wrong_is_refused(tmp_path, monkeypatch
 
 
 def test_the_command_writes_a_filter(run, tmp_path):
-    code, said, errors = run(
+    code, output, errors = run(
         "export", "filtergym/ManeuveringTarget-v0", "fixed-low", "--to", "c", "--set", "horizon=12"
     )
     assert code == 0, errors
-    assert "fixed_low.h" in said
+    assert "fixed_low.h" in output
     assert {path.name for path in (tmp_path / "fixed_low").iterdir()} == {
         "fixed_low.h", "fixed_low.c", "rows.h", "main.c", "vectors.h", "test.c", "measurements.csv",
     }  # fmt: skip
@@ -529,7 +529,7 @@ def test_the_command_writes_a_filter(run, tmp_path):
             ("filtergym/ManeuveringTarget-v0", "bptt", "--to", "onnx", "--set", "horizon=9"),
             "--set is not for --to onnx",
         ),
-        (("filtergym/ManeuveringTarget-v0", "nobody", "--to", "c"), "unknown policy 'nobody'"),
+        (("filtergym/ManeuveringTarget-v0", "missing", "--to", "c"), "unknown policy 'missing'"),
         (("filtergym/ManeuveringTarget-v0", "imm", "--to", "c", "--set", "gians=1"), "gains"),
     ],
 )

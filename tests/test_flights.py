@@ -133,7 +133,7 @@ def test_columns_of_opensky_and_traffic(tmp_path):
         assert found.name == name
 
 
-def test_flights_of_one_file_are_told_apart_and_stale_positions_go(tmp_path):
+def test_flights_of_one_file_are_separated_and_stale_positions_go(tmp_path):
     _, latitude, longitude, _ = geodetic()
     latitude[7], longitude[7] = latitude[6], longitude[6]
     latitude[9] = np.nan
@@ -288,10 +288,10 @@ WRONG = [
 @pytest.mark.parametrize(("columns", "message"), WRONG, ids=[message for _, message in WRONG])
 def test_a_wrong_file_is_refused_in_one_sentence(columns, message, tmp_path):
     file = table(tmp_path / "wrong.csv", **columns)
-    with pytest.raises(ValueError, match=message) as told:
+    with pytest.raises(ValueError, match=message) as caught:
         make_model(ID, scenario=file)
-    assert "wrong.csv" in str(told.value)
-    assert "\n" not in str(told.value)
+    assert "wrong.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -546,8 +546,8 @@ def test_one_command_on_a_folder_with_two_broken_files(tmp_path, monkeypatch, ca
         main()
     assert end.value.code == 0
     out = capsys.readouterr().out
-    told = (DOCS / "own_data.md").read_text(encoding="utf-8")
-    assert out[out.index("ory_07.csv:") :] in told
+    page = (DOCS / "own_data.md").read_text(encoding="utf-8")
+    assert out[out.index("ory_07.csv:") :] in page
     left_out = (11, 15)
     assert "18 flights" in out
     assert all((f"ory_{i:02} " in out) is (i not in left_out) for i in range(20))
@@ -555,7 +555,7 @@ def test_one_command_on_a_folder_with_two_broken_files(tmp_path, monkeypatch, ca
     assert len(scenarios) == 19
 
 
-def test_the_example_of_the_page_prints_what_it_says(capsys):
+def test_the_example_of_the_page_prints_its_comments(capsys):
     page = (DOCS / "own_data.md").read_text(encoding="utf-8")
     code = page.partition("```python\n")[2].partition("```")[0]
     exec(code, {})

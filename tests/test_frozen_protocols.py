@@ -1,4 +1,4 @@
-"""Frozen protocols: the file does not change, the number is what its formula says, the row repeats on any processor."""
+"""Frozen protocols: the file does not change, the number follows from its formula, the row repeats on any processor."""
 
 import math
 import os
@@ -87,7 +87,7 @@ def test_filtergym_1_is_of_all_five_environments_and_of_scenarios_that_there_are
         assert [name for name, one in shipped[own.id].scenarios.items() if one.training] == [own.training]
 
 
-def test_the_number_is_what_the_formula_says(found):
+def test_the_number_follows_the_formula(found):
     """Against costs of episodes that ``evaluate`` gives, one environment and episode after another."""
     logarithms, lost = [], []
     for own in found.protocol.environments:

@@ -124,7 +124,7 @@ def test_combination_has_the_moments_of_the_mixture():
 
 def test_impossible_mode_keeps_its_estimate_and_makes_no_nan():
     mean, covariance, _, _ = random_bank(0, modes=2)
-    absorbing = np.array([[1.0, 0.0], [1.0, 0.0]])  # nobody goes to mode 2
+    absorbing = np.array([[1.0, 0.0], [1.0, 0.0]])  # no mode leads to mode 2
     weights = np.tile([[1.0], [0.0]], mean.shape[-1])
     prediction = imm.predict_mode_probabilities(absorbing, weights)
     np.testing.assert_array_equal(prediction.probabilities[1], 0.0)

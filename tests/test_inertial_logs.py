@@ -156,7 +156,7 @@ def changed(table, columns, change):
         (lambda t: changed(t, ["rate_x"], lambda a: a.where(a.index != 7)), "row 7 of the IMU has a cell without"),
     ],
 )  # fmt: skip
-def test_what_no_imu_says_is_refused(pyins, log, change, sentence):
+def test_impossible_imu_values_are_refused(pyins, log, change, sentence):
     imu, fixes, _ = log
     with pytest.raises(ValueError, match=sentence):
         inertial_recording(change(imu), fixes, **WINDOWS)
@@ -176,7 +176,7 @@ def test_what_no_imu_says_is_refused(pyins, log, change, sentence):
         ),
     ],
 )
-def test_what_no_receiver_says_is_refused(pyins, log, change, sentence):
+def test_impossible_receiver_values_are_refused(pyins, log, change, sentence):
     imu, fixes, _ = log
     with pytest.raises(ValueError, match=sentence):
         inertial_recording(imu, change(fixes), **WINDOWS)

@@ -82,7 +82,7 @@ def truth_of(lanes):
 
 
 class Frames(Honest):
-    """Looks into the frames of whoever calls."""
+    """Looks into the frames of its caller."""
 
     def known(self, N):
         frame = sys._getframe()

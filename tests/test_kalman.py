@@ -50,7 +50,7 @@ def test_prediction_and_update_equal_naive_matrices(n, m, seed):
         assert result.squared_distance[b] == pytest.approx(distance, rel=1e-9)
 
 
-def test_matrices_shared_by_the_batch_mean_the_same_for_everyone():
+def test_matrices_shared_by_the_batch_equal_repeated_ones():
     s = system(0, 3, 2, 1)
     rng = np.random.default_rng(1)
     mean, covariance, z = rng.normal(size=(3, 5)), positive_definite(rng, 3, 5), rng.normal(size=(2, 5))

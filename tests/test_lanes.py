@@ -1,4 +1,4 @@
-"""The engine's noise: every measurement takes its own row of its own episode, whoever else flies or starts."""
+"""The engine's noise: every measurement takes its own row of its own episode, whatever other lanes do."""
 
 import pickle
 
@@ -66,12 +66,12 @@ def test_every_measurement_takes_its_own_row(monkeypatch, either_way):
         for found, own in zip(started[-1], start_numbers(identities, layout), strict=True):
             np.testing.assert_array_equal(found[:, : identities.shape[1]], own)
 
-    everyone = list(range(11))
-    check_start(check(everyone))
+    every_lane = list(range(11))
+    check_start(check(every_lane))
     for step in range(40):
         lanes.decide(np.zeros((11, 1)))
         t += 1
-        check(everyone)
+        check(every_lane)
         if step % 5 == 0:
             chosen = sorted([(3 * step) % 11, (3 * step + 4) % 11])
             lanes.restart(chosen)

@@ -281,8 +281,8 @@ def test_the_tunable_semi_markov_filter_begins_with_its_prior(model):
 
 @pytest.mark.parametrize("is_polar", [False, True])
 @pytest.mark.parametrize(("scenario", "errors"), [("biased", {}), ("random", {"coloured_sigma": (0.8, 1.2)})])
-def test_the_reference_is_told_lasting_errors_as_they_are_measured(scenario, errors, is_polar):
-    """Along x and y, or of range and azimuth: its own errors are then as large as it says."""
+def test_the_reference_knows_lasting_errors_as_they_are_measured(scenario, errors, is_polar):
+    """Along x and y, or of range and azimuth: its errors are then as large as it states."""
     keywords = {"polar_measurements": is_polar, **errors}
     records = tidy_records(evaluate(ID, ["imm", "known-turn"], scenario, episodes=200, **keywords))
     [anees] = [
@@ -291,7 +291,7 @@ def test_the_reference_is_told_lasting_errors_as_they_are_measured(scenario, err
         if (record.policy, record.metric, record.component, record.window)
         == ("known-turn", "anees", "state", "all")
     ]
-    assert anees == pytest.approx(1.0, abs=0.1)  # 20,000 scans; told the wrong axes it was 16
+    assert anees == pytest.approx(1.0, abs=0.1)  # 20,000 scans; with the wrong axes it was 16
 
 
 @pytest.mark.parametrize(

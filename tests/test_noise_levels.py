@@ -60,8 +60,8 @@ def test_a_hypothesis_that_was_ruled_out_comes_back() -> None:
     _, h, _ = some(0)
     h = h._replace(probability=numpy.concatenate([0.0 * h.probability[:1], normalised(h.probability[1:])]))
     change = numpy.full((H, 1), 0.01)
-    nobody = numpy.array([[0.0], [0.5], [0.25], [0.25]])
-    for prior in (nobody, nobody[::-1]):
+    unweighted = numpy.array([[0.0], [0.5], [0.25], [0.25]])
+    for prior in (unweighted, unweighted[::-1]):
         after = noise_levels.switch(h, change, prior, change, numpy.full((L, 1, 1), 1.0 / L))
         assert all(numpy.isfinite(part).all() for part in (*after[:3], *after.sensors))
         assert (after.probability > 0.0).all()

@@ -1,7 +1,7 @@
 """What README and the pages tell to type is right: commands are parsed, names are known, Python imports what there is.
 
 Pages for each audience run from top to bottom in ``test_docs.py``, snippets of README in ``test_readme.py``; here whole
-pages of the reference run likewise.
+those of pages of the reference run, too.
 """
 
 import ast

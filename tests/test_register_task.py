@@ -35,7 +35,7 @@ class Turns(ManeuveringTarget):
     """An aircraft that turns, once more."""
 
     id = "mine/Turns-v0"
-    companions = (Paper("nobody's"), PictureMaker(lambda model: None), *ManeuveringTarget.companions)
+    companions = (Paper("unknown"), PictureMaker(lambda model: None), *ManeuveringTarget.companions)
 
 
 class Middle(ConstantPolicy):
@@ -150,7 +150,7 @@ def test_the_command_line_lists_and_evaluates_it(package, command, monkeypatch):
     code, listed, errors = command("list", ID)
     assert code == 0, errors
     assert listed.startswith(ID)
-    assert "nobody's" in listed
+    assert "unknown" in listed
     code, _, errors = command("benchmark", "--environment", ID, "--out", "results")
     assert code == 0, errors
     assert list(outcome_sentences(read_results(package / "results")[0]))

@@ -105,14 +105,14 @@ def test_seconds_where_measurements_come_regularly():
     assert evaluate(model.task.id, ["kalman"], "paper-noise", 2, horizon=8, sampling_interval=0.1).elapsed[
         0
     ] == pytest.approx(0.1)
-    # Scans that miss the target leave gaps; the number of a plot then says nothing about its time.
+    # Scans that miss the target leave gaps; the number of a plot then does not give its time.
     missing = {"horizon": 8, "detection_probability": (0.5, 0.9)}
     assert "elapsed" not in evaluate(TARGET, ["imm"], "paper", 2, **missing).coords
     recording = record(TARGET, episodes=2, **missing)
     assert "elapsed" not in evaluate(TARGET, ["imm"], recording).coords
 
 
-def test_keywords_that_json_does_not_know_are_told():
+def test_keywords_that_json_cannot_hold_are_refused():
     given = {"gain": np.float64(0.5), "gains": np.array([[1, 2]]), "pair": (1.0, 2.0), "odd": slice(3)}
     text = keywords_as_text(given)
     read = keywords_of(xarray.Dataset(attrs={"keywords": text}))

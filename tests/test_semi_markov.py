@@ -177,8 +177,8 @@ def enumerated(filter, initial, measurements, b):
 def answers_of(model, estimator, count):
     """Start, measurements and answers of the first scans."""
     start, measurements, answers = watch_estimator(model, estimator)
-    told = [(mean, covariance, likelihood.log_likelihood) for mean, covariance, likelihood in answers]
-    return start, measurements[:count], told[:count]
+    estimates = [(mean, covariance, likelihood.log_likelihood) for mean, covariance, likelihood in answers]
+    return start, measurements[:count], estimates[:count]
 
 
 IRREGULAR = {"detection_probability": (0.6, 0.8), "scan_jitter": (0.8, 0.8)}
@@ -265,7 +265,7 @@ def test_survives_what_its_prior_rules_out():
 
 @pytest.mark.filterwarnings("error")
 def test_is_compiled_with_the_world():
-    # What cannot be traced runs as Python code, and a warning says so.
+    # What cannot be traced runs as Python code, and a warning states it.
     assert not SemiMarkov.in_python
     evaluate(ID, ["semi-markov", "semi-markov-vague"], episodes=8, horizon=4, backend="compiled")
 

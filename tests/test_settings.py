@@ -142,14 +142,14 @@ def test_a_config_may_have_a_default_section(tmp_path):
         (f"{ID}: {{gama: 0.5}}", "unknown setting 'algo.gama': did you mean 'algo.gamma'"),
     ],
 )
-def test_wrong_configs_are_told(text, message, tmp_path):
+def test_wrong_configs_are_refused(text, message, tmp_path):
     config = tmp_path / "mine.yml"
     config.write_text(text)
     with pytest.raises(ValueError, match=message):
         new_run(problem_of(ID), RunOptions("ppo", config=config))
 
 
-def test_a_config_that_is_missing_is_told(tmp_path):
+def test_a_missing_config_is_refused(tmp_path):
     with pytest.raises(ValueError, match="cannot read settings"):
         new_run(problem_of(ID), RunOptions("ppo", config=tmp_path / "none.yml"))
 
@@ -173,7 +173,7 @@ def test_a_config_that_is_missing_is_told(tmp_path):
         ("bptt", {"dtype": "float32"}, {}, "leave out env.dtype"),
     ],
 )
-def test_wrong_settings_are_told(algorithm, keywords, overrides, message):
+def test_wrong_settings_are_refused(algorithm, keywords, overrides, message):
     with pytest.raises(ValueError, match=message):
         new_run(problem_of(ID), RunOptions(algorithm, keywords=keywords, overrides=overrides))
 

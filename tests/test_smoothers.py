@@ -43,7 +43,7 @@ TARGET = "filtergym/ManeuveringTarget-v0"
         (KalmanTurnIMMSmoother, KalmanTurnInteractingMultipleModel),
     ],
 )
-def test_a_smoother_without_lag_says_what_its_filter_says(smoother, estimator):
+def test_a_smoother_without_lag_equals_its_filter(smoother, estimator):
     found = evaluate(
         TARGET, {"smoother": Variant(smoother, lag=0), "filter": estimator}, scenario="random", episodes=9
     )
@@ -275,7 +275,7 @@ class Holds:
 
 
 class HoldsToTheEnd(Holds):
-    """The same, said when all is measured."""
+    """The same, returned when all is measured."""
 
     kind = "smoother"
 

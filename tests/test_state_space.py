@@ -187,7 +187,7 @@ def test_the_hypotheses_are_mixed_as_in_the_golden_example(make):
     np.testing.assert_allclose(last.mean[:, 0], [5.9803866254, 2.15776662366], rtol=1e-10)
 
 
-def test_errors_are_as_large_as_the_covariance_says(make):
+def test_errors_fit_the_covariance(make):
     """The sum of normalised squared errors of M episodes is chi-square with 2 M degrees of freedom."""
     M = 4000
     _, kept = simulate(make(covariance=[[1.0, 0.5], [0.5, 2.0]]), 20, M)
@@ -245,7 +245,7 @@ def test_noise_scales_q_and_r(make):
     np.testing.assert_allclose(model.mean(after), other.mean(expected), rtol=1e-12)
 
 
-def test_a_filter_with_another_model_is_worse_than_one_that_is_told(make):
+def test_a_filter_with_another_model_is_worse_than_the_true_one(make):
     cls = make(
         h=np.eye(2), R=np.eye(2), filter_model={"f": [[1.0, 0.9], [-0.1, 1.0]]}, process_noise=(0.1, 10.0)
     )
@@ -257,7 +257,7 @@ def test_a_filter_with_another_model_is_worse_than_one_that_is_told(make):
     assert 0.9 < anees < 1.1
 
 
-def test_the_world_switches_as_the_chain_says(make):
+def test_the_world_switches_by_the_chain(make):
     cls = make(
         hypotheses=[{"Q": 100.0 * Q}, {"f": np.eye(2)}],
         transition=[[0.8, 0.2, 0.0], [0.0, 0.5, 0.5], [0.1, 0.0, 0.9]],

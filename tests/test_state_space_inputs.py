@@ -87,7 +87,7 @@ def test_the_filter_is_that_of_the_inputs(make, kind, backend):
 
 
 def test_inputs_have_the_distribution_that_is_declared(make):
-    """Of 4,000 episodes: the course is stationary, forgets as its correlation time says, and is told with its noise."""
+    """Of 4,000 episodes: the course is stationary, has its correlation time, and is given with its noise."""
     _, kept = simulate(make(), 8, 4000)
     first, last = kept[0], kept[-1]
     for j, one in enumerate(NOISY.values()):
@@ -98,8 +98,8 @@ def test_inputs_have_the_distribution_that_is_declared(make):
         before = (first[0].inputs[j] - one.mean) / one.deviation
         kept_share = np.exp(-7 * 0.5 / one.correlation_time)
         assert abs(np.mean(course * before) - kept_share) < 4.0 * np.sqrt(2.0 / 4000)
-        told = last[1].inputs[j] - last[0].inputs[j]
-        np.testing.assert_allclose(told.std(), one.noise, rtol=0.05, atol=1e-15)
+        measured = last[1].inputs[j] - last[0].inputs[j]
+        np.testing.assert_allclose(measured.std(), one.noise, rtol=0.05, atol=1e-15)
 
 
 LOADED = {
@@ -135,12 +135,12 @@ def test_sensors_may_measure_the_inputs(make, kind, backend):
 
 
 def test_the_world_measures_what_truly_acts(make):
-    """Without noise of the sensor, and with the input told exactly, nothing is left of the difference."""
+    """Without noise of the sensor, and with the exact input given, nothing is left of the difference."""
     cls = make(**LOADED, inputs=["current", "load"], R=[[1e-20]])
     _, kept = simulate(cls, 5, 8)
     for truth, measurement, *_ in kept:
-        told = LOADED["h"](truth.state, truth.inputs)[0]
-        np.testing.assert_allclose(measurement.values[0], told, atol=1e-8)
+        measured = LOADED["h"](truth.state, truth.inputs)[0]
+        np.testing.assert_allclose(measurement.values[0], measured, atol=1e-8)
 
 
 def test_filters_agree(make):
@@ -174,16 +174,16 @@ def test_a_loop_of_ones_own_gives_inputs_by_name_and_the_last_holds_on(make):
         each.start(mean=[0.8, 0.0], covariance=0.01 * np.eye(2))
     with pytest.raises(ValueError, match="needs load at the first measurement"):
         filter.update(0.5, voltage=0.9, current=1.0)
-    said = [
+    readings = [
         (0.5, {"current": 1.0, "load": 0.5, "voltage": 0.9}),
         (1.25, {"voltage": 0.8}),
         (1.5, {"current": 1.5}),
         (2.5, {"load": 0.25, "values": [0.7]}),
     ]
-    for time, values in said:
+    for time, values in readings:
         found = filter.update(time, **values)
     for k in (0, 2, 1, 3):
-        again = late.update(said[k][0], **said[k][1])
+        again = late.update(readings[k][0], **readings[k][1])
     mean, P = naive(np.array([0.8, 0.0]), 0.01 * np.eye(2), ROWS)
     np.testing.assert_allclose(found.mean, mean, rtol=1e-12)
     np.testing.assert_allclose(found.covariance, P, rtol=1e-12)

@@ -69,7 +69,7 @@ def test_what_comes_late_is_taken_in_as_if_all_had_begun_anew(make, kind):
 
 
 def test_the_world_hands_over_what_it_has_held_back(make):
-    """Of 2,000 episodes: as many come late as is said, and each is of the state three measurements before."""
+    """Of 2,000 episodes: as many come late as declared, and each is of the state three measurements before."""
     _, kept = simulate(make(), 8, 2000, **LATE)
     due = [kept[k][1].late_available.sum(axis=1) + 0.0 for k in (3, 4, 5, 6, 7)]
     in_time = [kept[k][1].available.sum(axis=1) for k in (0, 1, 2, 3, 4)]

@@ -299,7 +299,7 @@ def test_exported_programs_read_the_log_of_the_model(case, make, tmp_path):
     ]
     path = write(tmp_path / "log.csv", rows, names, separator)
     lines = path.read_text(encoding="utf-8").splitlines()
-    if case == "timed":  # a row of each sensor at one time, and one that says something else
+    if case == "timed":  # a row of each sensor at one time, and one with another value
         cells = lines[6].split(",")
         lines[6:7] = [",".join([*cells[:2], "", *cells[3:]]), ",".join([cells[0], "", cells[2], "", ""])]
         cells = lines[9].split(",")

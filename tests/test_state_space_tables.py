@@ -150,7 +150,7 @@ def test_a_table_that_does_not_fit_is_refused_with_what_to_type(make, tmp_path, 
         read_recording(written(tmp_path / "log.csv", text), ID)
 
 
-def test_columns_are_called_as_the_user_says(make, tmp_path):
+def test_columns_may_be_named_by_the_user(make, tmp_path):
     make()
     path = written(tmp_path / "log.csv", TEXT.replace("time,gps,odometry", "t,pos,odom"))
     found = read_recording(path, ID, rename={"T": "time", "pos": "gps", "odom": "Odometry"})
@@ -225,7 +225,7 @@ def test_a_filter_is_exported_and_tried_on_a_table(make, tmp_path):
     assert export_c(request_export(problem_of(ID), "extended", recording), tmp_path).difference < 1e-9
 
 
-def test_names_of_what_is_measured_can_be_told_apart(make):
+def test_names_of_measurements_are_distinct(make):
     for measured in (["one"], ["a", "A"], ["a", "time"], ["a", "truth_x"], ["a", ""]):
         with pytest.raises(ValueError, match=r"measured must|names of what is measured must"):
             make(measured=measured)

@@ -129,7 +129,7 @@ def found(honest):
 
 @pytest.fixture
 def run_once(found, monkeypatch):
-    """Take those, for tests that edit nothing but what the file says of them."""
+    """Take those, for tests that edit nothing but the text of the file."""
     monkeypatch.setattr(submissions, "run_submission", lambda *arguments: Run(0, found, ()))
 
 
@@ -459,12 +459,12 @@ def test_an_altered_protocol_is_refused(change, edited, command):
 def test_a_protocol_is_that_of_filtergym_1():
     whole, digest = read_protocol("filtergym-1")
     for known in whole.environments:
-        own, said = protocol_of(problem_of(known.id), "filtergym-1")
-        assert (own.environments, said) == ((known,), digest)
+        own, stated = protocol_of(problem_of(known.id), "filtergym-1")
+        assert (own.environments, stated) == ((known,), digest)
         assert (own.episodes, own.held_out_episodes, own.seed, own.split) == (2000, 500, 0, "test")
-        trial, said = protocol_of(problem_of(known.id), "trial")
+        trial, stated = protocol_of(problem_of(known.id), "trial")
         assert (trial.environments[0].training, trial.environments[0].held_out) == (known.training, ())
-        assert (trial.episodes, trial.seed, trial.split, said) == (32, 0, "test", digest)
+        assert (trial.episodes, trial.seed, trial.split, stated) == (32, 0, "test", digest)
 
 
 # --- code
@@ -537,7 +537,7 @@ def test_source_that_cannot_compete_is_refused(further, sentence, edited, comman
     assert sentence in refused(command, path, "--trust").replace(str(Path.cwd()) + "/", "")
 
 
-def test_what_is_told_the_truth_is_refused(edited, command):
+def test_a_competitor_that_knows_the_truth_is_refused(edited, command):
     def name(content):
         content["competitor"]["name"] = "known-turn"
 
@@ -577,7 +577,7 @@ def test_what_is_packed_or_large_is_refused(command, tmp_path):
 
 
 def test_damaged_files_end_in_a_sentence(honest, tmp_path):
-    """Whatever bytes are changed, a file is read as what it says or refused as a ValueError."""
+    """Whatever bytes are changed, a file is read as its content or refused by a ValueError."""
     rng, path = np.random.default_rng(0), tmp_path / "damaged.json"
     content = np.frombuffer((honest / "shipped.json").read_bytes(), np.uint8)
     refusals = 0

@@ -71,12 +71,16 @@ def naive_bank(model, state, posterior):
             model.task.common.decay,
         )[..., 0, 0]
         mean, P = F @ mean, F @ P @ F.T + model.task.process_noise[:, :, i, 0]
-        said = state.measurement
+        measured = state.measurement
         expected, rows = gnss_ins.observe(
-            mean[:, None], said.satellite_position, said.satellite_velocity, said.ins_angles, p.gravity
+            mean[:, None],
+            measured.satellite_position,
+            measured.satellite_velocity,
+            measured.ins_angles,
+            p.gravity,
         )
         H = dense(rows, mean[:, None])[..., 0]
-        nu = (said.readings - expected)[:, 0]
+        nu = (measured.readings - expected)[:, 0]
         R = numpy.diag(model.task.sensor_variance)
         S = H @ P @ H.T + R
         log_likelihoods.append(
@@ -122,8 +126,8 @@ def test_controls_that_ask_for_the_paper_get_it_bit_for_bit():
 def test_weights_that_state_the_probabilities_follow_the_paper():
     paper = make("random")
     probabilities = [s.filter.probabilities for *_, s in drive(paper, 8, 3, 30)]
-    told = make("random", "weights")
-    by_weights = [s.filter.mean for *_, s in drive(told, 8, 3, 30, lambda k, o, s: probabilities[k - 1])]
+    weighted = make("random", "weights")
+    by_weights = [s.filter.mean for *_, s in drive(weighted, 8, 3, 30, lambda k, o, s: probabilities[k - 1])]
     for estimate, (*_, state) in zip(by_weights, drive(paper, 8, 3, 30), strict=True):
         # Normalising weights that already sum to one moves the last digit.
         numpy.testing.assert_allclose(estimate, state.filter.mean, rtol=1e-9, atol=1e-9)
@@ -139,12 +143,12 @@ def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
     far[7, :4] += 10.0  # clock drift, m/s: more than the rates' aperture
     far[3, 4:] += 300.0  # clock bias, m: more than the ranges' aperture
     for feedback, rates, ranges in ((None, 1.0, 1.0), (expected, 1.0, 1.0), (far, 0.0, 0.0)):
-        _, said = model.task.world.advance(state.truth, row, feedback)
-        assert (said.available[4:8, :4] == rates).all()
-        assert (said.available[:4, 4:] == ranges).all()
-        assert (said.available[:4, :4] == 1.0).all()
-        assert (said.available[4:8, 4:] == 1.0).all()
-        assert (said.available[8:] == 1.0).all()
+        _, measured = model.task.world.advance(state.truth, row, feedback)
+        assert (measured.available[4:8, :4] == rates).all()
+        assert (measured.available[:4, 4:] == ranges).all()
+        assert (measured.available[:4, :4] == 1.0).all()
+        assert (measured.available[4:8, 4:] == 1.0).all()
+        assert (measured.available[8:] == 1.0).all()
     assert not make("matched", control).task.closes_loop
 
 
@@ -340,7 +344,7 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
     )
     previous, noisy, stuck, out = None, 0, 0, 0
     for k, state, _, _ in drive(model, 8, 11, 320):
-        s, said = state.truth, state.measurement
+        s, measured = state.truth, state.measurement
         assert ((s.noise_factor[4:8] == 1.0) | (s.noise_factor[4:8] == s.disturbances["noisy"].own)).all()
         noisy = noisy + (s.noise_factor[4:8] > 1.0).sum(axis=0)
         assert (s.noise_factor[:4] == 1.0).all()
@@ -353,14 +357,14 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
         assert (causes["stuck accelerometers"] == held).all()
         assert (causes["noisy rate"] == (s.noise_factor > 1.0).any(axis=0)).all()
         if previous is not None:
-            same = (said.readings[8:11] == previous.readings[8:11]).all(axis=0)
+            same = (measured.readings[8:11] == previous.readings[8:11]).all(axis=0)
             assert (same == held).all()
         stuck = stuck + held
-        missing = 4 - said.available[:4].sum(axis=0)
-        assert (said.available[:4] == said.available[4:8]).all()
+        missing = 4 - measured.available[:4].sum(axis=0)
+        assert (measured.available[:4] == measured.available[4:8]).all()
         assert set(missing) <= {0.0, 2.0}
         out = out + (missing == 2.0)
-        previous = said
+        previous = measured
     assert (out == 200).all()
     assert ((noisy >= 100) & (noisy <= 300)).all()
     assert ((stuck >= 29) & (stuck <= 100)).all()

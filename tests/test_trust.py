@@ -1,4 +1,4 @@
-"""What can execute code when it is loaded is not loaded, unless somebody says --trust."""
+"""What can execute code when it is loaded is not loaded, without --trust."""
 
 import json
 import pickle
@@ -199,7 +199,7 @@ def test_a_file_of_ones_own_is_no_library(tmp_path):
     assert "middle:Middle" in (tmp_path / "out" / "records.csv").read_text()
 
 
-def test_what_nobody_expected_is_a_sentence(monkeypatch, command):
+def test_an_unexpected_error_is_a_sentence(monkeypatch, command):
     def broken(*_, **__):
         raise KeyError("lost")
 

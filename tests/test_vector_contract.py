@@ -241,7 +241,7 @@ def copies_go_on_as_the_original(subject):
             assert_copies_go_on(subject.single(backend=backend), 2, backend)
 
 
-def assert_copies_go_on(env, steps, told):
+def assert_copies_go_on(env, steps, message):
     """Copies from the middle of an episode return what the original does, in the next episode, too."""
     env.reset(seed=3)
     env.action_space.seed(0)
@@ -252,8 +252,8 @@ def assert_copies_go_on(env, steps, told):
     following = env.reset()[0]
     for other in others:
         for one, two in zip(expected, continued(other, then), strict=True):
-            np.testing.assert_array_equal(one, two, err_msg=told)
-        np.testing.assert_array_equal(following, other.reset()[0], err_msg=told)
+            np.testing.assert_array_equal(one, two, err_msg=message)
+        np.testing.assert_array_equal(following, other.reset()[0], err_msg=message)
 
 
 BY_KIND = (
