@@ -138,35 +138,6 @@ def test_modes_start_as_the_chain_leaves_them(model, stay):
     )
 
 
-def test_imm_equals_filterpys(model):
-    filterpy = pytest.importorskip("filterpy.kalman")
-    sigmas, stay = (0.2, 4.0), (0.98, 0.9)
-
-    def track(x, P):
-        filters = []
-        for sigma in sigmas:
-            one = filterpy.KalmanFilter(dim_x=4, dim_z=2)
-            one.x, one.P, one.H, one.sigma = x.copy(), P.copy(), H, sigma
-            filters.append(one)
-        mu = [1 / (1 - s) for s in stay]
-        chain = np.array([[stay[0], 1 - stay[0]], [1 - stay[1], stay[1]]])
-        peer = filterpy.IMMEstimator(filters, np.array(mu) / sum(mu), chain)
-        z, R, dt = yield
-        while True:
-            for one in filters:
-                one.R, one.F, one.Q = R, transition(dt), one.sigma**2 * unit_noise(dt)
-            peer.predict()
-            if z is not None:
-                peer.update(z)
-            else:  # the predicted probabilities are in force, which filterpy learns in an update only
-                peer.mu = peer.cbar
-                peer._compute_mixing_probabilities()
-                peer._compute_state_estimate()
-            z, R, dt = yield peer.x, peer.P
-
-    compare(model, KalmanInteractingMultipleModel(model.task, sigmas, stay), track, rtol=1e-8)
-
-
 def test_unscented_filter_equals_filterpys(model):
     filterpy = pytest.importorskip("filterpy.kalman")
     acceleration, change, start_rate = 0.5, 0.4, 1.5

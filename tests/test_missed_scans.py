@@ -47,17 +47,23 @@ def paper_data(seed):
     return start, scans
 
 
-CHAIN, PRIOR = ((0.95, 0.05), (0.3, 0.7)), (0.8, 0.2)
+BANKS = [
+    ((0.3, 0.7), ((0.95, 0.05), (0.3, 0.7)), (0.8, 0.2)),
+    ((0.2, 0.5, 0.8), ((0.9, 0.08, 0.02), (0.1, 0.7, 0.2), (0.05, 0.35, 0.6)), (0.2, 0.3, 0.5)),
+]
+"""Gains, transition and probabilities at the start."""
 
 
-def flown(control, act, seed, **keywords):
+def flown(control, act, seed, bank=BANKS[0], **keywords):
     """What every scan of the paper's flight shows and leads to: observation, measurement and info."""
+    gains, chain, prior = bank
     env = gym.make(
         ID,
         control=control,
         scenario="paper",
-        transition=CHAIN,
-        initial_probabilities=PRIOR,
+        gains=gains,
+        transition=chain,
+        initial_probabilities=prior,
         detailed_info=True,
         **IRREGULAR,
         **keywords,
@@ -72,15 +78,17 @@ def flown(control, act, seed, **keywords):
     return model, steps
 
 
-def test_policy_of_the_paper_equals_the_imm_as_plain_filter():
+@pytest.mark.parametrize("bank", BANKS)
+def test_policy_of_the_paper_equals_the_imm_as_plain_filter(bank):
     seed = 0
     start, scans = paper_data(seed)
-    expected = naive_bank(start, scans, CHAIN, PRIOR, [(0.3, 0.7)] * len(scans))
+    gains, chain, prior = bank
+    expected = naive_bank(start, scans, chain, prior, [gains] * len(scans))
 
     def act(model, observation):
         return InteractingMultipleModel(model).predict(observation)[0]
 
-    _, steps = flown("weights", act, seed)
+    _, steps = flown("weights", act, seed, bank)
     assert 5 < sum(z is None for *_, z in scans) < 70
     before, measured = 0.0, 0.0
     for (time, truth, z), (mean, covariance, mu), (_, m, info) in zip(scans, expected, steps, strict=False):
@@ -100,22 +108,28 @@ def test_policy_of_the_paper_equals_the_imm_as_plain_filter():
         assert info["nis_degrees"] == (0.0 if z is None else 2.0)
 
 
-def test_steered_gains_equal_the_imm_as_plain_filter():
+@pytest.mark.parametrize("bank", BANKS)
+def test_steered_gains_equal_the_imm_as_plain_filter(bank):
     """Where the scan missed the target neither the action nor the likelihood counts."""
+    gains, chain, prior = bank
     rng, used = np.random.default_rng(5), []
 
     def act(model, observation):
-        action = rng.uniform(-1.0, 1.0, 2)
-        used.append(1.0 / (1.0 + np.exp(-(np.log([0.3 / 0.7, 0.7 / 0.3]) + 2.0 * action))))
+        action = rng.uniform(-1.2, 1.2, len(gains))
+        odds = np.array(gains) / (1.0 - np.array(gains)) * np.exp(1.5 * np.clip(action, -1.0, 1.0))
+        used.append(odds / (1.0 + odds))
         return action
 
     start, scans = paper_data(3)
-    _, steps = flown("gains", act, 3)
-    expected = naive_bank(start, scans[:100], CHAIN, PRIOR, used)
+    model, steps = flown("gains", act, 3, bank, gain_logits=1.5)
+    expected = naive_bank(start, scans[:100], chain, prior, used)
     for (mean, covariance, mu), (_, _, info) in zip(expected, steps, strict=True):
         np.testing.assert_allclose(info["estimate"], mean, rtol=0, atol=1e-7)
         np.testing.assert_allclose(info["covariance"], covariance, rtol=1e-9, atol=1e-6)
         np.testing.assert_allclose(info["mode_probability"], mu, rtol=0, atol=1e-10)
+    for (*_, z), alpha, (shown, *_) in zip(scans, used, steps[1:], strict=False):
+        if z is not None:
+            np.testing.assert_allclose(model.reader("last_alpha_1")(shown), alpha[:1], rtol=1e-12)
 
 
 def test_one_filter_equals_the_recursion_with_the_gain_over_the_elapsed_time():
@@ -129,7 +143,7 @@ def test_one_filter_equals_the_recursion_with_the_gain_over_the_elapsed_time():
     start, scans = paper_data(4)
     _, steps = flown("gain", act, 4, unmodelled_acceleration=0.0)
     # A bank of two equal filters is one filter.
-    expected = naive_bank(start, scans[:100], CHAIN, PRIOR, [(alpha, alpha) for alpha in used])
+    expected = naive_bank(start, scans[:100], *BANKS[0][1:], [(alpha, alpha) for alpha in used])
     for (_, _, z), (mean, _, _), (_, _, info) in zip(scans, expected, steps, strict=False):
         np.testing.assert_allclose(info["estimate"], mean, rtol=0, atol=1e-8)
         assert info["nis_degrees"] == (0.0 if z is None else 2.0)
