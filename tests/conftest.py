@@ -164,7 +164,6 @@ def short(env_id):
 
 @pytest.fixture(name="random_actions")
 def _random_actions():
-    """Draw actions for a batch."""
     return random_actions
 
 

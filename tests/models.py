@@ -40,12 +40,10 @@ def load_module(file: Path, name: str | None = None) -> Iterator[Any]:
 
 
 def make_model(id: str, control: str | None = None, scenario: Any = None, **keywords: Any) -> Model:
-    """Make a model as :func:`filtergym.envs.engine.backend.make_model` does."""
     return backend.make_model(task_class(id), control, scenario, **keywords)
 
 
 def begin(model: Model, rng: np.random.Generator, count: int) -> Any:
-    """Begin episodes side by side, from numbers of a generator."""
     noise = model.task.noise
     return model.begin(rng.random((noise.uniforms, count)), rng.normal(size=(noise.initial_normals, count)))
 

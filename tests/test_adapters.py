@@ -28,7 +28,6 @@ LIBRARIES = {"filterpy_filters": "filterpy", "autopilot_kalman": "filterpy", "st
 
 
 def example(name):
-    """Module of docs/examples."""
     if name in LIBRARIES:
         pytest.importorskip(LIBRARIES[name], reason=f"{LIBRARIES[name]} is in filtergym[adapters]")
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")

@@ -15,7 +15,6 @@ ID = "mine/BudgetedSensing-v0"
 
 @pytest.fixture(scope="module")
 def example():
-    """The module, registered."""
     yield from load_module(ROOT / "docs" / "examples" / "budgeted_sensing.py")
 
 

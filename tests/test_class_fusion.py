@@ -19,7 +19,6 @@ ASYMMETRIC = numpy.array([[0.9, 0.08, 0.02], [0.0, 0.7, 0.3], [0.25, 0.05, 0.7]]
 
 
 def bank(rng, N):
-    """Random weights, means and covariances of a bank, and a measurement near them."""
     P = rng.dirichlet([1.0, 1.0, 1.0], N).T
     mean = rng.standard_normal((3, 3, N)) * numpy.array([1000.0, 20.0, 5.0])[:, None, None]
     root = rng.standard_normal((3, 3, 3, N)) * numpy.array([1000.0, 20.0, 5.0])[:, None, None, None]

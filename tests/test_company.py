@@ -39,7 +39,6 @@ def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
 
 
 def residual(model):
-    """Random corrections of random actions."""
     return ResidualPolicy(model, RandomPolicy(model), competitor(ID, "adaptive")(model))
 
 

@@ -31,7 +31,6 @@ def compare(env_id, count, fly, **keywords):
 
 
 def flown(env, actions, **reset):
-    """Everything that episodes show."""
     found = [env.reset(seed=3, **reset)[0]]
     for action in actions:
         found += [np.asarray(part) for part in env.step(action)[:4]]
@@ -39,8 +38,6 @@ def flown(env, actions, **reset):
 
 
 def assert_same_episodes(env_id, count, actions, reset=None, **keywords):
-    """Compiled episodes are those of NumPy."""
-
     def fly(env):
         first, *steps = flown(env, sampled(env, actions), **(reset or {}))
         return [np.stack([first, *steps[::4]]), *(np.stack(steps[i::4]) for i in (1, 2, 3))]

@@ -144,7 +144,6 @@ def test_gymnasium_refuses_what_the_page_of_recipes_lists(row):
 
 
 def words_by_hand(text: str) -> int:
-    """Count the words of a page outside blocks, tables and headings."""
     prose = re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S)
     return sum(len(line.split()) for line in prose.splitlines() if not line.lstrip().startswith(("|", "#")))
 

@@ -20,7 +20,6 @@ RATES = [(0.3, 0.2, 0.6, 0.5), (0.1, 0.5, 0.3, 0.3), (0.0, 0.0, 1.0, 0.2)]
 
 
 def normal(x, sigma):
-    """Density over that at the mean."""
     return math.exp(-0.5 * (x / sigma) ** 2)
 
 

@@ -69,7 +69,6 @@ def shows_what_lies_in_its_space(subject):
 
 
 def run(env, actions, seed=21):
-    """Observations and rewards of fixed actions."""
     shown, paid = [env.reset(seed=seed)[0]], []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)

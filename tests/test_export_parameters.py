@@ -61,7 +61,6 @@ int main(int argc, char **argv) {{
 
 @pytest.fixture
 def state_space():
-    """Make an environment of a model of one's own."""
     yield from make_models({})
 
 

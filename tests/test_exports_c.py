@@ -31,7 +31,6 @@ SANITIZERS = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
 
 @pytest.fixture
 def run(command, monkeypatch, tmp_path):
-    """Run the command line in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return command
 

@@ -58,8 +58,6 @@ class Kalman:
 
 
 class InPython(Kalman):
-    """The same, asked in Python."""
-
     traceable = False
 
 

@@ -32,12 +32,10 @@ FIVE = np.arange(0.0, 200.0, 5.0)
 
 
 def weave(time, start=(2e4, 1e4), speed=120.0):
-    """Position, m, ``(n, 2)``."""
     return np.stack([start[0] + speed * time, start[1] + 500.0 * np.sin(time / 40.0)], axis=1)
 
 
 def table(file, **columns):
-    """Write a CSV file."""
     rows = zip(*columns.values(), strict=True)
     file.write_text("\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)]) + "\n")
     return file
@@ -49,7 +47,6 @@ def flight_file(file, time=FIVE, **of_weave):
 
 
 def as_json(file, **columns):
-    """Write a list of rows."""
     values = [np.array(column).tolist() for column in columns.values()]
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
     text = json.dumps(rows).encode()

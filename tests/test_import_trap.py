@@ -63,7 +63,6 @@ def everywhere(value, kept=()):
 
 
 def write_table(path, columns):
-    """Write columns as CSV, JSON or Parquet, by the suffix."""
     if path.suffix == ".csv":
         with path.open("w", newline="") as file:
             csv.writer(file).writerows([list(columns), *zip(*columns.values(), strict=True)])

@@ -57,7 +57,6 @@ def imports_of(file: Path) -> list[tuple[list[str], bool]]:
 
 
 def room_of(file: Path) -> str:
-    """Return the innermost room that a file stands in."""
     return max((room for room in ROOMS if file.is_relative_to(room)), key=len)
 
 

@@ -131,7 +131,6 @@ BACKWARD = "rate_x", "rate_y", "acceleration_x", "acceleration_y"
 
 
 def changed(table, columns, change):
-    """A copy of a table, some columns of it replaced."""
     columns = [*columns]
     return table.assign(**{name: change(table[name]) for name in columns})
 

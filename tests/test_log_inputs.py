@@ -34,13 +34,11 @@ def aircraft(**changes):
 
 
 def untold(**changes):
-    """Without the truth."""
     found = aircraft(**changes)
     return found[[name for name in found if not name.startswith("truth_")]]
 
 
 def read(log, tmp_path, **options):
-    """Write a table and read it as a recording."""
     log.to_csv(tmp_path / "log.csv", index=False, **options)
     return read_recording(tmp_path / "log.csv", TARGET)
 

@@ -45,7 +45,6 @@ def model():
 
 
 def estimates(model, estimator):
-    """What an estimator is given and answers: start, measurements, means and covariances of eight episodes."""
     start, measurements, answers = watch_estimator(model, estimator)
     mean, covariance, _ = zip(*answers, strict=True)
     return start, measurements, np.array(mean), np.array(covariance)

@@ -127,9 +127,10 @@ def test_steered_gains_equal_the_imm_as_plain_filter(bank):
         np.testing.assert_allclose(info["estimate"], mean, rtol=0, atol=1e-7)
         np.testing.assert_allclose(info["covariance"], covariance, rtol=1e-9, atol=1e-6)
         np.testing.assert_allclose(info["mode_probability"], mu, rtol=0, atol=1e-10)
+    last = [field.name for field in model.fields].index("last_alpha_1")
     for (*_, z), alpha, (shown, *_) in zip(scans, used, steps[1:], strict=False):
         if z is not None:
-            np.testing.assert_allclose(model.reader("last_alpha_1")(shown), alpha[:1], rtol=1e-12)
+            np.testing.assert_allclose(shown[last : last + len(gains)], alpha, rtol=1e-12)
 
 
 def test_one_filter_equals_the_recursion_with_the_gain_over_the_elapsed_time():

@@ -12,7 +12,6 @@ n, H, L, N = 3, 4, 5, 6
 
 
 def covariances(rng: numpy.random.Generator, *shape: int) -> numpy.ndarray:
-    """Random ones, ``(n, n, *shape)``."""
     factor = rng.standard_normal((n, n, *shape))
     return numpy.einsum("ik...,jk...->ij...", factor, factor) + 0.1 * numpy.eye(n).reshape(
         n, n, *[1] * len(shape)

@@ -238,7 +238,6 @@ OF_ALL_KINDS = [
 
 
 def begin(filter):
-    """Start a filter of one track, and return the initial estimate, ``(..., 1)``."""
     initial = filter.input.initial
     given = {name: array[..., 0] for name, array in initial._asdict().items() if name != "first"}
     if filter.task.id == RADAR:

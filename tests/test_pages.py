@@ -37,14 +37,12 @@ RUNNING = {
 
 
 def blocks(text, *languages):
-    """Yield blocks of a page in some languages."""
     for indent, language, block in BLOCK.findall(text):
         if language in languages:
             yield re.sub(f"^{indent}", "", block, flags=re.M)
 
 
 def commands(text):
-    """Yield words of every command of a page."""
     for block in blocks(text, "sh", "console"):
         for line in block.replace("\\\n", " ").splitlines():
             for command in re.split(r"&&|\|", line.removeprefix("$ ")):

@@ -67,7 +67,6 @@ def _changed(columns, changes):
 
 
 def untold(columns):
-    """Without the truth."""
     return {name: values for name, values in columns.items() if not name.startswith("truth_")}
 
 

@@ -301,7 +301,6 @@ def test_neither_side_waits_for_the_other_with_a_full_pipe(tmp_path):
 
 
 def running(pid):
-    """Whether there is a process, a zombie too."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -37,7 +37,6 @@ def assert_all_equal(some, others):
 
 
 def length(env):
-    """Decisions until the first truncation."""
     env.reset(seed=0)
     action, count, finished = env.action_space.sample(), 0, False
     while not finished:

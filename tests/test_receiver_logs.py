@@ -156,7 +156,6 @@ def test_what_is_no_solution_is_refused(change, sentence, tmp_path):
 
 
 def sentence(words):
-    """Words with their checksum."""
     total = 0
     for byte in words.encode():
         total ^= byte
@@ -190,7 +189,6 @@ def nmea(path, deviations=True, dates=True, quality=None):
 
 @pytest.fixture
 def pynmea2():
-    """The library that parses sentences."""
     return pytest.importorskip("pynmea2", reason="not installed: pip install 'filtergym[logs]'")
 
 

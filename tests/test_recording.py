@@ -47,7 +47,6 @@ def recordings():
 
 
 def blind(recording):
-    """The same recording without truth."""
     return dataclasses.replace(recording, truth=None)
 
 
@@ -263,7 +262,6 @@ def test_a_closed_loop_is_refused_as_recording_with_the_reason():
 
 
 def table(path, **columns):
-    """Write a CSV file."""
     names = list(columns)
     rows = zip(*(np.asarray(columns[name], dtype=object).tolist() for name in names), strict=True)
     cells = ["" if v is None or (isinstance(v, float) and v != v) else repr(v) if isinstance(v, float) else str(v)

@@ -60,8 +60,6 @@ def package(tmp_path, monkeypatch):
 
 @pytest.fixture
 def turns():
-    """Class of an environment that is not registered yet."""
-
     class Turns(ManeuveringTarget):
         id = "mine/Turns-v0"
 
@@ -189,7 +187,6 @@ GAIN = ManeuveringTarget.banks["gain"]
 
 
 def rows(state, measurement):
-    """What has four rows."""
     return GAIN.mean(None, state)
 
 

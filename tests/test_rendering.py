@@ -21,7 +21,6 @@ ID = "filtergym/ManeuveringTarget-v0"
 
 
 def played(steps, seed=1, **keywords):
-    """Environment after some random actions."""
     env = TaskEnv(ID, render_mode="rgb_array", **keywords)
     env.action_space.seed(seed)
     env.reset(seed=seed)

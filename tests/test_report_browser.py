@@ -33,14 +33,12 @@ def page(results, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def wide(page):
-    """The page on a screen, everything open."""
     with browser.opened(page, 1400, height=1400) as driver:
         yield opened_whole(driver)
 
 
 @pytest.fixture(scope="module")
 def narrow(page):
-    """The page on a telephone, everything open."""
     with browser.opened(page, 400) as driver:
         yield opened_whole(driver)
 

@@ -64,7 +64,6 @@ def sb3():
 
 
 def save(model, folder, name="model.zip", statistics="vecnormalize.pkl"):
-    """Save a model, and its statistics under a name that may lie in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     model.save(folder / name)
     if statistics:
@@ -240,7 +239,6 @@ class Sluggish:
 
 
 def looped(policy, seeds, begin=True, **keywords):
-    """Costs of episodes that are stepped by hand, one after the other."""
     env = gymnasium.make(ID, detailed_info=True, **{**policy.keywords, **keywords})
     found = []
     for seed in seeds:

@@ -44,7 +44,6 @@ def random_gaussian(rng, n):
 
 
 def moments(weights, means, covariances):
-    """Of a mixture."""
     x = sum(w * m for w, m in zip(weights, means, strict=True))
     spread = (w * (P + np.outer(m - x, m - x)) for w, m, P in zip(weights, means, covariances, strict=True))
     return x, sum(spread)

@@ -238,7 +238,6 @@ def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm,
 
 
 def words_of(command):
-    """Settings in a command."""
     words = shlex.split(command)
     return [word for before, word in itertools.pairwise(words) if before == "--set"]
 

@@ -62,7 +62,6 @@ def lorenz(x, order=5, T=0.02):
 
 
 def begin(cls):
-    """The initial estimate of eight episodes."""
     model = make_model(cls)
     noise = model.task.noise
     return model.begin(np.zeros((noise.uniforms, 8)), np.zeros((noise.initial_normals, 8))).measurement
@@ -316,7 +315,6 @@ class TestExamples:
 
 
 def noise_of(dt):
-    """White acceleration."""
     return [[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]]
 
 

@@ -39,7 +39,6 @@ ID = "mine/Table-v0"
 
 @pytest.fixture
 def make():
-    """Make the environment; forgotten afterwards."""
     yield lambda **keywords: filtergym.state_space(ID, **{**TIMED, **BOTH, **keywords})
     forget(ID)
 

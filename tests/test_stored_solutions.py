@@ -38,7 +38,6 @@ def test_other_numbers_are_solved_anew():
 
 
 def write_missing():
-    """Make every environment and store what is not stored."""
     entries = {stored_solutions.key_of(entry["function"], *entry["arguments"]): entry for entry in ENTRIES}
 
     def storing(solve):

@@ -47,7 +47,6 @@ SPRING = "open({!r}, 'w')\n"
 
 
 def stored(path, name):
-    """Write a submission of a few episodes."""
     made = make_submission(problem_of(ID), name, "trial", Card("A title"), Workers())
     write_submission(path, made)
     return path

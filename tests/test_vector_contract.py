@@ -70,7 +70,6 @@ def assert_same_steps(ours, theirs, actions):
 
 
 def arrays_in(value):
-    """Every array of numbers inside."""
     if isinstance(value, dict | tuple | list) or (isinstance(value, np.ndarray) and value.dtype == object):
         for part in value.values() if isinstance(value, dict) else value:
             yield from arrays_in(part)
@@ -79,7 +78,6 @@ def arrays_in(value):
 
 
 def scribble(value):
-    """Overwrite every array inside."""
     for array in arrays_in(value):
         array[...] = ~array if array.dtype == bool else 77
 
