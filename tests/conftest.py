@@ -193,6 +193,30 @@ def command(monkeypatch, capsys):
 
 
 @pytest.fixture
+def success(command):
+    """Run the command line, which must succeed; returns its output."""
+
+    def run(*words, **keywords):
+        code, shown, errors = command(*words, **keywords)
+        assert code == 0, errors
+        return shown
+
+    return run
+
+
+@pytest.fixture
+def refusal(command):
+    """Run the command line, which must refuse the words in one sentence; returns the sentence."""
+
+    def run(*words, **keywords):
+        code, _, errors = command(*words, **keywords)
+        assert (code, errors.count("\n")) == (2, 1), errors
+        return errors
+
+    return run
+
+
+@pytest.fixture
 def without_figures(monkeypatch):
     """Let `evaluate --out` draw no figures, which takes seconds, for tests that look at the other files."""
     for name in ("evaluation_figures", "worst_figures"):

@@ -275,11 +275,10 @@ def test_it_ends_in_sentences(advice):
 
 
 @pytest.mark.slow
-def test_the_command_writes_a_filter_that_evaluates(tmp_path, command, monkeypatch):
+def test_the_command_writes_a_filter_that_evaluates(tmp_path, command, success, monkeypatch):
     log = write_log(tmp_path, count=300, acceleration=2.0, sigma=2.0, stated=0.7, seed=4)
     path = tmp_path / "mine.filter.json"
-    code, out, err = command("advise", log, "--out", path)
-    assert code == 0, err
+    out = success("advise", log, "--out", path)
     assert "Take " in out
     table = json.loads(path.read_text())
     assert table["environment"] == ID
@@ -287,8 +286,7 @@ def test_the_command_writes_a_filter_that_evaluates(tmp_path, command, monkeypat
     assert float(np.nanmean(found["nis"].values / found["nis_degrees"].values)) == pytest.approx(
         1.0, abs=0.25
     )
-    code, out, err = command("evaluate", ID, "--recording", log, "--policy", path, "--policy", "imm")
-    assert code == 0, err
+    out = success("evaluate", ID, "--recording", log, "--policy", path, "--policy", "imm")
     assert "imm" in out
     assert command("advise", log, "--out", tmp_path / "mine.json")[0] == 2
 

@@ -13,7 +13,6 @@ import browser
 import numpy as np
 import pytest
 
-from filtergym.__main__ import main
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.maneuvering_target.log_families import log_families
@@ -190,10 +189,6 @@ def test_a_sensor_that_is_no_component_has_a_report_without_a_track(tmp_path):
     assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_report_without_its_extra_is_refused_before_anything_is_read(monkeypatch, capsys):
+def test_a_report_without_its_extra_is_refused_before_anything_is_read(monkeypatch, refusal):
     monkeypatch.setitem(sys.modules, "filtergym.reports.pages.html_report", None)
-    monkeypatch.setattr(sys, "argv", ["filtergym", "advise", "missing.csv", "--report", "advice.html"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    assert "reports need more packages" in capsys.readouterr().err
+    assert "reports need more packages" in refusal("advise", "missing.csv", "--report", "advice.html")

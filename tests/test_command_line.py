@@ -13,7 +13,7 @@ import commands
 import pytest
 from made_results import without_times
 
-from filtergym.__main__ import GROUPS, import_command, main
+from filtergym.__main__ import GROUPS, import_command
 from filtergym.agents.learned_policy import pretrained_path
 from filtergym.baselines.problem import problem_of
 from filtergym.commands import terminal
@@ -43,30 +43,22 @@ def run(command, monkeypatch, tmp_path):
     return ran
 
 
-def test_version_is_that_of_the_installed_package(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["filtergym", "--version"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 0
-    assert capsys.readouterr().out == f"filtergym {metadata.version('filtergym')}\n"
+def test_version_is_that_of_the_installed_package(success):
+    assert success("--version") == f"filtergym {metadata.version('filtergym')}\n"
 
 
 COMMANDS = {name: import_command(own) for group in GROUPS.values() for name, own in group.items()}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_every_command_ends_with_an_example(command, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["filtergym", command, "--help"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 0
-    shown, source = capsys.readouterr().out, inspect.getsource(COMMANDS[command])
-    assert f"Example: filtergym {command}" in shown
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_every_command_ends_with_an_example(name, success):
+    shown, source = success(name, "--help"), inspect.getsource(COMMANDS[name])
+    assert f"Example: filtergym {name}" in shown
     # The extras that a command names are not swallowed as markup.
     extras = {
         word for option in ("Backend", "Cluster") if f": {option}" in source for word in OF_OPTIONS[option]
     }
-    extras |= set(re.findall(r"filtergym\[\w+\]", inspect.getdoc(COMMANDS[command])))
+    extras |= set(re.findall(r"filtergym\[\w+\]", inspect.getdoc(COMMANDS[name])))
     assert extras == set(re.findall(r"filtergym\[\w+\]", shown))
 
 

@@ -203,7 +203,9 @@ class Losing:
 """
 
 
-def test_lost_episodes_stand_in_table_records_and_results(command, without_figures, monkeypatch, tmp_path):
+def test_lost_episodes_stand_in_table_records_and_results(
+    command, success, without_figures, monkeypatch, tmp_path
+):
     """Two of twenty, in two pieces of work; what others have finished is not lost."""
     monkeypatch.delitem(sys.modules, "losing", raising=False)
     monkeypatch.chdir(tmp_path)
@@ -229,8 +231,7 @@ def test_lost_episodes_stand_in_table_records_and_results(command, without_figur
     # Every number kept, and summaries alone, in pieces: the same message.
     for further in (("--out", "out"), ("--out", "small", "--no-netcdf")):
         monkeypatch.setattr("filtergym.evaluation.running.summary.TOGETHER", 8)
-        code, output, errors = command(*words, *further)
-        assert code == 0, errors
+        output = success(*words, *further)
         assert message in " ".join(output.split())
         [record] = [
             record for record in json.loads(Path("records.json").read_text())
@@ -265,7 +266,7 @@ class Nothing:
 """
 
 
-def test_an_error_of_an_estimator_names_its_line(command, monkeypatch):
+def test_an_error_of_an_estimator_names_its_line(refusal, monkeypatch):
     monkeypatch.delitem(sys.modules, "raising", raising=False)
     Path("raising.py").write_text(RAISING)
     words = ("evaluate", ID, "--episodes", 2, "--set", "horizon=3", "--policy")
@@ -278,17 +279,14 @@ def test_an_error_of_an_estimator_names_its_line(command, monkeypatch):
         ("AtStart", "failed at the start of the track: KeyError: 'lost'", 12),
         ("AtBirth", "cannot be made: ZeroDivisionError: division by zero", 17),
     ):
-        code, _, errors = command(*words, f"raising:{name}")
-        assert (code, errors.count("\n")) == (2, 1), errors
+        errors = refusal(*words, f"raising:{name}")
         assert f"estimator 'raising:{name}' {message}" in errors
         assert errors.rstrip().endswith(f"(raising.py, line {line})")
     monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words), "raising:AtBirth", "--debug"])
     with pytest.raises(ValueError, match="AtBirth") as caught:
         main()
     assert caught.value.__cause__ is not None
-    code, _, errors = command(*words, "raising:Nothing")
-    assert (code, errors.count("\n")) == (2, 1)
-    assert "an estimator the methods start and update" in errors
+    assert "an estimator the methods start and update" in refusal(*words, "raising:Nothing")
 
 
 def test_a_name_that_is_taken_is_refused():
@@ -333,13 +331,12 @@ def test_the_papers_algorithm_is_known_by_another_name():
     assert compare({"another": "kalman-imm"}, "first reading")[0] == "first reading"
 
 
-def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkeypatch):
+def test_a_class_of_ones_own_is_found_from_the_working_directory(success, monkeypatch):
     """The example of the page, as the page runs it."""
     monkeypatch.delitem(sys.modules, "mine", raising=False)
     monkeypatch.chdir(EXAMPLES)
     words = [word for name in ("mine:Mine", "imm", "bptt", "known-turn") for word in ("--policy", name)]
-    code, output, errors = command("evaluate", ID, "--episodes", 3, "--set", "horizon=10", *words)
-    assert code == 0, errors
+    output = success("evaluate", ID, "--episodes", 3, "--set", "horizon=10", *words)
     assert [line for line in output.splitlines() if line.startswith("> mine:Mine  ")]
     assert output.count("mine:Mine: ") > 1  # why, in sentences: it is the first that is named
     assert re.match(r"mine:Mine: [\d.]+ ", output)  # the first sentence is about the user's own

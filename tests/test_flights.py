@@ -5,7 +5,6 @@ import gzip
 import importlib
 import json
 import runpy
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,7 +16,6 @@ from gymnasium.vector import AutoresetMode
 from models import make_model
 
 from filtergym import Flights, Trajectory, evaluate, tidy_records
-from filtergym.__main__ import main
 from filtergym.envs.logs import flight_tables
 from filtergym.envs.logs.flight_cleaning import fit_parabolas
 from filtergym.envs.logs.flights import read_flights
@@ -533,16 +531,10 @@ def test_means_are_of_what_is_there_where_flights_end():
 # --- the command
 
 
-def test_one_command_on_a_folder_with_two_broken_files(tmp_path, monkeypatch, capsys):
+def test_one_command_on_a_folder_with_two_broken_files(tmp_path, success):
     runpy.run_path(str(DOCS / "examples" / "flights.py"))["write_flights"](tmp_path)
-    words = ["evaluate", ID, "--scenario", str(tmp_path / "*.csv"), "--policy", "imm", "--policy", "adaptive"]
-    monkeypatch.setattr(
-        sys, "argv", ["filtergym", *words, "--episodes", "19", "--json", str(tmp_path / "all.json")]
-    )
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 0
-    out = capsys.readouterr().out
+    words = ["evaluate", ID, "--scenario", tmp_path / "*.csv", "--policy", "imm", "--policy", "adaptive"]
+    out = success(*words, "--episodes", 19, "--json", tmp_path / "all.json")
     page = (DOCS / "own_data.md").read_text(encoding="utf-8")
     assert out[out.index("ory_07.csv:") :] in page
     left_out = (11, 15)
@@ -550,13 +542,6 @@ def test_one_command_on_a_folder_with_two_broken_files(tmp_path, monkeypatch, ca
     assert all((f"ory_{i:02} " in out) is (i not in left_out) for i in range(20))
     scenarios = {record["scenario"] for record in json.loads((tmp_path / "all.json").read_text())}
     assert len(scenarios) == 19
-
-
-def test_the_example_of_the_page_prints_its_comments(capsys):
-    page = (DOCS / "own_data.md").read_text(encoding="utf-8")
-    code = page.partition("```python\n")[2].partition("```")[0]
-    exec(code, {})
-    assert capsys.readouterr().out.strip() == code.strip().rpartition("# ")[2]
 
 
 def test_an_aircraft_that_has_landed_flies_another_flight(tmp_path):

@@ -287,7 +287,7 @@ def test_the_estimator_is_the_policy_in_its_bank(id, name):
                 np.testing.assert_array_equal(values, records[name])
 
 
-def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
+def test_a_file_is_an_estimator_of_its_environment(tmp_path, success):
     from filtergym.agents.training_run import RunOptions, new_run
 
     pytest.importorskip("stable_baselines3")
@@ -295,8 +295,7 @@ def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
     arrays = network(make_model(RADAR, NAME), 0.3).arrays
     write_arrays(path, arrays, new_run(problem_of(RADAR), RunOptions(NAME)), "tanh")
     assert kind_of(load_policy(problem_of(RADAR).task, path)) == "estimator"
-    code, out, _ = command("evaluate", RADAR, "--policy", path, "--policy", "imm", "--episodes", 2)
-    assert code == 0
+    out = success("evaluate", RADAR, "--policy", path, "--policy", "imm", "--episodes", 2)
     assert [line for line in out.splitlines() if line.startswith(str(path)[:4])]
     with pytest.raises(ValueError, match=f"was trained on '{RADAR}', not on {FUSION}"):
         filtergym.evaluate(FUSION, [str(path)], episodes=1)
@@ -304,14 +303,13 @@ def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
         filtergym.make_policy(RADAR, str(path))
 
 
-def test_training_of_an_environment_without_one(command, tmp_path, monkeypatch):
+def test_training_of_an_environment_without_one(refusal, tmp_path, monkeypatch):
     pytest.importorskip("stable_baselines3")
     monkeypatch.setattr(catalogue()[ESM], "companions", ())
-    code, _, error = command("train", ESM, "--algo", NAME, "--out", tmp_path / "run")
-    assert code == 2
     assert (
-        f"{ESM} has no filter for algorithm '{NAME}': choose another algorithm, or {FUSION}, {RADAR}" in error
+        f"{ESM} has no filter for algorithm '{NAME}': choose another algorithm, or {FUSION}, {RADAR}"
+        in refusal("train", ESM, "--algo", NAME, "--out", tmp_path / "run")
     )
-    code, _, error = command("train", RADAR, "--algo", NAME, "--control", "gain", "--out", tmp_path / "run")
-    assert code == 2
-    assert "unknown control 'gain'" in error
+    assert "unknown control 'gain'" in refusal(
+        "train", RADAR, "--algo", NAME, "--control", "gain", "--out", tmp_path / "run"
+    )

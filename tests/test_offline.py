@@ -207,10 +207,10 @@ def test_an_interruption_leaves_no_half_of_a_data_set(minari, monkeypatch, tmp_p
     assert list(tmp_path.rglob("*")) == []
 
 
-def test_without_minari_one_sentence_names_what_to_install(command, monkeypatch, tmp_path):
+def test_without_minari_one_sentence_names_what_to_install(refusal, monkeypatch, tmp_path):
     for name in ("minari", "minari.storage"):
         monkeypatch.setitem(sys.modules, name, None)
-    code, _, errors = command("offline", ENV, "--episodes", 2, "--out", tmp_path / "out")
-    assert code == 2
-    assert "pip install 'filtergym[offline]'" in errors
+    assert "pip install 'filtergym[offline]'" in refusal(
+        "offline", ENV, "--episodes", 2, "--out", tmp_path / "out"
+    )
     assert not (tmp_path / "out").exists()

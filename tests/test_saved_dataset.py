@@ -11,7 +11,6 @@ import xarray
 from models import make_model
 
 from filtergym import evaluate, record, tidy_records
-from filtergym.__main__ import main
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import (
@@ -123,7 +122,7 @@ def test_keywords_that_json_cannot_hold_are_refused():
 
 
 @pytest.mark.slow
-def test_examples_of_the_page(tmp_path, monkeypatch, capsys):
+def test_examples_of_the_page(tmp_path, monkeypatch, capsys, success):
     """What is written by a command is read by xarray alone, and drawn."""
     page = (Path(__file__).parent.parent / "docs" / "evaluation.md").read_text(encoding="utf-8")
     read, drawn = (
@@ -132,11 +131,7 @@ def test_examples_of_the_page(tmp_path, monkeypatch, capsys):
     )
     monkeypatch.chdir(tmp_path)
     words = ["evaluate", TARGET, "--scenario", "paper", "--policy", "imm", "--policy", "known-turn"]
-    monkeypatch.setattr("sys.argv", ["filtergym", *words, "--episodes", "8", "--out", "results/paper"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 0
-    capsys.readouterr()
+    success(*words, "--episodes", 8, "--out", "results/paper")
     names = {}
     exec(read, names)
     dataset = evaluate(TARGET, ["imm", "known-turn"], "paper", 8)

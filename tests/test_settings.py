@@ -321,13 +321,12 @@ def test_options_of_a_reset_reach_the_environments_of_an_adapter():
         env.reset()
 
 
-def test_settings_of_the_command_line(command, tmp_path):
+def test_settings_of_the_command_line(refusal, success, tmp_path):
     config = tmp_path / "mine.yml"
     config.write_text("env: {range_sigma: 70.0}\nalgo: {hidden_size: 4, truncation: 40, n_envs: 2}\n")
     words = ("train", ID, "--algo", "bptt", "--control", "gain", "--no-compare", "--out", tmp_path / "run")
     settings = ("--config", config, "--set", "algo.hidden_size=3", "--set", "env.horizon=50")
-    code, _, errors = command(*words, *settings, "--reward", "log-likelihood", "--steps", 100)
-    assert code == 0, errors
+    success(*words, *settings, "--reward", "log-likelihood", "--steps", 100)
     run = load_run(tmp_path / "run")
     assert run.hyperparameters["hidden_size"] == 3
     assert run.hyperparameters["env_kwargs"] == {
@@ -335,8 +334,5 @@ def test_settings_of_the_command_line(command, tmp_path):
         "horizon": 50,
         "reward": "log-likelihood",
     }
-    code, _, errors = command(*words, "--envs", 2, "--resume", "--steps", 100)
-    assert code == 0, errors
-    code, _, errors = command(*words, "--envs", 2, "--resume", "--set", "env.horizon=60")
-    assert code == 2
-    assert "hyperparameters" in errors
+    success(*words, "--envs", 2, "--resume", "--steps", 100)
+    assert "hyperparameters" in refusal(*words, "--envs", 2, "--resume", "--set", "env.horizon=60")

@@ -195,7 +195,7 @@ def test_rows_of_one_time_from_several_sensors_are_one_measurement(make, tmp_pat
         read_recording(written(tmp_path / "other.csv", other), ID)
 
 
-def test_commands_take_a_table(make, tmp_path, monkeypatch, command):
+def test_commands_take_a_table(make, tmp_path, monkeypatch, command, success):
     make()
     rng = np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.3, 2.0, 60))
@@ -204,10 +204,8 @@ def test_commands_take_a_table(make, tmp_path, monkeypatch, command):
     np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,gps,odometry", comments="")
     monkeypatch.chdir(tmp_path)
     log = ("--recording", "log.csv", "--rename", "t=time")
-    code, shown, errors = command("evaluate", ID, *log, "--policy", "kalman")
-    assert code == 0, errors
-    code, shown, errors = command("tune", ID, *log, "--policy", "extended", "--out", ".")
-    assert code == 0, errors
+    success("evaluate", ID, *log, "--policy", "kalman")
+    shown = success("tune", ID, *log, "--policy", "extended", "--out", ".")
     assert "measurement noise" in shown
     assert f"filtergym evaluate {problem_of(ID).name} --policy" in shown.replace("\n", " ")
     code, _, errors = command("tune", ID, "--policy", "extended", "--truth", "log.csv")

@@ -143,13 +143,12 @@ def test_one_truth_is_enough(tmp_path):
         read_recording(tmp_path / "log.csv", ID, truth=tmp_path / "nothing.csv")
 
 
-def test_commands_take_it(tmp_path, command):
+def test_commands_take_it(tmp_path, refusal, success):
     read(tmp_path, log(), truth(TIME))
     given = ("--recording", tmp_path / "log.csv", "--truth", tmp_path / "truth.csv")
-    code, out, err = command("evaluate", ID, *given, "--policy", "imm")
-    assert code == 0, err
+    out = success("evaluate", ID, *given, "--policy", "imm")
     assert "80 of 80 rows have a truth" in " ".join(out.split())
     assert "RMSE" in out
-    code, _, err = command("evaluate", ID, "--scenario", "paper", "--truth", tmp_path / "truth.csv")
-    assert code == 2
-    assert "--truth is for a recording" in err
+    assert "--truth is for a recording" in refusal(
+        "evaluate", ID, "--scenario", "paper", "--truth", tmp_path / "truth.csv"
+    )
