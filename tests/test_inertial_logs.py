@@ -236,12 +236,6 @@ def test_metres_of_a_site_are_placed_on_the_ellipsoid():
     )
 
 
-def test_without_pyins_the_extra_is_named(log, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pyins", None)
-    with pytest.raises(ValueError, match=r"filtergym\[ins\]"):
-        inertial_recording(*log[:2])
-
-
 @pytest.mark.slow
 def test_position_only_fixes_aid_the_ins(pyins, log):
     imu, fixes, _ = log

@@ -1,7 +1,6 @@
 """Offline data: transitions as Gymnasium gives them; Minari writes and loads them, and makes the environment again."""
 
 import json
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -205,12 +204,3 @@ def test_an_interruption_leaves_no_half_of_a_data_set(minari, monkeypatch, tmp_p
     with pytest.raises(KeyboardInterrupt):
         offline.write_datasets(ENV, ["imm"], episodes=2, horizon=4, folder=tmp_path / "out")
     assert list(tmp_path.rglob("*")) == []
-
-
-def test_without_minari_one_sentence_names_what_to_install(refusal, monkeypatch, tmp_path):
-    for name in ("minari", "minari.storage"):
-        monkeypatch.setitem(sys.modules, name, None)
-    assert "pip install 'filtergym[offline]'" in refusal(
-        "offline", ENV, "--episodes", 2, "--out", tmp_path / "out"
-    )
-    assert not (tmp_path / "out").exists()

@@ -483,15 +483,6 @@ def test_a_cluster_has_the_same_bits_and_loses_nothing(clustered, tmp_path, monk
     sys.modules.pop("elsewhere")
 
 
-def test_a_cluster_without_its_packages_is_one_sentence(refusal, monkeypatch):
-    for name in ("ray", "distributed"):
-        monkeypatch.setitem(sys.modules, name, None)
-    for cluster in ("ray", "tcp://127.0.0.1:1"):
-        assert "a cluster needs more packages: pip install 'filtergym[cluster]'" in refusal(
-            "evaluate", ENV, "--policy", "imm", "--episodes", 2, "--cluster", cluster
-        )
-
-
 def test_tuning_finds_the_same_values(two):
     from filtergym.baselines.tuning import Search, tune
 

@@ -264,22 +264,6 @@ def test_logs_of_too_many_rows_are_refused(pynmea2, tmp_path, monkeypatch):
             read_recording(path, TARGET)
 
 
-@pytest.mark.parametrize(
-    ("suffix", "library"),
-    [
-        (".nmea", "pynmea2"),
-        (".ulg", "pyulog"),
-        (".bin", "pymavlink.DFReader"),
-        (".bag", "rosbags.rosbag1"),
-    ],
-)
-def test_a_missing_library_is_named(suffix, library, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, library, None)
-    (tmp_path / f"log{suffix}").write_bytes(b"anything")
-    with pytest.raises(ValueError, match=r"needs one more package: pip install 'filtergym\[logs\]'"):
-        read_recording(tmp_path / f"log{suffix}", TARGET)
-
-
 # --- ULog
 
 

@@ -15,6 +15,7 @@ import pytest
 import scipy
 from contract import assert_equals_its_vector
 from models import load_module
+from naive import kalman_update
 from own_models import forget, simulate
 
 import filtergym
@@ -70,13 +71,10 @@ def begin(cls):
 def naive_filter(mean, P, measurements, f, F_of, h, H_of, Q, R):
     """Extended Kalman filter of one episode with NumPy's inverse."""
     found = []
-    for z, there in measurements:
+    for z in measurements:
         A = F_of(mean)
         mean, P = np.asarray(f(mean), float), A @ P @ A.T + Q
-        C = H_of(mean)[there]
-        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R[np.ix_(there, there)])
-        mean = mean + K @ (z - np.asarray(h(mean), float))[there]
-        P = (np.eye(len(mean)) - K @ C) @ P
+        mean, P = kalman_update(mean, P, z - np.asarray(h(mean), float), H_of(mean), R)
         found.append((mean, P))
     return found
 
@@ -84,7 +82,7 @@ def naive_filter(mean, P, measurements, f, F_of, h, H_of, Q, R):
 def compare_with_naive(cls, steps, tolerance, f, F_of, h, H_of, Q, R, **keywords):
     start, kept = simulate(cls, steps, 8, **keywords)
     for lane in range(8):
-        z = [(m.values[:, lane], m.available[:, lane] > 0.0) for _, m, _, _ in kept]
+        z = [np.where(m.available[:, lane] > 0.0, m.values[:, lane], np.nan) for _, m, _, _ in kept]
         mean, P = start.measurement.mean[:, lane], start.measurement.covariance[:, :, lane]
         naive = naive_filter(mean, P, z, f, F_of, h, H_of, Q, R)
         for (x, P), (_, _, mean, covariance) in zip(naive, kept, strict=True):
@@ -333,9 +331,7 @@ def naive_timed(f, F_of, mean, P, measurements):
     for dt, z in measurements:
         A = F_of(mean, dt)
         mean, P = np.array(f(mean, dt), float), A @ P @ A.T + np.array(noise_of(dt))
-        if np.isfinite(z):
-            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-            mean, P = mean + K @ (z - mean[:1]), (np.eye(2) - K @ H) @ P
+        mean, P = kalman_update(mean, P, z - mean[:1], H, R)
     return mean, P
 
 

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from naive import kalman_update
 from own_models import simulate
 
 import filtergym
@@ -59,10 +60,7 @@ def naive(x, P, rows, R=R):
             S = (H @ P @ H.T + R)[np.ix_(gps, gps)]
             if nu[gps] @ np.linalg.inv(S) @ nu[gps] > GATE**2:
                 there[:2], closed = False, closed + 1
-        if there.any():
-            C = H[there]
-            K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R[np.ix_(there, there)])
-            x, P = x + K @ nu[there], (np.eye(3) - K @ C) @ P
+        x, P = kalman_update(x, P, np.where(there, nu, np.nan), H, R)
     return x, P, closed
 
 
