@@ -54,6 +54,15 @@ def next_row(model: Model, rng: np.random.Generator, count: int) -> np.ndarray:
     return np.concatenate([rng.normal(size=(noise.normals, count)), rng.random((noise.row_uniforms, count))])
 
 
+def draw(
+    model: Model, count: int, seed: int, steps: int
+) -> tuple[np.ndarray, np.ndarray, Iterator[np.ndarray]]:
+    """Draw what episodes side by side take: uniforms, initial normals, and a row of each step."""
+    rng, noise = np.random.default_rng(seed), model.task.noise
+    start = rng.random((noise.uniforms, count)), rng.standard_normal((noise.initial_normals, count))
+    return *start, (next_row(model, rng, count) for _ in range(steps))
+
+
 def short_episodes(id: str) -> dict[str, Any]:
     """Keywords that make episodes of an environment five decisions long, of two measurements at most."""
     interval = min(task_class(id).Parameters().decision_interval, 2)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from naive import positive_definite
 
 from filtergym.filters import imm
 
@@ -12,8 +13,7 @@ def random_bank(seed, n=4, modes=3, batch=6):
     """Means, positive definite covariances, weights and an asymmetric transition matrix."""
     rng = np.random.default_rng(seed)
     mean = rng.normal(size=(n, modes, batch))
-    root = rng.normal(size=(n, n, modes, batch))
-    covariance = np.einsum("ijmb,kjmb->ikmb", root, root) + 0.1 * np.eye(n)[:, :, None, None]
+    covariance = positive_definite(rng, n, modes, batch)
     weights = rng.dirichlet(np.ones(modes), size=batch).T
     transition = rng.dirichlet(np.ones(modes), size=modes)
     return mean, covariance, weights, transition

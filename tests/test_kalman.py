@@ -2,14 +2,10 @@
 
 import numpy as np
 import pytest
+from naive import positive_definite
 from scipy.stats import multivariate_normal
 
 from filtergym.filters import kalman
-
-
-def positive_definite(rng, n, batch):
-    root = rng.normal(size=(batch, n, n))
-    return np.moveaxis(root @ root.swapaxes(1, 2) + 0.1 * np.eye(n), 0, -1)
 
 
 def system(seed, n, m, batch):

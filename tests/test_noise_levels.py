@@ -4,18 +4,12 @@ import math
 
 import numpy
 import pytest
+from naive import positive_definite
 
 from filtergym.filters import imm, noise_levels, packed_covariance
 from filtergym.filters.noise_levels import LevelHypotheses, SensorNoise
 
 n, H, L, N = 3, 4, 5, 6
-
-
-def covariances(rng: numpy.random.Generator, *shape: int) -> numpy.ndarray:
-    factor = rng.standard_normal((n, n, *shape))
-    return numpy.einsum("ik...,jk...->ij...", factor, factor) + 0.1 * numpy.eye(n).reshape(
-        n, n, *[1] * len(shape)
-    )
 
 
 def normalised(values: numpy.ndarray) -> numpy.ndarray:
@@ -25,7 +19,7 @@ def normalised(values: numpy.ndarray) -> numpy.ndarray:
 def some(seed: int) -> tuple[numpy.random.Generator, LevelHypotheses, numpy.ndarray]:
     """Hypotheses, and their covariances as matrices."""
     rng = numpy.random.default_rng(seed)
-    P = covariances(rng, H, N)
+    P = positive_definite(rng, n, H, N)
     q = tuple(normalised(rng.random((L, H, N))) for _ in range(2))
     h = LevelHypotheses(
         rng.standard_normal((n, H, N)), packed_covariance.pack(P), normalised(rng.random((H, N))), q

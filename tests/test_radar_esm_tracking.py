@@ -3,6 +3,7 @@
 import math
 from types import SimpleNamespace
 
+import models
 import numpy
 import pytest
 
@@ -23,14 +24,7 @@ def make(scenario="paper", control="evidence", xp=numpy, **keywords) -> Model:
 
 
 def draw(model, N, seed):
-    """Noise of an episode for N lanes: uniforms, normals, rows."""
-    rng, layout = numpy.random.default_rng(seed), model.task.noise
-    start = rng.random((layout.uniforms, N)), rng.standard_normal((layout.initial_normals, N))
-    rows = (
-        numpy.concatenate([rng.standard_normal((layout.normals, N)), rng.random((layout.row_uniforms, N))])
-        for _ in range(model.task.horizon + 1)
-    )
-    return *start, rows
+    return models.draw(model, N, seed, model.task.horizon + 1)
 
 
 def roll(model, noise, policy=None):

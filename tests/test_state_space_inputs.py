@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy
 from naive import kalman_update
-from own_models import simulate
+from own_models import compare_lanes, simulate
 
 import filtergym
 from filtergym import Input, read_recording
@@ -73,15 +73,15 @@ def test_the_filter_is_that_of_the_inputs(make, kind, backend):
     jitter = {} if kind is FIXED else {"jitter": 0.9}
     start, kept = simulate(make(**kind), 10, 8, backend=backend, **jitter)
     known = np.zeros((2, 2)) if "inputs" in kind else N
-    for lane in range(8):
+
+    def follow(mean, P, lane):
         rows = [
             (0.5 if m.interval is None else m.interval[lane], m.inputs[:, lane], m.values[0, lane])
             for _, m, *_ in kept
         ]
-        mean, P = start.measurement.mean[:, lane], start.measurement.covariance[:, :, lane]
-        mean, P = naive(mean, P, rows, known)
-        np.testing.assert_allclose(kept[-1][2][:, lane], mean, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(kept[-1][3][:, :, lane], P, rtol=1e-12, atol=1e-12)
+        return naive(mean, P, rows, known)
+
+    compare_lanes(start, kept, follow)
 
 
 def test_inputs_have_the_distribution_that_is_declared(make):
@@ -114,9 +114,9 @@ def test_sensors_may_measure_the_inputs(make, kind, backend):
     """Against a naive extended Kalman filter of the same equations, rounding alone between them."""
     cls = make(**LOADED, **kind)
     start, kept = simulate(cls, 10, 4, backend=backend, jitter=0.9)
-    for lane in range(4):
-        mean, P = start.measurement.mean[:, lane], start.measurement.covariance[:, :, lane]
-        known = np.zeros((2, 2)) if kind else N
+    known = np.zeros((2, 2)) if kind else N
+
+    def follow(mean, P, lane):
         for _, m, *_ in kept:
             dt, u = m.interval[lane], m.inputs[:, lane]
             F, G = np.diag([1.0, np.exp(-dt)]), np.array([[-0.1 * dt, 0.0], [0.0, 0.0]])
@@ -126,8 +126,9 @@ def test_sensors_may_measure_the_inputs(make, kind, backend):
             D = np.array([[-0.3 * (1.0 + mean[1]), 1.0]])
             nu = np.array([m.values[0, lane] - LOADED["h"](mean, u)[0]])
             mean, P = kalman_update(mean, P, nu, H, D @ known @ D.T + R)
-        np.testing.assert_allclose(kept[-1][2][:, lane], mean, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(kept[-1][3][:, :, lane], P, rtol=1e-12, atol=1e-12)
+        return mean, P
+
+    compare_lanes(start, kept, follow)
 
 
 def test_the_world_measures_what_truly_acts(make):

@@ -4,6 +4,7 @@ import math
 
 import numpy
 import pytest
+from models import draw
 from naive import dense
 
 from filtergym.envs.contract.causes import Causes
@@ -26,21 +27,9 @@ def make(scenario, control="evidence", xp=numpy, **keywords) -> Model:
     return Model(TightlyCoupledNavigation(parameters, xp), control)
 
 
-def numbers(model, N, seed, steps):
-    """Uniforms, initial normals, and one row for each step."""
-    rng = numpy.random.default_rng(seed)
-    layout = model.task.noise
-    uniforms, normals = rng.random((layout.uniforms, N)), rng.standard_normal((layout.initial_normals, N))
-    rows = (
-        numpy.concatenate([rng.standard_normal((layout.normals, N)), rng.random((layout.row_uniforms, N))])
-        for _ in range(steps)
-    )
-    return uniforms, normals, rows
-
-
 def drive(model, N, seed, steps, action=None, kind=numpy.asarray):
     """Yield step, state after ``measure``, observation and state after ``act``."""
-    uniforms, normals, rows = numbers(model, N, seed, steps)
+    uniforms, normals, rows = draw(model, N, seed, steps)
     state = model.begin(kind(uniforms), kind(normals))
     for k, row in enumerate(rows, 1):
         measured = model.measure(state, kind(row))
@@ -102,7 +91,7 @@ def test_zero_evidence_is_the_algorithm_of_the_paper(scenario, seed):
     posterior = None
     for _, measured, _, state in drive(model, 1, seed, 60):
         if posterior is None:
-            start = model.begin(*numbers(model, 1, seed, 0)[:2]).filter
+            start = model.begin(*draw(model, 1, seed, 0)[:2]).filter
             posterior = (
                 list(start.means[..., 0].T),
                 [unpack(start.covariances, 17)[:, :, i, 0] for i in range(3)],
@@ -222,7 +211,7 @@ UNMIXED = {"urban": False, "aperture": False, "undisturbed": 0.0}
 
 def test_some_episodes_are_undisturbed_between_houses_steered_or_one_manoeuvre():
     model, N = make("random", horizon=300), 4000
-    uniforms, normals, _ = numbers(model, N, 21, 0)
+    uniforms, normals, _ = draw(model, N, 21, 0)
     truth = model.begin(uniforms, normals).truth
     found, p = truth.disturbances, model.task.parameters
     urban, aperture = found["reflections"].urban, found["aperture"]
