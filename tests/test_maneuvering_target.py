@@ -11,8 +11,6 @@ from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
 from filtergym.envs.data.trajectory import Trajectory
-from filtergym.filters import alpha_beta, imm
-from filtergym.filters.gaussian import log_density
 
 ID = "filtergym/ManeuveringTarget-v0"
 REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0), "coloured_sigma": (0.0, 0.0)}
@@ -31,42 +29,6 @@ def paper_flight():
         step = [x + T * vx + a * T**2 / 2, y + T * vy + a * T**2 / 2, vx + a * T, vy + a * T]
         states.append(np.array(step))
     return np.array(states)
-
-
-def test_zero_evidence_is_the_plain_filter_bit_for_bit():
-    """The recursion through the functions of ``filters``, batch of 8, against the task's own bank."""
-    model = make_model(ID, "evidence", "random", **REGULAR)
-    rng = np.random.default_rng(0)
-    state = begin(model, rng, 8)
-    mean, covariance, mu = state.filter.mean, state.filter.covariance, state.filter.probabilities
-    alpha = np.array([[0.3], [0.7]])
-    beta = alpha_beta.benedict_bordner_beta(alpha)
-    transition = np.array([[0.9, 0.1], [0.1, 0.9]])
-    for _ in range(model.task.horizon):
-        state = model.measure(state, rng.normal(size=(2, 8)))
-        prediction = imm.predict_mode_probabilities(transition, mu)
-        mean, covariance = imm.mix(mean, covariance, prediction.mixing)
-        position, velocity = alpha_beta.predict(mean[:2], mean[2:], T), mean[2:]
-        covariance = alpha_beta.predict_joint_covariance(covariance, T)
-        innovation = state.measurement.position[:, None] - position
-        R = np.eye(2)[:, :, None, None] * state.measurement.variance[:, None]
-        log_likelihood, _ = log_density(innovation, covariance[:2, :2] + R)
-        mu = imm.mode_posterior(imm.log_probabilities(prediction.probabilities), log_likelihood)
-        mean = np.concatenate(alpha_beta.update(position, velocity, innovation, alpha, beta, T))
-        covariance = alpha_beta.update_joint_covariance(
-            covariance, state.measurement.variance[:, None], alpha, beta, T
-        )
-        state = model.act(state, np.zeros((2, 8)))
-        np.testing.assert_array_equal(state.filter.probabilities, mu)
-        np.testing.assert_array_equal(state.filter.mean, mean)
-        np.testing.assert_array_equal(state.filter.covariance, covariance)
-        np.testing.assert_allclose(
-            model.error(state),
-            imm.combine(mean, covariance, mu)[0]
-            - np.concatenate([state.truth.position, state.truth.velocity]),
-            rtol=0,
-            atol=1e-9,
-        )
 
 
 # --- the paper's table

@@ -15,7 +15,6 @@ from models import (
 )
 from scipy.stats import multivariate_normal
 
-from filtergym import evaluate
 from filtergym.envs.maneuvering_target.semi_markov import (
     SLOWEST,
     VAGUE,
@@ -260,13 +259,6 @@ def test_survives_what_its_prior_rules_out():
             assert np.isfinite(mean).all()
             assert np.isfinite(likelihood.log_likelihood).all()
             assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()
-
-
-@pytest.mark.filterwarnings("error")
-def test_is_compiled_with_the_world():
-    # What cannot be traced runs as Python code, and a warning states it.
-    assert not SemiMarkov.in_python
-    evaluate(ID, ["semi-markov", "semi-markov-vague"], episodes=8, horizon=4, backend="compiled")
 
 
 @pytest.fixture(scope="module")
