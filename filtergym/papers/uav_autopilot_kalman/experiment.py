@@ -210,7 +210,7 @@ def flatness(values: numpy.ndarray) -> float:
 
 
 def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the spectra of the nodes of the settled loop, white-noise input, from its transfer functions."""
+    """Return the spectra of output and nodes of the settled loop, white-noise input, from its transfer functions."""
     (F, B, H, L, K, Q, R), T = matrices(task), interval(task)
     n, m = len(F), len(R)
     loop = linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)
@@ -235,6 +235,7 @@ def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, nu
     if task.parameters.plant == "P":
         driven[0, 0] = task.parameters.acceleration_sigma
     return {
+        "output": power(numpy.hstack([coordinate, 0.0 * coordinate])),
         "plant_input": power(-L @ numpy.hstack([numpy.eye(n), -numpy.eye(n)]), z * driven),
         "observation": power(
             numpy.hstack([coordinate, 0.0 * coordinate]), numpy.hstack([numpy.zeros((1, n)), sensor]) @ noise
