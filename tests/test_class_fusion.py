@@ -19,7 +19,6 @@ ASYMMETRIC = numpy.array([[0.9, 0.08, 0.02], [0.0, 0.7, 0.3], [0.25, 0.05, 0.7]]
 
 
 def bank(rng, N):
-    """Random weights, means and covariances of a bank, and a measurement near them."""
     P = rng.dirichlet([1.0, 1.0, 1.0], N).T
     mean = rng.standard_normal((3, 3, N)) * numpy.array([1000.0, 20.0, 5.0])[:, None, None]
     root = rng.standard_normal((3, 3, 3, N)) * numpy.array([1000.0, 20.0, 5.0])[:, None, None, None]
@@ -111,17 +110,6 @@ def test_whitened_innovations_square_to_the_nis():
     w = step.innovation[:, 1, 4]
     assert w @ w == pytest.approx(Delta @ numpy.linalg.solve(Theta, Delta), rel=1e-12)
     assert w[0] == pytest.approx(Delta[0] / math.sqrt(Theta[0, 0]), rel=1e-12)
-
-
-def test_torch_agrees_with_numpy(torch):
-    arrays = bank(numpy.random.default_rng(3), 8)
-    expected = class_fusion.advance(*arrays, MODELS, ASYMMETRIC)
-    tensors = [torch.asarray(a, dtype=torch.float64) for a in arrays]
-    models = class_fusion.Models(*(torch.asarray(m, dtype=torch.float64) for m in MODELS))
-    result = class_fusion.advance(*tensors, models, torch.asarray(ASYMMETRIC, dtype=torch.float64))
-    for a, b in zip(result, expected, strict=True):
-        # The same operations; exp and log may differ in the last digit.
-        assert a.numpy() == pytest.approx(b, rel=1e-12, abs=1e-10)
 
 
 # --- exact errors

@@ -91,8 +91,6 @@ def test_each_takes_its_own_numbers_and_acts_in_its_turn():
 
 
 class Held(NamedTuple):
-    """State of :class:`Frozen`."""
-
     number: np.ndarray
     reading: np.ndarray
 

@@ -20,7 +20,6 @@ RATES = [(0.3, 0.2, 0.6, 0.5), (0.1, 0.5, 0.3, 0.3), (0.0, 0.0, 1.0, 0.2)]
 
 
 def normal(x, sigma):
-    """Density over that at the mean."""
     return math.exp(-0.5 * (x / sigma) ** 2)
 
 
@@ -229,7 +228,7 @@ def test_a_change_moves_the_weight_to_its_class():
 
 
 def test_ideal_is_consistent_where_errors_are_coloured_correlated_and_glint():
-    """Mean NEES over the dimension of a reference that is told all of it."""
+    """Mean NEES over the dimension of a reference that knows all of it."""
     for scenario, keywords in (
         ("random", {"radar_coloured": (0.5, 0.5), "radar_correlation": (-0.6, -0.6), "undisturbed": 0.0}),
         ("glint", {"radar_correlation": (0.7, 0.7)}),

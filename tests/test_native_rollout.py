@@ -72,9 +72,9 @@ def test_episodes_go_on_from_where_they_were_left(name, monkeypatch):
     given = model_of("ManeuveringTarget", name, "random", horizon=24)
     found, action = run_episodes(*given[:3], SEEDS, given[3])
     monkeypatch.setattr(rollouts, "AT_ONCE", 16 * 7)
-    told = []
-    parts, actions = run_episodes(*given[:3], SEEDS, given[3], tick=told.append)
-    assert told == [11 * 7, 11 * 7, 11 * 7, 11 * 3]
+    ticks = []
+    parts, actions = run_episodes(*given[:3], SEEDS, given[3], tick=ticks.append)
+    assert ticks == [11 * 7, 11 * 7, 11 * 7, 11 * 3]
     for each, values in found.items():
         np.testing.assert_array_equal(parts[each], values, err_msg=each)
         assert parts[each].flags.c_contiguous
@@ -94,7 +94,7 @@ def test_company_tiles_and_threads_change_no_bit(threads):
 
 
 class Traced(Policy):
-    """Says what it answers."""
+    """States what it returns."""
 
     control = "gain"
     traceable = True
@@ -121,7 +121,7 @@ class Branching(Traced):
 
 
 class Counting(Far):
-    """Another ``act`` that says nothing of itself."""
+    """Another ``act`` without declarations."""
 
     def act(self, observation, state, start):
         self.asked = getattr(self, "asked", 0) + 1
@@ -138,7 +138,7 @@ def test_an_action_that_is_no_number_is_refused():
         evaluate(ID, {"none": NoNumber}, episodes=3, horizon=10)
 
 
-def test_what_cannot_be_traced_is_asked_in_python_and_says_so():
+def test_a_policy_that_cannot_be_traced_runs_in_python_with_a_note():
     with pytest.warns(UserWarning, match="Branching.*test_native_rollout.py, line"):
         run = evaluate(ID, {"mine": Branching}, episodes=3, horizon=10)
     assert set(np.unique(run["action"])) <= {0.0, 1.0}
@@ -150,7 +150,7 @@ def test_a_method_that_is_replaced_is_not_taken_for_traceable():
 
 
 def test_a_function_may_make_another_policy_next_time():
-    """Of what makes it nobody knows whether it always makes the same."""
+    """It is unknown whether its maker always makes the same."""
     level = 0.1
 
     class Level(Policy):
@@ -176,7 +176,7 @@ def test_a_function_may_make_another_policy_next_time():
 
 
 def test_a_function_may_make_another_estimator_next_time():
-    """Likewise of what is compiled as a filter."""
+    """A function that is compiled as a filter, by its outputs."""
     known = problem_of(ID)
     names = ["kalman-imm", "kalman-imm-turn"]
 

@@ -108,7 +108,7 @@ def test_a_bounded_logarithm_is_the_value_near_zero_and_below_eight_everywhere()
     assert blocks.fields[0].description == "y / (1 + |y| / 8) with y = sign(x) log(1 + |x|) of anything"
 
 
-def test_unknown_names_and_names_said_twice():
+def test_unknown_and_repeated_names():
     blocks = Blocks(BLOCKS, QUANTITIES, np)
     with pytest.raises(ValueError, match="unknown quantity 'g' of the observation: choose from a, b"):
         blocks.reader("g")

@@ -41,7 +41,7 @@ def test_commands_print_what_the_readme_shows():
     pytest.importorskip("llvmlite")  # what is compiled is not marked as asked in Python
     text = README.read_text(encoding="utf-8")
     assert without_times(insert_outputs(README)) == without_times(text)
-    # The text says over what, as the table's title does.
+    # The text names the episodes, as the table's title does.
     for words in (
         "500 episodes, test split, seed 0",
         "500 of the test split, seed 0",
@@ -58,7 +58,7 @@ def test_the_headline_names_the_episodes_of_its_record():
 def test_what_a_page_shows_of_its_commands_is_what_they_print(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
-        "In `said.py`:\n\n```python\nraise SystemExit\n```\n\n```sh\nfiltergym --version\n```\n\n"
+        "In `exit.py`:\n\n```python\nraise SystemExit\n```\n\n```sh\nfiltergym --version\n```\n\n"
         "<!-- printed: begin -->\nold\n<!-- printed: end -->\n"
     )
     shown = insert_outputs(page)

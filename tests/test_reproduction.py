@@ -37,7 +37,7 @@ def test_an_unknown_paper_is_named_with_what_was_meant() -> None:
         paper_module("imm-alpha-gamma")
 
 
-def test_a_package_without_the_repository_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_without_the_repository_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("filtergym.reproductions.PAPERS", "filtergym.no_papers")
     with pytest.raises(ValueError, match="are part of the repository, not of the package"):
         paper_module("imm-alpha-beta")
