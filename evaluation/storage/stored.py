@@ -1,4 +1,4 @@
-"""Reading of JSON files with checks of types and limits."""
+"""Reading of JSON files, with checks of their types and limits."""
 
 import types
 from pathlib import Path
@@ -11,7 +11,7 @@ Stored = TypeVar("Stored")
 
 
 def read_json(path: Path) -> Any:
-    """Return the contents of a JSON file.
+    """Return the contents of a JSON file, as Python values.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -26,7 +26,7 @@ def read_json(path: Path) -> Any:
 
 
 def restore(cls: type[Stored], values: Any) -> Stored:
-    """Make a dataclass or named tuple from its fields.
+    """Make a dataclass or named tuple from a dictionary of its fields, with a check of their types.
 
     Raises:
         ValueError: if a field is missing, unknown, or not of its declared type.
@@ -47,7 +47,7 @@ def restore(cls: type[Stored], values: Any) -> Stored:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Return whether a value from JSON has a declared type; a whole number is a float, too."""
+    """Return whether a value read from JSON has the type of a hint; an integer also counts as a float."""
     origin, of = get_origin(hint), get_args(hint)
     if hint is Any:
         return True

@@ -1,4 +1,4 @@
-"""Small datasets as JSON: curves and tracks, for users without NetCDF or Python."""
+"""Conversion of small datasets, such as curves and tracks, to JSON and back."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +13,7 @@ PARTS = ("coords", "variables", "attrs")
 
 
 def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwise: int) -> dict[str, Any]:
-    """Return a dataset of numbers and strings as JSON values, null for NaN.
+    """Return a dataset of numbers and strings as a dictionary of JSON values; NaN becomes null.
 
     Args:
         dataset: values that are no numbers become strings.
@@ -42,7 +42,7 @@ def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwis
 
 
 def dataset_from_json(stored: Any) -> xarray.Dataset:
-    """Return the dataset from the JSON values of :func:`dataset_as_json`.
+    """Return the dataset stored in the JSON values of :func:`dataset_as_json`.
 
     Raises:
         ValueError: if it is no dataset: its parts do not fit together, or contain other types than numbers and strings.
@@ -80,7 +80,7 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
 
 
 def _array(values: Any, kind: Any) -> numpy.ndarray:
-    """Return numbers as an array; NaN for None.
+    """Return a list of numbers as an array; None becomes NaN.
 
     Raises:
         ValueError: if one is too large.
