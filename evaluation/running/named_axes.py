@@ -1,4 +1,4 @@
-"""The stored values of episodes as a dataset, whose axes have names and units."""
+"""Assembly of the values of all episodes to a dataset with named axes and units."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
-"""Names of the observation blocks with the last action."""
+"""Names of the observation blocks that contain the last action."""
 
 
 OF_COMPONENTS = "that of the component (coordinate unit)"
@@ -39,12 +39,12 @@ MEANINGS = {
     "lost": ("1", "number of the reason why the episode is lost, 0 where it is not"),
     "causes": ("1", "bit field of the causes that hold, in the order of the coordinate cause"),
 }
-"""Unit and meaning of variables; the environment's page gives the units of its own variables."""
+"""Unit and meaning of the dataset's variables; the environment's page lists the units of its own variables."""
 MEASURED = ("that of the environment's table of measurements", "as the sensors report it, not normalised")
 
 
 def _attributes(key: str, cost: str) -> dict[str, str]:
-    """Return the unit of a variable, and whether it is normalised; empty for variables of the environment."""
+    """Return the attributes ``units`` and ``long_name`` of a dataset variable; empty if they are not known here."""
     name = key.removeprefix(DRAWN_PREFIX)
     if name == "cost":
         return {"units": "1", "long_name": f"{cost}, normalised as stated"}
@@ -55,7 +55,7 @@ def _attributes(key: str, cost: str) -> dict[str, str]:
 def recording_coords(
     recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
 ) -> dict[str, Any]:
-    """Return the coordinates of a recording's evaluation that refer to its log.
+    """Return the coordinates that relate the evaluation of a recording to its log.
 
     Args:
         recording: the replayed recording.
@@ -77,7 +77,10 @@ def recording_coords(
 
 
 def _further_dimensions(key: str, count: int) -> list[str]:
-    """Return the names of a variable's dimensions after policy, episode and time: the first and ``count`` more."""
+    """Return the names of a variable's dimensions after policy, episode and time.
+
+    Their number is ``count`` plus one; below zero there are none.
+    """
     if count < 0:
         return []
     key = key.removeprefix(DRAWN_PREFIX)
@@ -106,7 +109,7 @@ def action_names(model: Model) -> tuple[str, ...]:
 
 
 class StackedArrays:
-    """Arrays of all competitors and episodes, filled in place piece by piece.
+    """Arrays of the values of all competitors and episodes, filled in place piece by piece.
 
     Args:
         models: model of every competitor.
@@ -134,7 +137,7 @@ class StackedArrays:
         self._written: list[tuple[int, slice, set[str]]] = []
 
     def write(self, name: str, part: slice, kept: dict[str, numpy.ndarray]) -> None:
-        """Write the values of some episodes, ``(episodes, time, ...)`` by name, and empty the mapping."""
+        """Write a competitor's values in some episodes, ``(episodes, time, ...)`` by name; empty the mapping."""
         place = self._places[name]
         self._written.append((place, part, set(kept)))
         while kept:
@@ -168,7 +171,7 @@ def with_named_axes(
     windows: Mapping[str, tuple[int, int]],
     seeds: Sequence[int],
 ) -> "xarray.Dataset":
-    """Return the values of competitors as a dataset.
+    """Return the dataset of the values of all competitors, with coordinates and units.
 
     Args:
         kept: the values.

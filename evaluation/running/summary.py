@@ -1,4 +1,4 @@
-"""Summaries of evaluations: statistics for records, curves and tracks, small enough to send and to store.
+"""Summaries of evaluations: the statistics of records and curves, small enough to send and to store.
 
 A summary contains one competitor. Its episodes are run in chunks, each reduced before the next begins, and the results
 are added in their order; so its bits depend only on the request.
@@ -44,18 +44,19 @@ from .threads import one_thread
 from .times import COORDINATES, with_times
 
 TOGETHER = 4 * BLOCK
-"""Episodes of a piece of work: enough that its result is small compared with its computation."""
+"""Number of episodes in a piece of work: its result is small compared with its computation."""
 DRAWN_TIMES = 20_000
-"""Maximal number of measurements of an episode in pictures."""
+"""Maximal number of measurements of an episode in a picture."""
 MOST_RECORDINGS = 40
 """Maximal number of episodes of a recording that are reported separately."""
 BATCH = 600_000
-"""Measurements that are sent to another process in one batch, where several pieces of work share a model: about a
-second. A longer batch would leave other processes idle at the end, and lose more in an interruption."""
+"""Number of measurements in a batch of pieces of work with a common model: about a second. A longer batch would leave
+processes idle at the end, and lose more in an interruption.
+"""
 
 
 class EvaluationRequest(NamedTuple):
-    """One competitor of an experiment."""
+    """Request to evaluate one competitor in an experiment, or in some of its episodes."""
 
     experiment: Experiment
     name: str
@@ -63,39 +64,39 @@ class EvaluationRequest(NamedTuple):
     metrics: OwnMetrics | None = None
     """Metrics of the environment."""
     horizon: int = 1
-    """Measurements of an episode, for the progress."""
+    """Number of measurements of an episode, for the progress."""
     first: int = 0
-    """Episode with which a piece of the work begins."""
+    """Number of the first episode."""
     last: int | None = None
-    """Episode before which it ends; None: the end."""
+    """Number after the last episode; None: the end of the experiment."""
     curves: bool = True
-    """Whether to compute curves, too, for figures; they take as long as the records."""
+    """Whether to compute curves for figures, too; they take as long as the records."""
     identity: str | None = None
     """Identity of the competitor, see :class:`..competitors.kinds.Competitor`; with None its summary is not stored."""
 
     @property
     def episodes(self) -> int:
-        """Number of episodes of the experiment."""
+        """Number of episodes of the whole experiment."""
         return self.experiment.episodes
 
     @property
     def end(self) -> int:
-        """Episode before which it ends."""
+        """Number after the last requested episode."""
         return self.episodes if self.last is None else self.last
 
     @property
     def measurements(self) -> int:
-        """Number of measurements."""
+        """Number of measurements in the requested episodes."""
         return (self.end - self.first) * self.horizon
 
     def work(self) -> Work | None:
-        """Return the piece of work of the summary, for a store; None where it is not stored."""
+        """Return the identity of the summary in a store; None if it is not stored."""
         if self.identity is None:
             return None
         return Work(f"{stem_of(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
 
     def pieces(self) -> list["EvaluationRequest"]:
-        """Split the request into pieces of work: one, unless there are many episodes."""
+        """Return the request split into requests of fewer episodes; unchanged if it has few."""
         if self.episodes <= TOGETHER:
             return [self]
         begins = range(0, self.episodes, TOGETHER)
@@ -103,7 +104,7 @@ class EvaluationRequest(NamedTuple):
 
 
 def stem_of(experiment: Experiment) -> str:
-    """Return the beginning of the name of a file about an experiment."""
+    """Return the first part of the name of files about an experiment, with environment, scenario and seed."""
     environment, scenario = short_name(experiment.task.id), experiment.scenario or "default"
     return f"{environment}.{scenario}.{experiment.episodes}.{experiment.split}{experiment.seed}"
 
@@ -112,17 +113,18 @@ class Evaluation(NamedTuple):
     """Results of an evaluation."""
 
     dataset: xarray.Dataset
-    """Values of every episode (:func:`.evaluate.run_experiment`); or, for summaries, coordinates and attributes with
-    the values of the first episodes, over policy, drawn_episode and time."""
+    """Values of every episode (:func:`.evaluate.run_experiment`); for summaries only coordinates, attributes and
+    values of the first episodes, over policy, drawn_episode and time.
+    """
     records: list[Record]
     curves: xarray.Dataset | None
-    """See :func:`.curves.curves_of`; None where they were not requested of every competitor."""
+    """Curves (:func:`.curves.curves_of`); None unless they were requested of every competitor."""
     costs: Mapping[str, numpy.ndarray]
     """Mean cost of every episode by name, ``(episodes,)``, of all competitors with a known cost."""
     flights: Sequence[Record] = ()
     """Records of every flight, where they are reported separately."""
     differences: Mapping[str, IntervalEstimate] = {}
-    """For a recording, the log-likelihood per measurement less that of the best, by name."""
+    """For a recording, each competitor's mean log-likelihood of a measurement minus that of the best, by name."""
 
     @property
     def has_truth(self) -> bool:
@@ -136,28 +138,28 @@ class Evaluation(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """One competitor of an evaluation."""
+    """Statistics and curves of one competitor of an evaluation."""
 
     contender: Contender
     curves: CompetitorCurves | None
     """Curves; None where they were not requested."""
     head: xarray.Dataset
-    """Its part of the evaluation, without the values of every episode."""
+    """The competitor's part of the evaluation, without the values of every episode."""
     episodes: int
 
 
 class Part(NamedTuple):
-    """Some episodes of one competitor."""
+    """Contributions of some episodes of one competitor to its summary."""
 
     reduction: Reduction
     head: xarray.Dataset
 
     def merge(self, later: "Part") -> "Part":
-        """Add the episodes that come next."""
+        """Return the sum of these contributions and those of the next episodes."""
         return self._replace(reduction=self.reduction.merge(later.reduction))
 
     def summary(self, request: EvaluationRequest) -> Summary:
-        """Return the summary of all episodes of the request."""
+        """Return the summary of the competitor, when the contributions of all episodes are merged."""
         results, bootstrap = self.reduction.results(), resampling(request.episodes)
         contender = contender_of(results, self.head, bootstrap, request.metrics)
         curves = competitor_curves(results) if request.curves else None
@@ -165,7 +167,7 @@ class Part(NamedTuple):
 
 
 def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
-    """Run a request and reduce it to a summary; for a piece of the episodes only, return their contribution.
+    """Run a request; return its summary, or the contribution to it if the request has only some of the episodes.
 
     Raises:
         ValueError: as :func:`reduce_episodes`.
@@ -185,7 +187,7 @@ def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
 def reduce_episodes(
     request: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
-    """Run a request and reduce it to statistics, a block of episodes at a time.
+    """Run a request block by block of episodes; return the contributions to declared statistics.
 
     Args:
         request: request of one competitor over episodes.
@@ -226,7 +228,7 @@ def summaries(
     progress: Progress | None = None,
     store: Store | None = None,
 ) -> Iterator[tuple[int, Summary]]:
-    """Summarise competitors, of any environments.
+    """Run requests for competitors, of any environments; yield number and summary of each when it is finished.
 
     Args:
         requests: the requests, started in this order.
@@ -283,7 +285,7 @@ def summaries(
 
 
 def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:
-    """Group pieces of work that share a model, so that one process traces it once.
+    """Return the pieces of work as lists of pieces that share a model, so that one process traces it once.
 
     A batch takes the place of its first piece, and contains at most ``BATCH`` measurements, or one piece.
     """
@@ -302,7 +304,7 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 @one_thread()
 def combine_summaries(found: Sequence[Summary]) -> Evaluation:
-    """Combine the summaries of all competitors to their evaluation."""
+    """Return the evaluation of all competitors, from their summaries."""
     evaluation = _heads_together(
         [one.head for one in found], [one.contender.losses for one in found], found[0].episodes
     )
@@ -319,7 +321,7 @@ def combine_summaries(found: Sequence[Summary]) -> Evaluation:
 def _actions_by_control(
     curves: Sequence[CompetitorCurves], controls: Sequence[str]
 ) -> list[CompetitorCurves]:
-    """Add the control to the names of actions where competitors use several controls."""
+    """Return the curves with the control added to the names of actions, if competitors use several controls."""
     if len({control for control, own in zip(controls, curves, strict=True) if own.actions}) < 2:
         return list(curves)
     return [
@@ -329,7 +331,10 @@ def _actions_by_control(
 
 
 class SeparateResults(NamedTuple):
-    """Data of one competitor over flights, a recording or one episode, which are resampled with those of the others."""
+    """Results of one competitor over flights, a recording or one episode, before those of the others are known.
+
+    All competitors are resampled together.
+    """
 
     reduced: Reduced
     flights: list[Reduced]
@@ -339,11 +344,13 @@ class SeparateResults(NamedTuple):
     losses: Losses | None
     curves: CompetitorCurves | None
     head: xarray.Dataset
-    """Its part of the evaluation, without the values of every episode, at ``DRAWN_TIMES`` measurements at most."""
+    """The competitor's part of the evaluation at no more than ``DRAWN_TIMES`` measurements, without the values of
+    every episode.
+    """
 
 
 def reduce_alone(run: xarray.Dataset, request: EvaluationRequest) -> SeparateResults:
-    """Reduce one competitor's part of an evaluation."""
+    """Return the results of one competitor, from its part of an evaluation over flights, a recording or one episode."""
     episodes, times = run.sizes["episode"], run.sizes["time"]
     flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
     if not run.attrs["truth"] or (recorded and episodes > MOST_RECORDINGS):
@@ -411,7 +418,7 @@ def run_requests(
     store: Store | None = None,
     whole: bool = False,
 ) -> Evaluation:
-    """Evaluate the competitors of one experiment.
+    """Evaluate the competitors of one experiment; return records, curves and costs.
 
     Args:
         requests: one request for each competitor.
