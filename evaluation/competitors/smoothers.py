@@ -1,4 +1,4 @@
-"""Smoothers in the loop: a forward run as an estimator, then the smoothed estimates."""
+"""Evaluation of smoothers: a forward run as an estimator, then the smoothed estimates."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -20,12 +20,12 @@ from .filters import AdaptedState, Checked, find_fault, is_lacking
 
 
 class SmoothedTrack(Filter[Task, Any, int]):
-    """An estimator whose estimates a smoother has computed before; its state counts the measurements.
+    """Filter that returns estimates that a smoother has computed before; its state is the number of measurements.
 
     Args:
         task: the estimation problem.
-        means: ``(C, K, N)``.
-        covariances: ``(C, C, K, N)``.
+        means: smoothed means at K measurements, ``(C, K, N)``.
+        covariances: smoothed covariances, ``(C, C, K, N)``.
     """
 
     in_python = True
@@ -36,31 +36,30 @@ class SmoothedTrack(Filter[Task, Any, int]):
         self.covariances = covariances
         count = means.shape[-1]
         self.lanes: numpy.ndarray = numpy.minimum(numpy.arange(round_up_lanes(count)), count - 1)
-        """Index of the episode of each lane; lanes beyond repeat the last one."""
+        """Index of the episode of each lane; further lanes repeat the last episode."""
 
     def start(self, initial: Any) -> int:
-        """Return the state before the first measurement."""
+        """Return the number of measurements, zero."""
         return 0
 
     def update(self, state: int, given: FilterInput) -> int:
-        """Count the measurement."""
+        """Return the number of measurements, one more."""
         return state + 1
 
     def mean(self, state: int) -> Array:
-        """Return the estimate at the last measurement."""
+        """Return the smoothed mean at the last measurement, ``(C, N)``."""
         return self.means[:, state - 1, self.lanes]
 
     def covariance(self, state: int) -> Array:
-        """Return the estimate at the last measurement."""
+        """Return the smoothed covariance at the last measurement, ``(C, C, N)``."""
         return self.covariances[:, :, state - 1, self.lanes]
 
 
 def check_open_loop(model: Model, name: str) -> None:
-    """Raise ValueError if the loop is closed: estimates of a smoother or from a file cannot steer the next
-    measurements.
+    """Raise ValueError if the estimate affects later measurements, so that they cannot be known in advance.
 
     Args:
-        model: model in which the smoother or the estimates from a file are to run.
+        model: model in which a smoother or estimates from a file are to run.
         name: kind and name of the competitor.
     """
     if model.task.closes_loop:
@@ -71,13 +70,13 @@ def check_open_loop(model: Model, name: str) -> None:
 
 
 def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Run a smoother forward over episodes, then smooth them.
+    """Run a smoother forward over episodes; return the smoothed means and covariances.
 
     Args:
         looped: model with the smoother as its filter.
         lanes: episodes of the model, with their first measurement.
         length: number of measurements of each episode.
-        name: name of the smoother in errors.
+        name: name of the smoother, for error messages.
 
     Returns:
         Means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of K measurements.
@@ -113,12 +112,12 @@ def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], 
 
 
 def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
-    """Report the inputs of ``smooth``."""
+    """Return the measurement and the filter's memory, the inputs of ``smooth``."""
     return episode.measurement, episode.filter.own
 
 
 def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
-    """Return the measurements, masked as the smoother receives them, and the memories of a compiled smoother."""
+    """Return the measurements, with missing ones masked, and the memories of a compiled smoother."""
     start = map_nested(lambda values: values[None, ..., : lanes.count], lanes.state.filter.own)
     measured: list[Any] = []
     memories = [start]
@@ -132,11 +131,11 @@ def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scan
 
 
 def run_stretches(lanes: Lanes, report: Report, length: int) -> Iterator[Any]:
-    """Run episodes from their start, and yield reports on successive stretches of measurements, ``(scans, ..., N)``.
+    """Run episodes from their start; yield reports on successive stretches of measurements, ``(scans, ..., N)``.
 
     Args:
         lanes: compiled episodes, whose filter has no policy.
-        report: as of :meth:`.Lanes.run`.
+        report: function of model and episode that returns arrays ``(..., N)``, see :meth:`.Lanes.run`.
         length: number of measurements of each episode.
     """
     together = max(1, TOGETHER // lanes.width)
@@ -152,14 +151,14 @@ def _join(stretches: Sequence[Any]) -> Any:
 
 
 def report_world(model: Model, episode: Episode) -> tuple[Any, Any]:
-    """Report the quantities of the world, which do not depend on the estimate."""
+    """Return truth and measurement, which do not depend on the estimate."""
     return episode.truth, episode.measurement
 
 
 def report_smoothed(
     looped: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
 ) -> Iterator[dict[str, numpy.ndarray]]:
-    """Report on a smoothed track as on a filter's estimates, for many measurements together.
+    """Yield the same reports on smoothed estimates as on those of a filter, for stretches of measurements.
 
     Args:
         looped: model with the smoothed track as its filter.
@@ -176,22 +175,22 @@ def report_smoothed(
     for stretch in run_stretches(lanes, report_world, length):
         world = map_nested(lambda values: numpy.moveaxis(values, 0, -2), stretch)
         some = slice(first, first := first + len(leaves(stretch)[0]))
-        answers = track.means[:, some][..., track.lanes], track.covariances[:, :, some][..., track.lanes]
-        checked = _check_answers(looped.task, state, world[1], *answers)
+        estimates = track.means[:, some][..., track.lanes], track.covariances[:, :, some][..., track.lanes]
+        checked = _check_estimates(looped.task, state, world[1], *estimates)
         found = over_time(lambda episode: looped.run(report, episode), Episode(world[0], world[1], checked))
         yield map_nested(lambda values: numpy.moveaxis(values, -2, 0), found)
         state = map_nested(lambda values: values[..., -1, :], checked)
 
 
-def _check_answers(
+def _check_estimates(
     task: Task, before: Checked, measurement: Any, means: numpy.ndarray, covariances: numpy.ndarray
 ) -> Checked:
-    """Return the states of a :class:`.CheckedFilter` at measurements ``(..., scans, N)``, from estimates at them.
+    """Return the states of a :class:`.CheckedFilter` with these estimates, for many measurements at once.
 
     Args:
         task: the estimation problem.
         before: state before the first measurement.
-        measurement: all measurements.
+        measurement: all measurements, ``(..., scans, N)``.
         means: ``(C, scans, N)``; changed in place where an earlier estimate is repeated.
         covariances: ``(C, C, scans, N)``; changed in place in the same way.
     """
@@ -206,9 +205,9 @@ def _check_answers(
     for lane in numpy.flatnonzero((fault > 0.0).any(axis=0)):
         first = numpy.argmax(fault[:, lane] > 0.0)
         fault[first:, lane] = fault[first, lane]
-        for answers, start in ((means, before.mean), (covariances, before.covariance)):
-            last = answers[..., first - 1, lane] if first else start[..., lane]
-            answers[..., first:, lane] = last[..., None]
+        for estimates, start in ((means, before.mean), (covariances, before.covariance)):
+            last = estimates[..., first - 1, lane] if first else start[..., lane]
+            estimates[..., first:, lane] = last[..., None]
     own = AdaptedState(means, covariances, None, Likelihood.unknown(fault))
     return Checked(own, means, covariances, fault, missed)
 

@@ -143,6 +143,6 @@ def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
     if not running:
         raise SystemExit(code if code >= 0 else 128 - code)
     if is_late:
-        return running[1:], f"it has not answered within {limit:g} s, see --time-limit"
+        return running[1:], f"it has not responded within {limit:g} s, see --time-limit"
     ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
     return running[1:], f"it has ended the process {ending}"

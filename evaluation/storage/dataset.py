@@ -29,7 +29,7 @@ FAULTS = (
     "the covariance is not symmetric",
     "the estimate is not finite after a missed measurement (missing measurements are NaN: predict without it)",
     "the program ended",
-    "the program did not answer in time",
+    "the program did not respond in time",
     "the program wrote no valid estimate",
     "the file contains no more estimates of the track",
 )
