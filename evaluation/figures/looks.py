@@ -55,8 +55,8 @@ def choose_highlights(
 
     Args:
         curves: curves of an evaluation.
-        highlight: names to highlight; default: the user's own, the paper's algorithm, the reference, the bound, the best
-            learned and the best classical competitor, and then by cost.
+        highlight: names to highlight; default: the user's own, the paper's algorithm, the reference, the bound, the
+            best learned and the best classical competitor, and then by cost.
         learned: names of learned competitors.
         own: names of the user's competitors.
 
