@@ -221,7 +221,7 @@ def smooth_imm(
     :func:`.imm.combine` merges those of each scan.
 
     Args:
-        filtered: estimates after the update at each of K scans, ``(n, M, K, N)``, ``(n, n, M, K, N)`` and ``(M, K, N)``.
+        filtered: estimates after the update at K scans, ``(n, M, K, N)``, ``(n, n, M, K, N)`` and ``(M, K, N)``.
         arrival: motion to and measurement at the K - 1 later scans; or a function that returns those of a slice.
         transition: transition matrix of the modes, row = from, column = to, ``(M, M)``.
         lag: number of later scans that each estimate uses; default: all.
