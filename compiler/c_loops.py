@@ -75,7 +75,7 @@ class Loops:
         self._starts: dict[tuple[int, ...], str] = {}
 
     def loop(self, loop: Loop) -> list[str]:
-        """Return the C lines of a loop.
+        """Return the C lines of a loop, after a comment with the functions of its operations.
 
         A comment before the first line names the functions of its operations, unless the previous loop has the same.
         """
@@ -144,7 +144,7 @@ class Loops:
         ]
 
     def _entry(self, numbers: Sequence[int]) -> str:
-        """Return the C expression of a run's number, as a function of ``i``."""
+        """Return a C expression in ``i`` for the number of run ``i``."""
         if common_difference(numbers) is None:
             return f"{self._table(tuple(numbers))}[i]"
         least, text = self._term(numbers, "i")

@@ -210,7 +210,7 @@ class Call:
         return self.native
 
     def replace(self, place: int, array: numpy.ndarray) -> None:
-        """Replace an array by another one of the same shape."""
+        """Bind another array of the same shape as argument number ``place``."""
         self.arrays[place] = array
         self.table[1 + 2 * place : 3 + 2 * place] = address_of(array), _stride(array)
 

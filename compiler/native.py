@@ -90,7 +90,7 @@ class Setting(NamedTuple):
 
 
 def quick_setting(features: str, has_products: bool) -> Setting:
-    """Return the setting with the shortest compilation: no optimisation, loops, blocks of one register.
+    """Return the code generation setting with the shortest compilation: no optimisation, loops, small blocks.
 
     With products of matrices the blocks are those of the fastest code, as a product takes twice as long in half of a
     block.
@@ -119,7 +119,7 @@ which on a straight line saves none either, since its code exceeds them.
 
 
 def better_setting(quick: Setting, steps: int, in_loops: bool) -> Setting | None:
-    """Return the setting with the fastest code; None: the quick setting.
+    """Return the code generation setting with the fastest code; None if that is the quick one.
 
     Args:
         quick: the quick setting.

@@ -87,7 +87,7 @@ def unband(table: numpy.ndarray, rows: int, columns: int) -> numpy.ndarray:
 
 @contextmanager
 def without_collection() -> Iterator[None]:
-    """Disable garbage collection inside the context, with the lock.
+    """Disable garbage collection inside the context, and hold the compiler's lock.
 
     None of a hundred thousand new expressions is garbage, and repeated searches would take a third of the time.
     """
@@ -367,7 +367,7 @@ class Graph:
         return a if y == 1.0 else None
 
     def live(self, wanted: Iterable[int]) -> list[int]:
-        """Return all expressions on which the wanted ones depend, each after its arguments and as late as possible.
+        """Return the expressions needed to compute the wanted ones, in topological order, each as late as possible.
 
         A sum of products is thus complete before the next begins, and its terms need no storage.
         """

@@ -300,7 +300,7 @@ class CallSequence:
         ends = self._tables + 8 * numpy.array([len(table) for table in tables])
 
         def moved(entries: numpy.ndarray) -> tuple[numpy.ndarray, list[int]]:
-            """Return the same entries in these tables, and the numbers of their tables."""
+            """Return the addresses of the same entries in these tables, and the numbers of their tables."""
             owners = [int(numpy.flatnonzero((e >= self._tables) & (e < ends))[0]) for e in entries]
             return addresses[owners] + entries - self._tables[owners], owners
 

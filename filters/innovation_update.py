@@ -37,7 +37,7 @@ class Received(NamedTuple):
 
 
 def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Received:
-    """Return the measurement model with the entries that were not received made independent of the state.
+    """Return the measurement model without the entries that were not received: zero innovation and H, unit noise.
 
     Args:
         innovation: innovation, ``(m, N)``, finite.
@@ -86,7 +86,7 @@ def update_with_gain(mean: Array, covariance: Array, received: Received, K: Arra
 
 
 def _of_missing(available: Array) -> Array:
-    """Return the log-density of the placeholders of entries that were not received, with opposite sign, ``(N,)``."""
+    """Return the correction of a log-density that removes the entries that were not received, ``(N,)``."""
     return 0.5 * math.log(2.0 * math.pi) * ordered_sum(1.0 - available)
 
 

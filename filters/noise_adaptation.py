@@ -72,7 +72,7 @@ def sage_husa(
     least: Array | float,
     available: Array | float = 1.0,
 ) -> Level:
-    """Return the variance of a measurement's noise by Sage and Husa, equation (1), limited from below.
+    """Return the updated estimate of a measurement's noise variance by Sage and Husa, (1), limited from below.
 
     Args:
         level: variance before.
@@ -117,7 +117,7 @@ def mehra(
     least: Array | float,
     available: Array | float = 1.0,
 ) -> tuple[Array, Array]:
-    """Return the variance of a measurement's noise by Mehra, equation (5), limited from below, and the window.
+    """Return the updated estimate of a measurement's noise variance by Mehra, (5), limited from below, and the window.
 
     Args:
         window: the last samples, the oldest first, ``(W, ...)``.

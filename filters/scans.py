@@ -73,7 +73,7 @@ def take_scans(part: Any, scans: slice) -> Any:
 
 
 def over_time(function: Step, *parts: Any) -> Any:
-    """Return the results of a function at all scans, from one call with the scans as parts of the batch.
+    """Return the results of a function at all scans of a track, from one call with the scans in the batch axis.
 
     Args:
         function: function of nested arrays ``(..., N)`` that treats each episode separately.

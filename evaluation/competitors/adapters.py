@@ -20,7 +20,7 @@ Array = Any
 
 
 def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
-    """Return entries of the last axis of nested tuples and dictionaries of arrays, as new arrays.
+    """Return selected entries of the last axis (lanes) of the arrays in nested tuples and dictionaries, as copies.
 
     An integer selects one entry and removes the axis.
     """
@@ -102,7 +102,7 @@ class SingleTrackEstimator(ABC):
 
     @abstractmethod
     def begin(self, initial: Any) -> Any:
-        """Return a new track object, such as a filter, at the initial estimate.
+        """Return an object for a new track, such as a filter, set to the initial estimate.
 
         Args:
             initial: initial estimate of the track, without the axis of episodes; ``mean`` ``(n,)`` and ``covariance``

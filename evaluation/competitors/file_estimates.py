@@ -177,7 +177,7 @@ def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], toler
 
 
 class FileState(NamedTuple):
-    """Position of each episode in the file of estimates."""
+    """State of a :class:`FileTrack`: the present row of the file for each episode."""
 
     measurements: int
     """Number of measurements so far."""
@@ -232,7 +232,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         return FileState(0, none, numpy.full(width, -1), none, none, initial)
 
     def update(self, state: FileState, given: FilterInput) -> FileState:
-        """Return the state at the measurement: for each episode the newest row that is not later."""
+        """Return the state with each episode's newest row that is not later than the measurement."""
         width = given.measurement[0].shape[-1]
         lane = numpy.minimum(numpy.arange(width), len(self.names) - 1)
         seconds = self._times(state, given.measurement)

@@ -83,7 +83,7 @@ class Adapter(Filter[Task, Any, AdaptedState]):
 
     @property
     def fault(self) -> int:
-        """Number among ``FAULTS`` of the reason why a program returned no estimate; 0: it returned one."""
+        """Number among ``FAULTS`` of the reason why the program returned no estimate; 0 without a fault."""
         return getattr(self.own, "fault", 0)
 
     def call_update(self, given: FilterInput, memory: Any) -> Any:
@@ -167,7 +167,7 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
 
     @property
     def fault(self) -> int:
-        """Number among ``FAULTS`` of the reason why a program returned no estimate; 0: it returned one."""
+        """Number among ``FAULTS`` of the reason why the program returned no estimate; 0 without a fault."""
         return self.own.fault if isinstance(self.own, Adapter) else 0
 
     def _repeat_last(self, given: FilterInput) -> FilterInput:
@@ -179,14 +179,14 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         return given._replace(measurement=select_lanes(given.measurement, lanes))
 
     def initialise(self, given: FilterInput) -> AdaptedState:
-        """Start the wrapped filter with the initial estimate and store its state."""
+        """Start the wrapped filter with the initial estimate; return a state without its memory, stored here."""
         with explain_errors(f"{self.name} failed at the start of the track"):
             self.memory = self.own.initialise(self._repeat_last(given))
         initial = given.measurement
         return AdaptedState(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
 
     def start(self, initial: Any) -> AdaptedState:
-        """Start the wrapped filter with the initial estimate, without the truth."""
+        """Start the wrapped filter with the initial estimate, without the truth; return the state."""
         return self.initialise(FilterInput(initial))
 
     def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
@@ -275,13 +275,13 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         self.stated: Stated | None = own.stated
 
     def start(self, initial: Any) -> Checked:
-        """Start the filter with the initial estimate."""
+        """Return the state of the filter, started with the initial estimate."""
         zero = 0.0 * initial.mean[0]
         missing = None if self.stated is None else zero
         return Checked(self.own.start(initial), initial.mean, initial.covariance, zero, zero, missing)
 
     def predict(self, state: Checked, measurement: Any) -> Checked:
-        """Predict the filter to the time of the measurement."""
+        """Return the state with the filter predicted to the time of the measurement."""
         return state._replace(own=self.own.predict(state.own, self.task.world.mask_missing(measurement)))
 
     def update(self, state: Checked, given: FilterInput) -> Checked:
@@ -385,7 +385,7 @@ class AroundBank(Filter[Task, Any, State]):
     bank: Any
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Predict the bank to the time of the measurement."""
+        """Return the state with the bank predicted to the time of the measurement."""
         return state._replace(bank=self.bank.predict(state.bank, measurement))
 
     def mean(self, state: Any) -> Array:
@@ -427,11 +427,11 @@ class BoundFilter(AroundBank[LimitState]):
         self.knows: str = own.knows or "the truth"
 
     def initialise(self, given: FilterInput) -> LimitState:
-        """Start the bank, and the bound with the truth."""
+        """Return the state at the start of bank and bound; the bound receives the truth."""
         return LimitState(self.bank.start(given.measurement), self.own.initialise(given))
 
     def start(self, initial: Any) -> LimitState:
-        """Start the bank and the bound, without the truth."""
+        """Return the state at the start of bank and bound, without the truth."""
         return self.initialise(FilterInput(initial))
 
     def update(self, state: LimitState, given: FilterInput) -> LimitState:
@@ -448,7 +448,7 @@ class BoundFilter(AroundBank[LimitState]):
 
 
 def wrap_for_loop(kind: Kind, model: Model, own: Filter[Any, Any, Any]) -> Filter[Any, Any, Any]:
-    """Return the filter for the loop: an estimator with checks, a bound with a bank, a reference unchanged."""
+    """Return an estimator's filter with checks, a bound's with a bank that closes the loop, a reference's unchanged."""
     if kind == "bound":
         return BoundFilter(model.task, own, model.filter)
     return CheckedFilter(model.task, own) if kind in TRUTH_FREE_KINDS else own
@@ -465,7 +465,7 @@ class _Maker:
     """Components that a competitor in Python reports."""
 
     def __call__(self, model: Model) -> Filter[Any, Any, Any]:
-        """Return the filter for a model on any arrays."""
+        """Return the competitor's filter for a model on arrays of any kind."""
         task = model.task
         own = (
             PythonFilter(task, stated=self.stated)
@@ -486,7 +486,7 @@ def _can_be_traced(maker: Any, own: Filter[Any, Any, Any]) -> bool:
 
 
 def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
-    """Raise ValueError unless a reference or a bound declares every disturbance of the world.
+    """Raise ValueError unless a reference or bound lists every disturbance of the world in ``disturbances``.
 
     Args:
         name: its name, for error messages.
@@ -509,7 +509,7 @@ def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
 def close_loop(
     model: Model, competitor: Any, kind: Kind, name: str, count: int, last: int | None = None
 ) -> Model:
-    """Return a model whose filter is a competitor instead of the bank.
+    """Return a model whose filter is a competitor: an estimator, smoother, reference or bound.
 
     Args:
         model: task with a bank.

@@ -122,7 +122,7 @@ def leave_to_child(libc: Any, apart: bool) -> None:
 
 
 def limit_own(name: str, most: int) -> None:
-    """Set the limit of a resource of this process, unless a lower limit is in force."""
+    """Set the limit of a resource of this process, unless it is lower already."""
     import resource
 
     kind = getattr(resource, name)
@@ -185,7 +185,7 @@ def restrict_files(libc: Any, version: int, readable: list[str], listable: list[
 
 
 def filter_calls(libc: Any) -> bool:
-    """Restrict this process to the system calls of the table; return whether the system supports it."""
+    """Permit this process only the system calls of the table (seccomp); return whether the system supports it."""
     import struct
 
     column, machine = MACHINES.get(os.uname().machine, (0, 0))

@@ -90,7 +90,7 @@ def _has(found: Any, *methods: str) -> bool:
 
 
 def make_competitor(maker: Any, problem: Task | Model) -> Any:
-    """Return a competitor, made by its maker for a problem; an object that is no maker is returned unchanged.
+    """Return the competitor that a maker makes for a problem; an object that is no maker is returned unchanged.
 
     Args:
         maker: a class or function that takes the problem, or nothing; or the competitor itself. One whose first

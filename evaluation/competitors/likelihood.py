@@ -145,7 +145,7 @@ def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[
 
 
 def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
-    """Return values with the last measurement repeated up to a length; repetitions never count."""
+    """Return values padded to a length with the last measurement; padding never counts in the likelihood."""
     missing = length - len(values)
     return values if missing == 0 else numpy.concatenate([values, numpy.repeat(values[-1:], missing, axis=0)])
 
@@ -213,7 +213,7 @@ class WindowLikelihood:
             raise ValueError("the recording has no measurement that counts")
 
     def on(self, windows: Windows) -> "WindowLikelihood":
-        """Return the same function on other windows, without tracing and compiling it again; errors as of the class."""
+        """Return the same likelihood function for other windows, without compiling it again."""
         other = copy.copy(self)
         other._take(windows)
         return other

@@ -163,7 +163,7 @@ class OnlineFilter:
         return OnlineState(state, memory, policy, numpy.ones(self.tracks, dtype=bool))
 
     def start_from(self, first: dict[str, Any], second: dict[str, Any]) -> None:
-        """Start the track with an estimate from its first two measurements, as for a log.
+        """Start the track with an estimate from its first two measurements.
 
         Args:
             first: ``time`` and values of the sensors of the first measurement, as in :meth:`update`.
@@ -422,7 +422,9 @@ class OnlineFilter:
             ) from None
 
     def _try(self, state: OnlineState) -> None:
-        """Update with an example measurement from a state, to check it; raise any error.
+        """Check a state by an update with an example measurement; any error is raised.
+
+        A filter in Python, which may have hidden state, is skipped.
 
         A filter in Python, which may have hidden state, is skipped.
         """
@@ -457,7 +459,7 @@ class OnlineFilter:
             self.input.measure(memory, memory["time"] + self._default_interval(), {})
 
     def _resume(self, state: OnlineState) -> None:
-        """Set the filter to a snapshot, which does not change."""
+        """Set the filter to a state from ``_snapshot``, which is not changed."""
         state = copy.deepcopy(state) if self._is_in_python else state
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step_number = state.python
@@ -611,7 +613,7 @@ def _shapes(part: Any) -> list[tuple[int, ...]]:
 
 
 def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return the estimate of a model's filter by name, with its statistics of the measurement."""
+    """Return mean, covariance and statistics of the measurement of a model's filter, by name."""
     records = model.filter.records(episode.filter, episode.measurement)
     mean, covariance = model.filter.mean(episode.filter), model.filter.covariance(episode.filter)
     known = {name: records[name] for name in REPORTED if name in records}

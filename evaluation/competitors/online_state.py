@@ -20,7 +20,7 @@ class Watch(Protocol):
     """
 
     def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
-        """Update the memory with inputs ``(N, fields)``; ``start`` marks the tracks that have just begun."""
+        """Add inputs ``(N, fields)`` to the memory; ``start`` marks the tracks that have just begun."""
         ...
 
     def describe(self) -> list[str]:

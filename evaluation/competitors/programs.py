@@ -70,7 +70,7 @@ def limit_programs(seconds: float, memory: float) -> Iterator[None]:
 
 
 def search_path() -> str:
-    """Return the search path for programs, as text, with the folder of the virtual environment first.
+    """Return the value of PATH for programs, with the folder of the virtual environment first.
 
     So ``python`` is the interpreter that has the package, whether the environment is activated or not.
     """
@@ -219,7 +219,9 @@ class ProgramEstimator:
         self._fields: list[ArrayField] = []
 
     def start(self, initial: Any, N: int) -> int:
-        """Start the program; return the number of measurements, zero.
+        """Start the program; return the memory, which is the number of measurements so far.
+
+        The hello is sent with the first measurement, since it describes its fields.
 
         The hello is sent with the first measurement, since it describes its fields.
 
@@ -244,7 +246,7 @@ class ProgramEstimator:
         return 0
 
     def update(self, memory: int, measurement: Any) -> tuple[Array, Array, int]:
-        """Send a measurement to the program; return its means, covariances and the number of measurements.
+        """Send a measurement to the program; return its means, covariances and the memory.
 
         Raises:
             ValueError: if the program takes no part, or for an earlier memory, since a process cannot go back.
@@ -385,7 +387,7 @@ class ProgramEstimator:
 
 
 def _count(fields: Sequence[ArrayField]) -> int:
-    """Return how many numbers one track has in these fields."""
+    """Return the total number of entries of these fields for one track."""
     return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 
 

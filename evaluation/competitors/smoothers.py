@@ -39,11 +39,11 @@ class SmoothedTrack(Filter[Task, Any, int]):
         """Index of the episode of each lane; further lanes repeat the last episode."""
 
     def start(self, initial: Any) -> int:
-        """Return the number of measurements, zero."""
+        """Return the state before the first measurement: zero measurements."""
         return 0
 
     def update(self, state: int, given: FilterInput) -> int:
-        """Return the number of measurements, one more."""
+        """Return the state after one more measurement."""
         return state + 1
 
     def mean(self, state: int) -> Array:
@@ -56,7 +56,7 @@ class SmoothedTrack(Filter[Task, Any, int]):
 
 
 def check_open_loop(model: Model, name: str) -> None:
-    """Raise ValueError if the estimate affects later measurements, so that they cannot be known in advance.
+    """Raise ValueError if a model's estimates affect its later measurements (closed loop).
 
     Args:
         model: model in which a smoother or estimates from a file are to run.
@@ -151,14 +151,14 @@ def _join(stretches: Sequence[Any]) -> Any:
 
 
 def report_world(model: Model, episode: Episode) -> tuple[Any, Any]:
-    """Return truth and measurement, which do not depend on the estimate."""
+    """Return truth and measurement of an episode, which do not depend on the estimate."""
     return episode.truth, episode.measurement
 
 
 def report_smoothed(
     looped: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
 ) -> Iterator[dict[str, numpy.ndarray]]:
-    """Yield the same reports on smoothed estimates as on those of a filter, for stretches of measurements.
+    """Yield the reports that a filter with the smoothed estimates would give, for stretches of measurements.
 
     Args:
         looped: model with the smoothed track as its filter.

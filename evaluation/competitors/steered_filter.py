@@ -66,7 +66,7 @@ class Decider:
         self.means: DecisionMeans = DecisionMeans(model.fields, self.interval)
 
     def start(self, zero: Array) -> Decisions:
-        """Return the state before the first decision, with all numbers zero.
+        """Return the policy's state before the first decision; ``zero`` is an array ``(N,)`` of zeros.
 
         ``zero`` is an array ``(N,)`` of zeros.
         """
@@ -187,7 +187,7 @@ def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Dec
 
 
 def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
-    """Return the bank of a model and a policy as one filter; arguments as of :func:`decider_of`.
+    """Return a filter that combines the bank of a model with a policy; arguments as of :func:`decider_of`.
 
     Raises:
         NotTraceable: on traced arrays, where the policy's arithmetic cannot be traced.
@@ -196,7 +196,7 @@ def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredF
 
 
 def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = None) -> Specialised:
-    """Return a policy traced to a function of the observation, lane by lane, and of :class:`Decisions`.
+    """Return a policy as a traced function of an observation and :class:`Decisions`, ready for compilation.
 
     The function returns an action and the next :class:`Decisions`, which are zero before the first decision.
 
@@ -218,7 +218,9 @@ def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = No
 
 
 def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Policy], Any]) -> Any:
-    """Return a policy in traced form, or None where it runs in Python.
+    """Return a policy as a traced function, or None if it must run in Python.
+
+    Warn if a policy that is declared traceable cannot be traced.
 
     Warn if a policy that is declared traceable cannot be traced.
 

@@ -300,12 +300,12 @@ class CompiledUpdate:
 
     @property
     def state(self) -> Any:
-        """State of the filter, in new arrays."""
+        """Copy of the filter's state."""
         return copy_arrays(self._template, self._states[self._now], self._kinds)
 
     @property
     def policy_state(self) -> Any:
-        """Memory of the traced policy, in new arrays."""
+        """Copy of the traced policy's memory."""
         return map_arrays(lambda i: self._policies[self._now > 0][i].copy(), self._policy_template)
 
     def resume(self, state: Any, policy: Any) -> None:
@@ -340,12 +340,12 @@ class ModelUpdate:
 
     @property
     def observation(self) -> numpy.ndarray:
-        """Observation of a policy, ``(width, fields)``."""
+        """Observation for a policy, ``(width, fields)``."""
         return numpy.asarray(self._model.observe(self._episode)).T
 
     @property
     def observed(self) -> numpy.ndarray:
-        """Values of ``observe``, ``(width, fields)``."""
+        """Values of the function ``observe``, ``(width, fields)``."""
         return numpy.asarray(self._model.run(self._observe, self._episode)).T
 
     def act(self, action: numpy.ndarray) -> None:

@@ -30,7 +30,7 @@ def styles(names: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def by_cost(curves: xarray.Dataset) -> list[str]:
-    """Return a list of the names of the ranked competitors, ordered by mean cost.
+    """Return a list of the names of the ranked competitors, ordered by mean cost, the lowest first.
 
     Without costs the order is by the mean RMSE of the first quantity, and without truth that of the evaluation.
     """
@@ -96,7 +96,7 @@ def choose_highlights(
 
 
 def _same(one: numpy.ndarray, other: numpy.ndarray) -> bool:
-    """Return whether two lines are equal to 1e-6, with NaN at the same places."""
+    """Return whether two lines agree within a relative 1e-6, with NaN in the same places; False if all are NaN."""
     missing = numpy.isnan(one).all() and numpy.isnan(other).all()
     return not missing and bool(numpy.allclose(one, other, rtol=1e-6, atol=0.0, equal_nan=True))
 

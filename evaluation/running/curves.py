@@ -139,7 +139,7 @@ def select_quantities(dataset: xarray.Dataset) -> list[str]:
 def curve_statistics(
     run: xarray.Dataset, episodes: int, resamples: int = BAND_RESAMPLES
 ) -> Iterator[Statistic]:
-    """Yield the declarations of the statistics of a competitor's curves, for some of its episodes.
+    """Yield the statistics needed for a competitor's curves, as declarations (:class:`.Statistic`).
 
     Args:
         run: some episodes of one competitor.

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> str:
-    """Return the name of the control in which a competitor runs.
+    """Return the name of the control (the quantity that actions change) in which a competitor runs.
 
     It is the policy's own, or one whose spaces fit those of a learned model.
 
@@ -157,7 +157,7 @@ class Experiment:
         return make_task(self.task, self.scenario, **self.keywords)
 
     def make_model(self, maker: Any, control: str) -> Model:
-        """Return the model in which a competitor runs, with its control.
+        """Return the model (task, bank and control) in which a competitor runs.
 
         The experiment's keywords override those that the competitor was tuned with.
         """
@@ -246,7 +246,7 @@ def run_competitors(
 
 
 class Piece(NamedTuple):
-    """Some episodes of one competitor as a piece of work: plain data for any process."""
+    """Some episodes of one competitor as a unit of parallel work: plain data for any process."""
 
     experiment: Experiment
     name: str
@@ -262,7 +262,7 @@ class Piece(NamedTuple):
 
     @property
     def part(self) -> slice:
-        """Slice of the evaluation's episodes."""
+        """Slice of these episodes among all episodes of the evaluation."""
         return slice(self.first, self.first + len(self.seeds))
 
 
@@ -340,7 +340,7 @@ class Plan(NamedTuple):
     lengths: numpy.ndarray | None
 
     def piece(self, name: str, first: int, count: int, here: bool) -> Piece:
-        """Return some episodes of a competitor as a piece of work, with its model if it runs in this process."""
+        """Return some episodes of a competitor as a unit of parallel work; ``here``: with its model."""
         model = self.models[name]
         return Piece(
             self.experiment,
@@ -360,7 +360,7 @@ class Plan(NamedTuple):
             return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
     def arrays(self, episodes: int, drawn: int) -> StackedArrays:
-        """Return empty arrays for the values of all competitors in a number of episodes."""
+        """Return preallocated arrays for the values of all competitors in some episodes."""
         acting = [
             name
             for name, model in self.models.items()
@@ -405,7 +405,9 @@ class Plan(NamedTuple):
 def plan_of(
     experiment: Experiment, competitors: Mapping[str, Any], first: int = 0, end: int | None = None
 ) -> Plan:
-    """Return the plan of an evaluation, after checks of all arguments; errors as of :func:`run_experiment`.
+    """Check the arguments of an evaluation; return its episodes, models and kinds of competitors.
+
+    Errors as of :func:`run_experiment`.
 
     Args:
         experiment: the episodes and options.

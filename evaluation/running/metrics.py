@@ -107,19 +107,22 @@ def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES)
 def resampling(
     episodes: int, resamples: int = RESAMPLES, clusters: tuple[str, ...] | None = None
 ) -> Bootstrap:
-    """Return the bootstrap over a number of episodes, or over clusters of them; cached, since it can take seconds."""
+    """Return the bootstrap over a number of episodes, or over clusters of them, from a cache."""
     return Bootstrap(episodes, resamples, clusters=clusters)
 
 
 def units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
-    """Return the units of time for resampling one long episode; None for several episodes or a short one."""
+    """Return the division of one long episode into units of time; None for several episodes or a short one."""
     if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST:
         return TimeUnits(dataset.sizes["time"])
     return None
 
 
 def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | None:
-    """Return sums and numbers of terms of a competitor's cost in units of time, ``(units, 2)``.
+    """Return sums and numbers of one competitor's costs in units of time, ``(units, 2)``.
+
+    They determine the length of blocks. Without truth they are sums of the log-likelihood; None where neither is
+    known.
 
     They determine the length of blocks. Without truth they are sums of the log-likelihood; None where neither is
     known.
@@ -150,7 +153,7 @@ def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Boots
 
 
 class Reduced(NamedTuple):
-    """Contributions of one competitor's episodes to its records; for one episode also sums in units of time."""
+    """Sums and samples over one competitor's episodes, from which its records follow."""
 
     reduction: Reduction
     units: TimeUnits | None
@@ -162,13 +165,15 @@ class Reduced(NamedTuple):
     """The competitor's part of an evaluation, of which only coordinates and attributes are needed."""
 
     def without_variables(self) -> "Reduced":
-        """Return a copy that stores only coordinates and attributes of the evaluation's first measurement."""
+        """Return a copy without the values of the dataset, which saves memory."""
         run = self.run.drop_vars(list(self.run.data_vars))
         return self._replace(run=run.isel(time=slice(0, 1)).copy(deep=True))
 
 
 def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
-    """Return the contributions of one competitor's episodes to its records.
+    """Return the sums and samples over one competitor's episodes, from which its records follow.
+
+    The environment's ``metrics`` are not used for recordings.
 
     The environment's ``metrics`` are not used for recordings.
     """
@@ -182,7 +187,9 @@ def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) 
 
 
 def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset") -> Bootstrap:
-    """Return the bootstrap for the records of an evaluation, from its reduced competitors.
+    """Return the bootstrap over the episodes of a reduced evaluation; for one episode over blocks of time.
+
+    It equals that of :func:`bootstrap_of`.
 
     It equals that of :func:`bootstrap_of`.
     """
@@ -212,7 +219,7 @@ def records_of_reduced(
 
 
 def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean over time of each episode, ``(episodes,)``; where flights differ in length, without NaN.
+    """Return the means over time of values ``(episodes, time)``; NaN beyond the end of a flight is left out.
 
     Args:
         run: part of the evaluation with the values.
@@ -231,7 +238,9 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
 def record_statistics(
     run: "xarray.Dataset", episodes: int, metrics: OwnMetrics | None = None
 ) -> Iterator[Statistic]:
-    """Yield the declarations of the statistics for a competitor's records, for some of its episodes.
+    """Yield the statistics needed for a competitor's records, as declarations (:class:`.Statistic`).
+
+    Their keys contain metric, component, window and unit. The costs of all episodes are declared, too.
 
     Their keys contain metric, component, window and unit. The costs of all episodes are declared, too.
 
@@ -245,7 +254,7 @@ def record_statistics(
     judged = run.attrs.get("truth", True)
 
     def means(metric: str, component: str, unit: str, values: Any, function: Function = identity) -> Any:
-        """Yield the mean over every window."""
+        """Yield the statistic of a mean over time for each window."""
         for window, times in slices.items():
             key, mean = ("record", metric, component, window, unit), mean_over_time(run, values[:, times])
             yield Statistic(key, mean, function, of_units=_units(values, times))
@@ -302,7 +311,7 @@ def _mean_of_present(
 
 
 def _units(values: numpy.ndarray, times: slice) -> Callable[[TimeUnits], numpy.ndarray]:
-    """Return a function from units of time to the sums of one episode's values ``(1, time)`` in them."""
+    """Return a function from units of time to sums and numbers of one episode's values ``(1, time)`` in them."""
     return functools.partial(TimeUnits.sums_of_present, values=values, times=times)
 
 
@@ -472,7 +481,7 @@ class _Against:
         }
 
     def _columns(self, part: slice) -> numpy.ndarray:
-        """Return the columns to average over a slice of the episodes, ``(some, columns)``.
+        """Return cost, log cost, loss and win of every competitor for some episodes, ``(some, columns)``.
 
         For every competitor: the cost, its logarithm, whether the track is lost, and whether the cost is less than that
         of the paper's algorithm.
@@ -584,7 +593,7 @@ def flight_records(dataset: "xarray.Dataset") -> list[Record]:
 
 
 def parts_by_flight(dataset: "xarray.Dataset") -> "Iterator[xarray.Dataset]":
-    """Yield the part of an evaluation of each flight, in the order of the flights' names."""
+    """Yield the dataset of each flight's episodes, in the order of the flights' names."""
     for flight in sorted(set(dataset["flight"].values.tolist())):
         own = dataset["flight"].values == flight
         part = dataset if own.all() else dataset.isel(episode=numpy.flatnonzero(own))  # a copy

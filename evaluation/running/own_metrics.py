@@ -52,7 +52,7 @@ class OwnMetrics:
     """Function from the inputs of all episodes, and the evaluation's coordinates and attributes, to the measures."""
 
     def statistics(self, run: "xarray.Dataset") -> Iterator[Statistic]:
-        """Yield the declarations of the statistics that are the metrics' inputs, for some episodes.
+        """Yield the inputs of the metrics as declarations of statistics, for some episodes.
 
         Args:
             run: some episodes of one competitor.

@@ -13,7 +13,7 @@ DRAWN_PREFIX = "drawn_"
 
 
 def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
-    """Return the normalised estimation error squared, NEES, of the components with a known truth.
+    """Return ``nees``, the normalised estimation error squared of components with known truth, as a dictionary.
 
     Args:
         model: task with a filter.

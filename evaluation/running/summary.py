@@ -96,7 +96,7 @@ class EvaluationRequest(NamedTuple):
         return Work(f"{stem_of(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
 
     def pieces(self) -> list["EvaluationRequest"]:
-        """Return the request split into requests of fewer episodes; unchanged if it has few."""
+        """Return a list of requests for fewer episodes each, which together cover this one."""
         if self.episodes <= TOGETHER:
             return [self]
         begins = range(0, self.episodes, TOGETHER)
@@ -149,17 +149,17 @@ class Summary(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Contributions of some episodes of one competitor to its summary."""
+    """Sums and samples over some episodes of one competitor, from which its summary follows."""
 
     reduction: Reduction
     head: xarray.Dataset
 
     def merge(self, later: "Part") -> "Part":
-        """Return the sum of these contributions and those of the next episodes."""
+        """Return the sums and samples of these and the next episodes together."""
         return self._replace(reduction=self.reduction.merge(later.reduction))
 
     def summary(self, request: EvaluationRequest) -> Summary:
-        """Return the summary of the competitor, when the contributions of all episodes are merged."""
+        """Return the summary of the competitor, from the sums and samples of all its episodes."""
         results, bootstrap = self.reduction.results(), resampling(request.episodes)
         contender = contender_of(results, self.head, bootstrap, request.metrics)
         curves = competitor_curves(results) if request.curves else None
@@ -167,7 +167,7 @@ class Part(NamedTuple):
 
 
 def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
-    """Run a request; return its summary, or the contribution to it if the request has only some of the episodes.
+    """Run a request; return its summary, or if it has only some of the episodes, their sums and samples.
 
     Raises:
         ValueError: as :func:`reduce_episodes`.
@@ -187,7 +187,7 @@ def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
 def reduce_episodes(
     request: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
-    """Run a request block by block of episodes; return the contributions to declared statistics.
+    """Run a request block by block of episodes; return sums and samples for declared statistics.
 
     Args:
         request: request of one competitor over episodes.
@@ -304,7 +304,7 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 @one_thread()
 def combine_summaries(found: Sequence[Summary]) -> Evaluation:
-    """Return the evaluation of all competitors, from their summaries."""
+    """Return the evaluation (records, curves, costs) of all competitors, from their summaries."""
     evaluation = _heads_together(
         [one.head for one in found], [one.contender.losses for one in found], found[0].episodes
     )
@@ -331,7 +331,9 @@ def _actions_by_control(
 
 
 class SeparateResults(NamedTuple):
-    """Results of one competitor over flights, a recording or one episode, before those of the others are known.
+    """Reduced results of one competitor over flights, a recording or one episode.
+
+    All competitors are resampled together.
 
     All competitors are resampled together.
     """

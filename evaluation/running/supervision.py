@@ -74,7 +74,7 @@ def is_supervised() -> bool:
 
 @contextmanager
 def running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
-    """Report to the parent process that the code of a competitor runs; yield the progress function to call meanwhile.
+    """Report to the parent process that a competitor's code runs inside the context; yield its progress function.
 
     Args:
         name: name of the competitor.

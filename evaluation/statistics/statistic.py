@@ -56,7 +56,7 @@ class Statistic(NamedTuple):
 
 
 class Reduction(NamedTuple):
-    """Contributions of some episodes of one competitor to its statistics, which can be merged."""
+    """Sums and samples over some episodes of one competitor for its statistics, which can be merged."""
 
     functions: dict[Key, Function]
     sums: dict[Key, numpy.ndarray]
@@ -70,7 +70,7 @@ class Reduction(NamedTuple):
     """Values of the statistics of one episode that cannot be resampled over time."""
 
     def merge(self, later: "Reduction") -> "Reduction":
-        """Return the sum of these contributions and those of the next episodes."""
+        """Return the sums and samples of these and the next episodes together."""
         optional = self.optional | later.optional
         sums = {key: own for key, own in (self.sums | later.sums).items() if key in optional}
         sums |= {key: own + later.sums[key] for key, own in self.sums.items() if key in later.sums}
@@ -104,7 +104,7 @@ def reduce_run(
     bootstrap: Bootstrap | TimeUnits,
     first: int = 0,
 ) -> Reduction:
-    """Return the contributions of some episodes of one competitor to the declared statistics.
+    """Return the sums and samples over some episodes of one competitor for the declared statistics.
 
     Args:
         run: one competitor's part of an evaluation.
@@ -138,7 +138,7 @@ def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap | TimeUn
                 found.known[s.key] = s.function(s.values)
 
     def product(s: Statistic) -> tuple[int | None, int]:
-        """Return the key of a statistic's matrix product."""
+        """Return a key that is equal for statistics computed in one matrix product."""
         nonlocal columns
         columns += s.values[0].size
         return s.resamples, columns // COLUMNS

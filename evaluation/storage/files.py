@@ -275,7 +275,7 @@ def _beside(folder: Path) -> tuple[Path, Path]:
 
 
 def find_folder(folder: Path) -> Path:
-    """Return the path with the contents of a folder: next to it after a crash of :func:`whole_folder`.
+    """Return the path that has a folder's contents: itself, or a neighbour after a crash of :func:`whole_folder`.
 
     The old one is moved away only when the new one is complete, so without the folder both others are whole.
     """
@@ -286,7 +286,7 @@ def find_folder(folder: Path) -> Path:
 
 
 def settle_folder(folder: Path) -> None:
-    """Finish a replacement of a folder that a crash interrupted, and remove its leftovers.
+    """Finish replacing a folder if a crash interrupted it, and remove the leftover copies.
 
     Raises:
         ValueError: if it cannot be moved into its place.

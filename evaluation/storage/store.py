@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 
 class Work(NamedTuple):
-    """Identity of a piece of work: all that its result depends on."""
+    """Name and identity of a unit of work whose result is stored."""
 
     name: str
     """First part of the name of its file. Files with the same name are removed together."""
@@ -63,7 +63,7 @@ class Store:
         return self.folder / f"{name}.{digest[:DIGITS]}{SUFFIX}"
 
     def read(self, work: Work | None, kind: type[Result]) -> Result | None:
-        """Return the stored result of a piece of work; None if it is not stored.
+        """Return the stored result of a unit of work; None if it is not stored.
 
         Args:
             work: the piece; None for one that is never stored, since changes of its code cannot be recognised.

@@ -74,7 +74,7 @@ class Stream:
         return numpy.cumsum(self.measurements.interval, axis=0)
 
     def at(self, number: int) -> Any:
-        """Return the measurement of one number from 0 on, arrays ``(..., N)``."""
+        """Return the measurement with this index, arrays ``(..., N)``."""
         return map_arrays(lambda values: values[number], self.measurements)
 
     def select(self, numbers: Sequence[int] | numpy.ndarray) -> "Stream":
