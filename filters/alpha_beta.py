@@ -86,7 +86,7 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
     )
 
 
-def left_by_acceleration(
+def add_acceleration_error(
     P: Covariance, mean_square: Array, alpha: Array, beta: Array, T: float | Array, since: float | Array = 0.0
 ) -> Covariance:
     """Return the covariance after an update, increased by the error that an acceleration leaves.

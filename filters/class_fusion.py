@@ -255,7 +255,7 @@ def add_coloured_errors(
     return whole, numpy.moveaxis(P, 0, -1)
 
 
-def take_away_coloured_errors(mean: Array, covariance: Array, measured: int = 2) -> tuple[Array, Array]:
+def remove_coloured_errors(mean: Array, covariance: Array, measured: int = 2) -> tuple[Array, Array]:
     """Return mean and covariance of the state x itself, from those of :func:`add_coloured_errors`.
 
     Args:

@@ -96,7 +96,7 @@ def runge_kutta(drift: Callable[[Array], Array], x: Array, interval: Any, steps:
     return x
 
 
-def held_noise(A: Array, D: numpy.ndarray, interval: Any) -> Array:
+def constant_matrix_noise(A: Array, D: numpy.ndarray, interval: Any) -> Array:
     """Return the process noise over an interval for a matrix A that is constant in it, ``(n, n)``, by quadrature."""
     square = A @ A
     cube, total = square @ A, 0.0

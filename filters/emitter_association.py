@@ -103,7 +103,7 @@ def start_table(grid: Surroundings, labels: int) -> Array:
     return numpy.stack([numpy.stack([grid.weight * (1.0 - balance), grid.weight * balance])] * labels)
 
 
-def fall_silent(table: Array, grid: Surroundings, looked: Array) -> Array:
+def predict_silence(table: Array, grid: Surroundings, looked: Array) -> Array:
     """Return the table of likelihoods after a possible start or end of silence before a look, equation (3).
 
     Args:

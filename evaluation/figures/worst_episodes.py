@@ -11,7 +11,15 @@ import xarray
 from ..running.evaluate import Experiment, Plan, plan_of, run_piece
 from ..running.metrics import mean_cost
 from ..statistics.bootstrap import ratio
-from ..statistics.cause_split import COST, COUNT, EVERYTHING, VARIABLE, cause_sums, held_causes, reason_weight
+from ..statistics.cause_split import (
+    COST,
+    COUNT,
+    EVERYTHING,
+    VARIABLE,
+    active_causes,
+    cause_sums,
+    reason_weight,
+)
 from .looks import COLOURS
 from .print_layout import add_title, figure_with_pairs, in_print
 
@@ -107,7 +115,7 @@ def main_causes(run: xarray.Dataset) -> list[list[str]]:
     """
     if VARIABLE not in run:
         return [[] for _ in range(run.sizes["episode"])]
-    names = [name for name, _ in held_causes(run)]
+    names = [name for name, _ in active_causes(run)]
     sums = cause_sums(run, None)
     weights = reason_weight(_share_of_all(sums[..., COST]), _share_of_all(sums[..., COUNT]))
     weights[:, names.index(EVERYTHING)] = 0.0

@@ -92,7 +92,7 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
     return stack_curves(found, dataset, bootstrap.episodes)
 
 
-def spread(count: int, most: int) -> numpy.ndarray:
+def evenly_spaced(count: int, most: int) -> numpy.ndarray:
     """Return at most ``most`` evenly spaced indices below ``count``, including the first and the last."""
     return numpy.unique(numpy.linspace(0, count - 1, min(count, most)).round().astype(int))
 

@@ -33,8 +33,8 @@ from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
-from .stored_values import StoredValues, limits
-from .supervision import running
+from .stored_values import StoredValues, bound_values
+from .supervision import report_running
 from .threads import one_thread
 from .times import with_times
 
@@ -273,21 +273,19 @@ LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     """Run some episodes of one competitor; return its values at all measurements by name, ``(episodes, time, ...)``.
 
-    For a policy with a box of actions they include ``action``, clipped to the limits of the box, as every bank does.
-
     For a policy whose action is a box they include ``action``, clipped to the limits of the box, as every bank does.
     """
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
     kept, drawn = StoredValues(experiment.tracks), None
-    report: Report = limits if kind == "bound" else kept
+    report: Report = bound_values if kind == "bound" else kept
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
         drawn = replace(kept, drawings=True), most
     # Code that is timed afterwards is optimised here: so nothing is compiled in two ways.
     with (
         optimised_code() if experiment.timed else nullcontext(),
-        running(piece.name, tick) as report_progress,
+        report_running(piece.name, tick) as report_progress,
     ):
         flown = run_episodes(
             model, piece.maker, kind, piece.seeds, report, piece.name, report_progress, drawn
@@ -356,7 +354,7 @@ class Plan(NamedTuple):
 
     def time(self, name: str) -> ProcessorTime | None:
         """Return the measured processor time of a competitor, see :func:`.rollout.measure_time`."""
-        with running(name, timed=False):
+        with report_running(name, timed=False):
             return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
     def arrays(self, episodes: int, drawn: int) -> StackedArrays:

@@ -100,11 +100,11 @@ def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
 def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
     """Return the bootstrap over the episodes of an evaluation, or over its flights."""
     clusters = tuple(dataset["flight"].values.tolist()) if "flight" in dataset.coords else None
-    return resampling(dataset.sizes["episode"], resamples, clusters)
+    return cached_bootstrap(dataset.sizes["episode"], resamples, clusters)
 
 
 @functools.lru_cache(maxsize=2)
-def resampling(
+def cached_bootstrap(
     episodes: int, resamples: int = RESAMPLES, clusters: tuple[str, ...] | None = None
 ) -> Bootstrap:
     """Return the bootstrap over a number of episodes, or over clusters of them, from a cache."""

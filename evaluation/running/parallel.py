@@ -65,7 +65,7 @@ class Elsewhere(Exception):  # noqa: N818  (the cause of an error, not an error)
     """Traceback of an error in another process, shown as the cause of that error in this process."""
 
 
-def end_with(parent: int) -> None:
+def end_with_parent(parent: int) -> None:
     """Start a thread that ends this process when the process with the id ``parent`` ends, even if it is killed."""
 
     def watch() -> None:
@@ -252,7 +252,7 @@ class Workers:
 
         class Processes(LokyBackend):
             def configure(self, *given: Any, **options: Any) -> Any:
-                own = {"initializer": end_with, "initargs": (os.getpid(),)}
+                own = {"initializer": end_with_parent, "initargs": (os.getpid(),)}
                 return super().configure(*given, **own, **options)
 
         # Where an error or Ctrl-C ends the work early, the rest is cancelled.

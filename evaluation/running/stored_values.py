@@ -67,6 +67,6 @@ class StoredValues:
         return {**found, **model.track(episode)} if self.tracks else found
 
 
-def limits(model: Model, episode: Episode) -> dict[str, Any]:
+def bound_values(model: Model, episode: Episode) -> dict[str, Any]:
     """Return the values to store at a measurement of a bound, by name."""
     return model.filter.records(episode.filter, episode.measurement)

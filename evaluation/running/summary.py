@@ -18,7 +18,7 @@ from ..statistics.statistic import Reduction, Statistic, reduce_run
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import Losses, count_losses, losses_in
 from ..storage.store import Store, Work
-from .curves import CompetitorCurves, competitor_curves, curve_statistics, spread, stack_curves
+from .curves import CompetitorCurves, competitor_curves, curve_statistics, evenly_spaced, stack_curves
 from .evaluate import Experiment, check_sendable, plan_of, run_competitors, run_piece
 from .metrics import (
     PER_FLIGHT,
@@ -27,6 +27,7 @@ from .metrics import (
     Reduced,
     bootstrap_of_episodes,
     bootstrap_of_reduced,
+    cached_bootstrap,
     contender_of,
     mean_over_time,
     parts_by_flight,
@@ -34,7 +35,6 @@ from .metrics import (
     records_of,
     records_of_reduced,
     reduce_competitor,
-    resampling,
 )
 from .own_metrics import OwnMetrics
 from .parallel import Workers
@@ -93,7 +93,7 @@ class EvaluationRequest(NamedTuple):
         """Return the identity of the summary in a store; None if it is not stored."""
         if self.identity is None:
             return None
-        return Work(f"{stem_of(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
+        return Work(f"{file_stem(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
 
     def pieces(self) -> list["EvaluationRequest"]:
         """Return a list of requests for fewer episodes each, which together cover this one."""
@@ -103,7 +103,7 @@ class EvaluationRequest(NamedTuple):
         return [self._replace(first=i, last=min(i + TOGETHER, self.episodes)) for i in begins]
 
 
-def stem_of(experiment: Experiment) -> str:
+def file_stem(experiment: Experiment) -> str:
     """Return the first part of the name of files about an experiment, with environment, scenario and seed."""
     environment, scenario = short_name(experiment.task.id), experiment.scenario or "default"
     return f"{environment}.{scenario}.{experiment.episodes}.{experiment.split}{experiment.seed}"
@@ -160,7 +160,7 @@ class Part(NamedTuple):
 
     def summary(self, request: EvaluationRequest) -> Summary:
         """Return the summary of the competitor, from the sums and samples of all its episodes."""
-        results, bootstrap = self.reduction.results(), resampling(request.episodes)
+        results, bootstrap = self.reduction.results(), cached_bootstrap(request.episodes)
         contender = contender_of(results, self.head, bootstrap, request.metrics)
         curves = competitor_curves(results) if request.curves else None
         return Summary(contender, curves, self.head, request.episodes)
@@ -200,7 +200,7 @@ def reduce_episodes(
     plan = plan_of(request.experiment, {request.name: request.maker}, request.first, request.end)
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
-    bootstrap = resampling(request.episodes)
+    bootstrap = cached_bootstrap(request.episodes)
     block = block_of(plan.models[request.name].task.horizon)
 
     def part(first: int) -> Part:
@@ -309,7 +309,7 @@ def combine_summaries(found: Sequence[Summary]) -> Evaluation:
         [one.head for one in found], [one.contender.losses for one in found], found[0].episodes
     )
     costs = {one.contender.name: one.contender.costs for one in found if one.contender.costs is not None}
-    records = records_of([one.contender for one in found], evaluation, resampling(found[0].episodes))
+    records = records_of([one.contender for one in found], evaluation, cached_bootstrap(found[0].episodes))
     each = [one.curves for one in found if one.curves is not None]
     if len(each) < len(found):
         return Evaluation(evaluation, records, None, costs)
@@ -360,7 +360,7 @@ def reduce_alone(run: xarray.Dataset, request: EvaluationRequest) -> SeparateRes
     costs = mean_over_time(run, run["cost"].values) if "cost" in run else None
     if costs is not None and numpy.isnan(costs).all():  # bounds have no cost
         costs = None
-    chosen, curves = spread(times, DRAWN_TIMES), None
+    chosen, curves = evenly_spaced(times, DRAWN_TIMES), None
     if request.curves:
         declare = functools.partial(curve_statistics, episodes=episodes)
         results = reduce_run(run, declare, bootstrap_of_episodes(run)).results()
@@ -402,7 +402,7 @@ def _combine_alone(
         if record.metric in PER_FLIGHT
     ]
     shown = evaluation.drop_vars(list(evaluation.data_vars))
-    shown = shown.isel(time=spread(shown.sizes["time"], DRAWN_TIMES))
+    shown = shown.isel(time=evenly_spaced(shown.sizes["time"], DRAWN_TIMES))
     return Evaluation(
         evaluation,
         records_of_reduced(reduced, evaluation, metrics),

@@ -15,7 +15,7 @@ import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 
-from .parallel import end_with
+from .parallel import end_with_parent
 from .rollout import Progress
 
 POLLING = 0.5
@@ -58,7 +58,7 @@ def supervise(names: Collection[str], seconds: float) -> dict[str, str]:
         if (child := os.fork()) == 0:
             os.close(reports)
             _supervised, _reports = left, writing
-            end_with(parent)
+            end_with_parent(parent)
             return failures
         os.close(writing)
         name, words = _watch(child, reports, seconds)
@@ -73,7 +73,7 @@ def is_supervised() -> bool:
 
 
 @contextmanager
-def running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
+def report_running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
     """Report to the parent process that a competitor's code runs inside the context; yield its progress function.
 
     Args:

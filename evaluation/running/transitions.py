@@ -56,7 +56,7 @@ def transitions_of(
     finished = numpy.zeros(len(seeds), dtype=bool)
     while not finished.all():  # flights differ in length: finished ones start again, and are cut below
         action, memory = policy.predict(observation, memory)
-        action = member(envs.single_action_space, action)
+        action = clip_to_space(envs.single_action_space, action)
         observation, reward, _, truncated, _ = envs.step(action)
         for values, latest in zip(kept, (observation, action, reward, truncated), strict=True):
             values.append(latest)
@@ -71,7 +71,7 @@ def transitions_of(
     return found
 
 
-def member(space: gymnasium.Space[Any], action: numpy.ndarray) -> numpy.ndarray:
+def clip_to_space(space: gymnasium.Space[Any], action: numpy.ndarray) -> numpy.ndarray:
     """Return a batch of actions, clipped to the limits of the action space and cast to its type."""
     if isinstance(space, gymnasium.spaces.Box):
         action = numpy.clip(action, space.low, space.high)

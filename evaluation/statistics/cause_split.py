@@ -62,7 +62,7 @@ def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
     return {**dict(declared), START: first, OTHER: "where none of the causes holds"}
 
 
-def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
+def active_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
     """Yield the name of each cause and the measurements at which it is active, booleans ``(episodes, time)``.
 
     The first is ``EVERYTHING``.
@@ -91,7 +91,7 @@ def cause_sums(
         units: units of time of one episode, in place of episodes; None: episodes.
 
     Returns:
-        ``(episodes, causes, 4)``, in the order of :func:`held_causes`.
+        ``(episodes, causes, 4)``, in the order of :func:`active_causes`.
     """
     cost = run["cost"].values
     known = ~numpy.isnan(cost)
@@ -99,7 +99,7 @@ def cause_sums(
     values = numpy.stack([known, numpy.where(known, cost, 0.0), numpy.zeros(cost.shape), judged])
     if nees is not None:
         values[NEES] = numpy.where(judged, nees, 0.0)
-    holding = (held for _, held in held_causes(run))
+    holding = (held for _, held in active_causes(run))
     if units is not None:
         values, holding = units.cut(values[:, 0]), (units.cut(held)[0] for held in holding)
     return numpy.stack([numpy.einsum("set,et->es", values, held) for held in holding], axis=1, dtype=float)

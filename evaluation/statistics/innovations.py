@@ -51,7 +51,7 @@ def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
     )
 
 
-def received(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
+def measured_quantities(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
     """Return the measured quantities that a log format can predict, ``(m, episodes, time)``; None without predictions.
 
     Args:

@@ -7,7 +7,7 @@ import numpy
 import xarray
 
 from ...envs.contract.parameters import quote_shortened
-from .stored import fits
+from .stored import has_type
 
 PARTS = ("coords", "variables", "attrs")
 
@@ -51,19 +51,19 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
         raise ValueError(f"expected {', '.join(PARTS)} of a dataset, got {quote_shortened(stored)}")
 
     def read(name: str, entry: Any) -> tuple[list[str], numpy.ndarray]:
-        if not (isinstance(entry, list) and len(entry) == 2 and fits(entry[0], list[str])):
+        if not (isinstance(entry, list) and len(entry) == 2 and has_type(entry[0], list[str])):
             raise ValueError(f"{name!r} needs dimensions and values")
         values = entry[1]
         if isinstance(values, dict):
             shape, numbers = values.get("shape"), values.get("numbers")
-            if not (isinstance(shape, list) and fits(shape, list[int]) and min(shape, default=0) >= 0):
+            if not (isinstance(shape, list) and has_type(shape, list[int]) and min(shape, default=0) >= 0):
                 raise ValueError(f"{name!r} needs a shape")
-            if not fits(numbers, list[float | None]):
+            if not has_type(numbers, list[float | None]):
                 raise ValueError(f"{name!r} needs its numbers")
             array = _array(numbers, float).reshape(shape)
-        elif fits(values, list[str]) or isinstance(values, str):
+        elif has_type(values, list[str]) or isinstance(values, str):
             array = numpy.array(values)
-        elif fits(values, list[int]) or isinstance(values, int):
+        elif has_type(values, list[int]) or isinstance(values, int):
             array = _array(values, numpy.int64)
         else:
             raise ValueError(f"{name!r} must contain numbers or strings")
@@ -74,7 +74,7 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
     coords, variables = (
         {name: read(name, entry) for name, entry in stored[part].items()} for part in PARTS[:2]
     )
-    if not fits(stored["attrs"], dict[str, str | int | float]):
+    if not has_type(stored["attrs"], dict[str, str | int | float]):
         raise ValueError("attributes must be words or numbers")
     return xarray.Dataset(variables, coords, stored["attrs"])
 

@@ -54,7 +54,7 @@ def _gap(scans: int) -> Function:
             seconds = stream.seconds
             kept = numpy.r_[:SETTLED, SETTLED + scans : len(stream)]
             found = stream.select(kept).with_times(seconds[kept])
-            return _cut(found.renumbered(), SETTLED, SETTLED + 1)
+            return _cut(found.renumber(), SETTLED, SETTLED + 1)
         field = type(stream.task.world).received_field
         if not field:
             return None
@@ -85,7 +85,7 @@ def _reordered(order: Callable[[int], list[int]]) -> Function:
         numbers = [*range(SETTLED)]
         for first in range(SETTLED, len(stream) - EVERY, EVERY):
             numbers += order(first)
-        return _cut(stream.select(numbers).with_times(stream.seconds[numbers]).renumbered(), SETTLED, None)
+        return _cut(stream.select(numbers).with_times(stream.seconds[numbers]).renumber(), SETTLED, None)
 
     return alter
 
@@ -189,7 +189,7 @@ def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
             others[name] = before if isinstance(value, type(before)) else getattr(before, name, value)
     begun = initial._replace(mean=stream.truth[SETTLED - 1] + errors, **others)
     later = stream.select(numpy.arange(SETTLED, len(stream)))
-    return _cut(replace(later, initial=begun).renumbered(), Causes.of(stream.task).start, 1)
+    return _cut(replace(later, initial=begun).renumber(), Causes.of(stream.task).start, 1)
 
 
 def _rounded(stream: Stream, generator: numpy.random.Generator) -> Stream:

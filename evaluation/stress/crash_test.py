@@ -166,7 +166,7 @@ class CrashTest:
         for one in alterations:
             generator = numpy.random.default_rng([experiment.seed, *one.name.encode()])
             altered = one.function(whole, generator)
-            self.streams[one.name] = None if altered is None else altered.received_as_live()
+            self.streams[one.name] = None if altered is None else altered.mark_missing()
         self.scale: numpy.ndarray = numpy.ones(len(whole.task.components))
         self._bootstrap = Bootstrap(experiment.episodes)
         self._kept: list[Stream] = []

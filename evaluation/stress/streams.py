@@ -114,7 +114,7 @@ class Stream:
             fields[elapsed] = _since_received(seconds, numpy.asarray(self.received.any(axis=1)))
         return self.with_fields(**fields)
 
-    def received_as_live(self) -> "Stream":
+    def mark_missing(self) -> "Stream":
         """Return a stream in which readings of NaN are set to not received, as the input of an online filter does."""
         field, missing = type(self.task.world).received_field, numpy.isnan(self.readings)
         if not field or not missing.any():
@@ -123,7 +123,7 @@ class Stream:
         available[missing if available.ndim == missing.ndim else missing.any(axis=1)] = 0
         return self.with_fields(**{field: numpy.where(missing, 0.0, self.readings), "available": available})
 
-    def renumbered(self) -> "Stream":
+    def renumber(self) -> "Stream":
         """Return a stream with the scan numbers counted from 1 on, if measurements have such numbers."""
         counter = LiveReader.of(self.task).input.counter
         values = getattr(self.measurements, counter, None)
