@@ -103,17 +103,17 @@ def start_table(grid: Surroundings, labels: int) -> Array:
     return numpy.stack([numpy.stack([grid.weight * (1.0 - balance), grid.weight * balance])] * labels)
 
 
-def predict_silence(table: Array, grid: Surroundings, looked: Array) -> Array:
+def predict_silence(table: Array, grid: Surroundings, is_looking: Array) -> Array:
     """Return the table of likelihoods after a possible start or end of silence before a look, equation (3).
 
     Args:
         table: table of likelihoods, ``(J, 2, V, N)``.
         grid: grid of the table.
-        looked: mask of episodes in which the station looks, ``(N,)`` booleans.
+        is_looking: mask of episodes in which the station looks, ``(N,)`` booleans.
     """
     xp = namespace(table)
-    off = xp.where(looked, grid.silence_start, 0.0) * table[:, 1]
-    on = xp.where(looked, grid.silence_end, 0.0) * table[:, 0]
+    off = xp.where(is_looking, grid.silence_start, 0.0) * table[:, 1]
+    on = xp.where(is_looking, grid.silence_end, 0.0) * table[:, 0]
     change = on - off
     return xp.stack([table[:, 0] - change, table[:, 1] + change], axis=1)
 

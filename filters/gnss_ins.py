@@ -235,23 +235,24 @@ def geometry(state: Array, satellite_position: Array, satellite_velocity: Array)
     return Geometry(distance, unit, w, unit[0] * w[0] + unit[1] * w[1] + unit[2] * w[2])
 
 
-def ranges(state: Array, seen: Geometry) -> tuple[Array, Array]:
+def ranges(state: Array, satellites: Geometry) -> tuple[Array, Array]:
     """Return the predicted pseudoranges, m, and pseudorange rates, m/s, of S satellites, ``(S, ...)`` each."""
-    return seen.distance + state[CLOCK_BIAS], seen.range_rate + state[CLOCK_DRIFT]
+    return satellites.distance + state[CLOCK_BIAS], satellites.range_rate + state[CLOCK_DRIFT]
 
 
-def range_jacobian(seen: Geometry) -> list[JacobianRow]:
+def range_jacobian(satellites: Geometry) -> list[JacobianRow]:
     """Return the Jacobian rows of S pseudoranges, then of S pseudorange rates."""
     x, v = range(0, 3), range(4, 7)
-    across = (seen.relative_velocity - seen.unit * seen.range_rate) / seen.distance
-    count = seen.distance.shape[0]
+    across = (satellites.relative_velocity - satellites.unit * satellites.range_rate) / satellites.distance
+    count = satellites.distance.shape[0]
     ranges_rows = [
-        JacobianRow((*x, CLOCK_BIAS), (*(-seen.unit[i, j] for i in range(3)), 1.0)) for j in range(count)
+        JacobianRow((*x, CLOCK_BIAS), (*(-satellites.unit[i, j] for i in range(3)), 1.0))
+        for j in range(count)
     ]
     rate_rows = [
         JacobianRow(
             (*x, *v, CLOCK_DRIFT),
-            (*(-across[i, j] for i in range(3)), *(-seen.unit[i, j] for i in range(3)), 1.0),
+            (*(-across[i, j] for i in range(3)), *(-satellites.unit[i, j] for i in range(3)), 1.0),
         )
         for j in range(count)
     ]

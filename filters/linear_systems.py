@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy
 from numpy.typing import ArrayLike, NDArray
 
-from .stored_solutions import stored
+from .stored_solutions import use_stored_solution
 
 Matrix = NDArray[numpy.float64]
 _MARGIN = 1e-9
@@ -59,7 +59,7 @@ def intensity_matrix(name: str, matrix: ArrayLike, size: int, definite: bool = F
     return array
 
 
-@stored
+@use_stored_solution
 def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     """Return F and B of the discrete model of ``dx/dt = A x + B u``, with ``u`` constant in each interval.
 
@@ -81,7 +81,7 @@ def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
-@stored
+@use_stored_solution
 def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matrix]:
     """Return transition matrix F and process noise covariance Q of a continuous model over an interval.
 
@@ -211,7 +211,7 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
         )
 
 
-@stored
+@use_stored_solution
 def riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Any:
     """Return the stabilising solution of a discrete or continuous algebraic Riccati equation.
 

@@ -46,13 +46,13 @@ class LevelHypotheses(NamedTuple):
     sensors: tuple[Array, ...]
     """Probabilities of the levels of each sensor, ``(L, H, N)``."""
 
-    def take(self, some: slice) -> "LevelHypotheses":
+    def take(self, part: slice) -> "LevelHypotheses":
         """Return a slice of the hypotheses."""
         return LevelHypotheses(
-            self.mean[:, some],
-            self.covariance[:, some],
-            self.probability[some],
-            tuple(q[:, some] for q in self.sensors),
+            self.mean[:, part],
+            self.covariance[:, part],
+            self.probability[part],
+            tuple(q[:, part] for q in self.sensors),
         )
 
 

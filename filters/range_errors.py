@@ -61,7 +61,7 @@ def start(mean: Array, covariance: Array, satellites: int, variance: Array) -> t
     return xp.concat([mean, empty[:satellites]]), xp.stack(rows)
 
 
-def advance(state: Array, axis: Array, T: float, decay: float, kept: Array | list[Array]) -> Array:
+def advance(state: Array, axis: Array, T: float, decay: float, persistence: Array | list[Array]) -> Array:
     """Return the product of the transition matrix with a vector or matrix, ``F x`` or ``F P``.
 
     Args:
@@ -69,13 +69,13 @@ def advance(state: Array, axis: Array, T: float, decay: float, kept: Array | lis
         axis: transition matrix of (x, v, a), ``(3, 3, ...)``, see :func:`.gnss_ins.advance`.
         T: step, s.
         decay: factor of the attitude rates.
-        kept: psi, factor on a range error in a step, which broadcasts against ``(...)``; or a list of one for each.
+        persistence: psi, factor on a range error in a step, broadcast against ``(...)``; or a list of one for each.
     """
     known = gnss_ins.SIZE
-    if isinstance(kept, list):
-        errors = namespace(state).stack([psi * state[known + j] for j, psi in enumerate(kept)])
+    if isinstance(persistence, list):
+        errors = namespace(state).stack([psi * state[known + j] for j, psi in enumerate(persistence)])
     else:
-        errors = kept * state[known:]
+        errors = persistence * state[known:]
     return namespace(state).concat([gnss_ins.advance(state, axis, T, decay), errors], axis=0)
 
 
@@ -86,8 +86,8 @@ def predict(
     T: float,
     decay: float,
     Q: Array,
-    kept: Array | list[Array],
-    gained: Array | list[Array],
+    persistence: Array | list[Array],
+    noise_variance: Array | list[Array],
 ) -> tuple[Array, Array]:
     """Return the predicted means ``F x`` and covariances ``F P F^T + Q`` of M hypotheses.
 
@@ -98,16 +98,16 @@ def predict(
         T: step, s.
         decay: factor of the attitude rates.
         Q: covariance of the process noise of the first 17 states, with zeros beyond, ``(17 + S, 17 + S, M, 1)``.
-        kept: psi, factor on a range error, ``(N,)`` or a number; or a list of one for each error.
-        gained: variance of w, m^2, same shape.
+        persistence: psi, factor on a range error, ``(N,)`` or a number; or a list of one for each error.
+        noise_variance: variance of w, m^2, same shape.
     """
     xp = namespace(mean)
-    moved = advance(covariance, axis, T, decay, kept)
-    both = advance(xp.moveaxis(moved, 0, 1), axis, T, decay, kept) + Q
+    moved = advance(covariance, axis, T, decay, persistence)
+    both = advance(xp.moveaxis(moved, 0, 1), axis, T, decay, persistence) + Q
     for j in range(gnss_ins.SIZE, mean.shape[0]):
-        own = gained[j - gnss_ins.SIZE] if isinstance(gained, list) else gained
+        own = noise_variance[j - gnss_ins.SIZE] if isinstance(noise_variance, list) else noise_variance
         both = _replace(both, j, both[j], both[j, j] + own)
-    return advance(mean, axis, T, decay, kept), both
+    return advance(mean, axis, T, decay, persistence), both
 
 
 def observe(

@@ -46,7 +46,7 @@ class FaultCovariance(NamedTuple):
 
 
 def predict_fault(
-    P: FaultCovariance, s: Sampling, coloured: Array, white: Array, decay: Array, gained: Array
+    P: FaultCovariance, s: Sampling, coloured: Array, white: Array, decay: Array, noise_variance: Array
 ) -> FaultCovariance:
     """Return the covariance after one step without a measurement, ``F P F^T + Qd``.
 
@@ -56,7 +56,7 @@ def predict_fault(
         coloured: increase of the coloured rate error's variance in a step, m^2/s^2.
         white: variance of the displacement in a step that this increase does not explain, m^2.
         decay: psi, factor on each error of the receiver in a step, ``(E, ...)``.
-        gained: increase of the variance of each of them in a step, ``(E, ...)``.
+        noise_variance: increase of the variance of each of them in a step, ``(E, ...)``.
     """
     xp = namespace(P.cross)
     position, drift, rate = P.cross
@@ -64,7 +64,7 @@ def predict_fault(
     E = P.faults.shape[0]
     faults = [[decay[i] * decay[k] * P.faults[i, k] for k in range(E)] for i in range(E)]
     for i in range(E):
-        faults[i][i] = faults[i][i] + gained[i]
+        faults[i][i] = faults[i][i] + noise_variance[i]
     return FaultCovariance(
         predict_augmented(P.ins, s, coloured, white),
         xp.stack([decay * along, decay * drift, decay * s.decay * rate]),

@@ -92,16 +92,16 @@ def merge(hypotheses: AgedHypotheses) -> AgedHypotheses:
     return AgedHypotheses(mean[:, None], covariance[:, :, None], total[None])
 
 
-def grow_older(table: AgedHypotheses, begun: AgedHypotheses) -> AgedHypotheses:
+def grow_older(table: AgedHypotheses, new: AgedHypotheses) -> AgedHypotheses:
     """Return the table one step later: every age increases by one, and the last two are merged.
 
     Args:
         table: table before.
-        begun: new hypothesis of the first age.
+        new: new hypothesis of the first age.
     """
     if table.probability.shape[0] == 1:
-        return merge(join([begun, table]))
-    return join([begun, table.take(slice(None, -2)), merge(table.take(slice(-2, None)))])
+        return merge(join([new, table]))
+    return join([new, table.take(slice(None, -2)), merge(table.take(slice(-2, None)))])
 
 
 class Mode(NamedTuple):

@@ -18,7 +18,7 @@ Solve = TypeVar("Solve", bound=Callable[..., Any])
 FILE = Path(__file__).with_suffix(".json")
 
 
-def stored(solve: Solve) -> Solve:
+def use_stored_solution(solve: Solve) -> Solve:
     """Decorate a function that solves an equation, so that it returns the stored solution if there is one.
 
     Args:

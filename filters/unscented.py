@@ -71,7 +71,7 @@ def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[Any], list[Any]]:
     return [first, *others], [first + 1.0 - spread.alpha**2 + spread.beta, *others]
 
 
-def narrow(jacobian: Array, covariance: Array, limit: float) -> Spread:
+def limit_spread(jacobian: Array, covariance: Array, limit: float) -> Spread:
     """Return parameters whose sigma points move a function by no more than a limit, to first order.
 
     The columns of the scaled root of P move a row H of the function by at most alpha sqrt(n H P H^T). Angles are

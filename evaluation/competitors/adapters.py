@@ -50,10 +50,10 @@ READINGS = ("z", "zk", "y", "meas", "measurement", "obs", "observation")
 """Usual names of the first argument of ``update`` in filters of a single track whose state is in the object."""
 
 
-def check_update_order(found: Any) -> None:
+def check_update_order(estimator: Any) -> None:
     """Raise ValueError if an estimator's ``update`` takes the memory after the measurement, or no memory."""
     try:
-        names = [name for name in inspect.signature(found.update).parameters if name != "self"]
+        names = [name for name in inspect.signature(estimator.update).parameters if name != "self"]
     except (AttributeError, TypeError, ValueError):  # without one, or compiled
         return
     if "memory" in names[1:]:

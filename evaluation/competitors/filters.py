@@ -308,12 +308,12 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         apart = numpy.eye(len(known))[:, :, None]
         return numpy.where(known[:, None], mean, 0.0), numpy.where(both, covariance, apart)
 
-    def _held(self, lost: Array, last: Array, answer: Array) -> Array:
+    def _held(self, lost: Array, last: Array, estimate: Array) -> Array:
         """Return the estimate, replaced by the last valid one where the episode is lost."""
         if self.in_python:  # a copy retains its layout, on which rounding in matrix products depends
-            answer[..., lost] = last[..., lost]
-            return answer
-        return self.xp.where(lost, last, answer)
+            estimate[..., lost] = last[..., lost]
+            return estimate
+        return self.xp.where(lost, last, estimate)
 
     def feedback(self, state: Checked, measurement: Any) -> Array | None:
         """Return a program's feedback; where it is not finite or the episode is lost, that of the estimate."""

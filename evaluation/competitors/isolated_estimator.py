@@ -92,7 +92,7 @@ def enter_namespaces(libc: Any, wanted: int) -> bool:
     return True
 
 
-def leave_to_child(libc: Any, apart: bool) -> None:
+def continue_in_child(libc: Any, apart: bool) -> None:
     """Fork and continue in the child; the parent waits for it and exits with its status.
 
     The parent ends its other children before.
@@ -115,13 +115,13 @@ def leave_to_child(libc: Any, apart: bool) -> None:
         os._exit(128 - code if code < 0 else code)
     end_children()
     if 0 < (number := -code if code < 0 else code - 128) < 32:
-        limit_own("RLIMIT_CORE", 0)
+        limit_resource("RLIMIT_CORE", 0)
         libc.signal(number, None)
         os.kill(os.getpid(), number)
     os._exit(code)
 
 
-def limit_own(name: str, most: int) -> None:
+def limit_resource(name: str, most: int) -> None:
     """Set the limit of a resource of this process, unless it is lower already."""
     import resource
 
@@ -221,7 +221,7 @@ def filter_calls(libc: Any) -> bool:
     return bool(libc.prctl(SET_FILTER, 2, struct.pack("HP", len(code), ctypes.addressof(content)), 0, 0) == 0)
 
 
-def wall(readable: list[str], listable: list[str], apart: bool) -> str:
+def restrict_process(readable: list[str], listable: list[str], apart: bool) -> str:
     """Restrict this process permanently; return a sentence on the remaining gaps, empty if there are none.
 
     Args:
@@ -237,7 +237,7 @@ def wall(readable: list[str], listable: list[str], apart: bool) -> str:
             restrict_files(libc, version, readable, listable)
         filtered = filter_calls(libc)
         if not (apart or filtered):
-            limit_own("RLIMIT_NPROC", 0)
+            limit_resource("RLIMIT_NPROC", 0)
     missing = {"Landlock": version > 0, "a filter of system calls": filtered, "namespaces": apart or filtered}
     gaps = {
         "read any file, the package's among them": version > 0,
@@ -280,7 +280,7 @@ class SharedModules:
         exec(compile(self.texts.get(name, ""), name, "exec", dont_inherit=True), module.__dict__)
 
 
-def nested(values: dict[str, Any], name: str) -> Any:
+def nested_tuple(values: dict[str, Any], name: str) -> Any:
     """Return a NamedTuple of arrays from a mapping by name; dots in names separate nested NamedTuples."""
     from collections import namedtuple
 
@@ -291,7 +291,9 @@ def nested(values: dict[str, Any], name: str) -> Any:
             parts.setdefault(first, {})[rest] = value
         else:
             parts[first] = value
-    held = {key: nested(value, key) if isinstance(value, dict) else value for key, value in parts.items()}
+    held = {
+        key: nested_tuple(value, key) if isinstance(value, dict) else value for key, value in parts.items()
+    }
     return namedtuple(name.capitalize(), list(held))(**held)
 
 
@@ -351,10 +353,10 @@ class Frames:
             part = rows[place : place + count].reshape(*shape, self.lanes)
             values[own["name"]] = numpy.array(part, dtype=own["type"], order="C")
             place += count
-        return nested(values, name)
+        return nested_tuple(values, name)
 
 
-def load(request: dict[str, Any]) -> Any:
+def load_estimator(request: dict[str, Any]) -> Any:
     """Execute the estimator's source text in a request; return the class that the request names."""
     from types import ModuleType
 
@@ -370,14 +372,14 @@ def load(request: dict[str, Any]) -> Any:
     return found
 
 
-def make(found: Any, task: Any) -> Any:
+def make_estimator(cls: Any, task: Any) -> Any:
     """Return an estimator of a class, made with the task if the constructor takes an argument."""
     from filtergym.evaluation.competitors.adapters import check_update_order, takes_problem
 
-    check_update_order(found)
-    if not isinstance(found, type):
-        return found
-    return found(task) if takes_problem(found) else found()
+    check_update_order(cls)
+    if not isinstance(cls, type):
+        return cls
+    return cls(task) if takes_problem(cls) else cls()
 
 
 def run_program(words: list[str]) -> None:
@@ -401,29 +403,29 @@ def main(memory: str, *words: str) -> None:
     apart = False
     if sys.platform == "linux":
         if int(memory):
-            limit_own("RLIMIT_AS", int(memory))
+            limit_resource("RLIMIT_AS", int(memory))
         libc = ctypes.CDLL(None, use_errno=True)
         apart = enter_namespaces(libc, NEW_PID if words else NEW_PID | NEW_OTHERS)
         libc.prctl(END_WITH_PARENT, TERMINATE, 0, 0, 0)
         for _ in range(1 + apart):  # the first one of a namespace only waits
-            leave_to_child(libc, apart)
-    run_program([*words]) if words else serve(apart)
+            continue_in_child(libc, apart)
+    run_program([*words]) if words else serve_estimator(apart)
 
 
-def serve(apart: bool) -> None:
+def serve_estimator(apart: bool) -> None:
     """Run one estimator: read measurements from standard input, and write estimates to standard output."""
     import json
 
     questions, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # an estimator's prints go to standard error, not into the answers
     request, hello = json.loads(questions.readline()), json.loads(questions.readline())
-    gaps = wall(request["readable"], request["listable"], apart)
+    gaps = restrict_process(request["readable"], request["listable"], apart)
     sys.path[:] = request["path"]
     sys.meta_path.insert(0, SharedModules(request["shared"]))
     import numpy
 
     try:
-        own = make(load(request), make_task(hello, numpy))
+        own = make_estimator(load_estimator(request), make_task(hello, numpy))
     except Exception as error:  # a module is a program: it can raise anything
         response: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
     else:

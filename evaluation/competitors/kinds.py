@@ -80,9 +80,9 @@ def is_filter(competitor: Any) -> bool:
     return issubclass(made if isinstance(made, type) else type(made), Filter)
 
 
-def is_program(found: Any) -> bool:
+def is_program(competitor: Any) -> bool:
     """Return whether a competitor runs a program in a separate process, which reports its own processor time."""
-    return getattr(found, "is_program", False) is True
+    return getattr(competitor, "is_program", False) is True
 
 
 def _has(found: Any, *methods: str) -> bool:
@@ -110,32 +110,32 @@ def is_made_for_episodes(competitor: Any) -> bool:
     return _has(competitor, "of_episodes")
 
 
-def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
+def check_competitor(name: str, competitor: Any, kind: Kind | None = None) -> Any:
     """Return a user's competitor unchanged, after a check that it has the methods of its kind.
 
     Args:
         name: its name in the table of results.
-        found: a competitor, or its class.
+        competitor: a competitor, or its class.
         kind: required kind; default: its own.
 
     Raises:
         ValueError: if it lacks a method of its kind: ``predict``, or ``start`` and ``update``, and ``smooth`` of a
             smoother; or if its ``update`` takes the memory after the measurement.
     """
-    kind = kind or kind_of(found)
+    kind = kind or kind_of(competitor)
     methods = {"policy": ("predict",), "smoother": ("start", "update", "smooth")}.get(
         kind, ("start", "update")
     )
-    if kind not in get_args(Kind) or not _has(found, *methods):
+    if kind not in get_args(Kind) or not _has(competitor, *methods):
         too = ", a smoother smooth too" if kind == "smoother" else ""
         raise ValueError(
             f"{name!r} is no competitor: a policy has a method predict, an estimator the methods start and update{too}"
         )
     try:
-        check_update_order(found)
+        check_update_order(competitor)
     except ValueError as error:
         raise ValueError(f"{name!r}: {error}") from None
-    return found
+    return competitor
 
 
 def expose_spaces(outer: Any, inner: Any, *further: str) -> None:

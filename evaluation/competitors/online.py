@@ -579,8 +579,8 @@ class OnlineFilter:
                 "each with its own filter"
             )
 
-    def _merge(self, begun: OnlineState, tracks: Any) -> OnlineState:
-        """Return the state with restarted tracks from ``begun`` and the other tracks unchanged."""
+    def _merge(self, new: OnlineState, tracks: Any) -> OnlineState:
+        """Return the state with restarted tracks from ``new`` and the other tracks unchanged."""
         chosen = numpy.zeros(self.tracks, dtype=bool)
         try:
             numbers = numpy.asarray(tracks)
@@ -597,11 +597,11 @@ class OnlineFilter:
                 f"tracks are numbers from 0 to {self.tracks - 1}, got {quote_shortened(tracks)}"
             ) from None
         old, padded = self._snapshot(), chosen[self._pad]
-        policy = old.policy if self._policy else select_nested(padded, begun.policy, old.policy)
-        one_track = begun.input if chosen[0] else old.input
+        policy = old.policy if self._policy else select_nested(padded, new.policy, old.policy)
+        one_track = new.input if chosen[0] else old.input
         return old._replace(
-            filter=select_nested(padded, begun.filter, old.filter),
-            input=one_track if self.tracks == 1 else select_nested(chosen, begun.input, old.input),
+            filter=select_nested(padded, new.filter, old.filter),
+            input=one_track if self.tracks == 1 else select_nested(chosen, new.input, old.input),
             policy=policy,
             fresh=chosen | old.fresh,
             history=History(),

@@ -69,11 +69,11 @@ def check_open_loop(model: Model, name: str) -> None:
         )
 
 
-def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
+def run_forward(model: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Run a smoother forward over episodes; return the smoothed means and covariances.
 
     Args:
-        looped: model with the smoother as its filter.
+        model: model with the smoother as its filter.
         lanes: episodes of the model, with their first measurement.
         length: number of measurements of each episode.
         name: name of the smoother, for error messages.
@@ -84,29 +84,29 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
     Raises:
         ValueError: if its estimates have other shapes.
     """
-    run = _run_compiled if can_step(looped, report_forward) else _step_forward
-    measurements, memories = run(looped, lanes, length)
-    own = looped.filter.own.own if looped.filter.in_python else looped.filter.own
+    run = _run_compiled if can_step(model, report_forward) else _step_forward
+    measurements, memories = run(model, lanes, length)
+    own = model.filter.own.own if model.filter.in_python else model.filter.own
     with explain_errors(f"smoother {name!r} failed after {length} measurements"):
         means, covariances = own.smooth(measurements, memories)
-    C, N = len(looped.task.components), lanes.count if run is _run_compiled else lanes.width
+    C, N = len(model.task.components), lanes.count if run is _run_compiled else lanes.width
     return (
         _check_shape("means", means, (C, length, N), name),
         _check_shape("covariances", covariances, (C, C, length, N), name),
     )
 
 
-def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
+def _step_forward(model: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
 
     def memory_in(episode: Any) -> Any:
-        return looped.filter.own.memory if looped.filter.in_python else episode.filter.own
+        return model.filter.own.memory if model.filter.in_python else episode.filter.own
 
     measurements: list[Any] = []
     memories = [memory_in(lanes.state)]
     action = numpy.zeros(lanes.count, dtype=numpy.int64)
     while len(measurements) < length:
         for episode, _ in lanes.decide(action, whole_episode):
-            measurements.append(looped.task.world.mask_missing(episode.measurement))
+            measurements.append(model.task.world.mask_missing(episode.measurement))
             memories.append(memory_in(episode))
     return measurements, memories
 
@@ -116,7 +116,7 @@ def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
     return episode.measurement, episode.filter.own
 
 
-def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
+def _run_compiled(model: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
     """Return the measurements, with missing ones masked, and the memories of a compiled smoother."""
     start = map_nested(lambda values: values[None, ..., : lanes.count], lanes.state.filter.own)
     measured: list[Any] = []
@@ -124,7 +124,7 @@ def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scan
     for stretch in run_stretches(lanes, report_forward, length):
         # Copies without the padding lanes, which make the arrays of one episode eight times as long.
         measurement, memory = map_nested(lambda values: values[..., : lanes.count].copy(), stretch)
-        masked = over_time(looped.task.world.mask_missing, stack_scans(Scans(measurement)))
+        masked = over_time(model.task.world.mask_missing, stack_scans(Scans(measurement)))
         measured.append(map_nested(lambda values: numpy.moveaxis(values, -2, 0), masked))
         memories.append(memory)
     return Scans(_join(measured)), Scans(_join(memories))
@@ -156,12 +156,12 @@ def report_world(model: Model, episode: Episode) -> tuple[Any, Any]:
 
 
 def report_smoothed(
-    looped: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
+    model: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
 ) -> Iterator[dict[str, numpy.ndarray]]:
     """Yield the reports that a filter with the smoothed estimates would give, for stretches of measurements.
 
     Args:
-        looped: model with the smoothed track as its filter.
+        model: model with the smoothed track as its filter.
         lanes: compiled episodes of the same world that have just begun, with any filter.
         track: the smoothed estimates.
         report: function that returns arrays ``(..., N)`` by name.
@@ -176,8 +176,8 @@ def report_smoothed(
         world = map_nested(lambda values: numpy.moveaxis(values, 0, -2), stretch)
         some = slice(first, first := first + len(leaves(stretch)[0]))
         estimates = track.means[:, some][..., track.lanes], track.covariances[:, :, some][..., track.lanes]
-        checked = _check_estimates(looped.task, state, world[1], *estimates)
-        found = over_time(lambda episode: looped.run(report, episode), Episode(world[0], world[1], checked))
+        checked = _check_estimates(model.task, state, world[1], *estimates)
+        found = over_time(lambda episode: model.run(report, episode), Episode(world[0], world[1], checked))
         yield map_nested(lambda values: numpy.moveaxis(values, -2, 0), found)
         state = map_nested(lambda values: values[..., -1, :], checked)
 

@@ -107,10 +107,10 @@ class CompetitorCurves(NamedTuple):
     """Mean over episodes of the cost in each stretch, in the data and every resample, ``(1 + resamples, stretches)``;
     None for bounds, and without truth."""
 
-    def at_measurements(self, chosen: numpy.ndarray, times: int) -> "CompetitorCurves":
+    def at_measurements(self, indices: numpy.ndarray, times: int) -> "CompetitorCurves":
         """Return the curves with only the measurements of these indices, out of ``times``."""
         over_time = {key for key, own in self.curves.items() if own.shape[-1:] == (times,)}
-        fewer = {key: own[..., chosen] if key in over_time else own for key, own in self.curves.items()}
+        fewer = {key: own[..., indices] if key in over_time else own for key, own in self.curves.items()}
         return self._replace(curves=fewer)
 
 
@@ -194,30 +194,32 @@ DIMENSIONS: dict[str, tuple[str, ...]] = {
 """Dimensions of a curve, after the competitor."""
 
 
-def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, episodes: int) -> xarray.Dataset:
+def stack_curves(
+    competitors: Sequence[CompetitorCurves], dataset: xarray.Dataset, episodes: int
+) -> xarray.Dataset:
     """Return the curves of several competitors as one dataset, see :func:`curves_of`.
 
     Args:
-        found: curves in the order of the policies of the evaluation.
+        competitors: curves in the order of the policies of the evaluation.
         dataset: the evaluation, of which only coordinates and attributes are needed.
         episodes: number of episodes of the curves.
     """
     units, shown = components_and_groups(dataset), select_quantities(dataset)
     names = {
-        "action_name": list(dict.fromkeys(name for each in found for name in each.actions)),
-        "gain_name": list(dict.fromkeys(name for each in found for name in each.gains)),
+        "action_name": list(dict.fromkeys(name for each in competitors for name in each.actions)),
+        "gain_name": list(dict.fromkeys(name for each in competitors for name in each.gains)),
     }
     variables: dict[str, Series] = {}
     for key, dims in DIMENSIONS.items():
         for ending in ENDINGS:
-            own = [each.curves.get(key + ending) for each in found]
+            own = [each.curves.get(key + ending) for each in competitors]
             shapes = [values.shape for values in own if values is not None]
             if not shapes:
                 continue
             listed = names.get(dims[0], []) if dims else []
             shape = (len(listed), *shapes[0][1:]) if listed else shapes[0]
-            stacked = numpy.full((len(found), *shape), numpy.nan)
-            for i, (values, each) in enumerate(zip(own, found, strict=True)):
+            stacked = numpy.full((len(competitors), *shape), numpy.nan)
+            for i, (values, each) in enumerate(zip(own, competitors, strict=True)):
                 if values is not None and listed:
                     of = each.actions if key == "action" else each.gains
                     stacked[i, [listed.index(name) for name in of]] = values
@@ -227,10 +229,10 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
                 key in variables or not numpy.isnan(stacked).all()
             ):  # a curve without a band has NaN for its ends
                 variables[key + ending] = (("policy", *dims), stacked)
-    variables |= _consistency_bands(found)
-    best = _cheapest(found, dataset)
+    variables |= _consistency_bands(competitors)
+    best = _cheapest(competitors, dataset)
     bases = {"paper": dataset.attrs["paper"], "best": best}
-    differences = _cost_differences(found, dataset["policy"].values.tolist(), bases)
+    differences = _cost_differences(competitors, dataset["policy"].values.tolist(), bases)
     variables |= differences
     coords: dict[str, Any] = {
         name: dataset[name].variable

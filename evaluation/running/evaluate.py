@@ -366,10 +366,10 @@ class Plan(NamedTuple):
         ]
         return StackedArrays(self.models, acting, episodes, drawn)
 
-    def dataset(self, kept: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
+    def dataset(self, arrays: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
         """Return the dataset of an evaluation from the arrays of values and the seeds of their episodes."""
         experiment = self.experiment
-        dataset = with_named_axes(kept, self.kinds, self.models, self.scenario.windows, seeds)
+        dataset = with_named_axes(arrays, self.kinds, self.models, self.scenario.windows, seeds)
         if self.flown is not None and self.lengths is not None:
             beyond = dataset["time"].values > self.lengths[:, None]
             for values in dataset.data_vars.values() if beyond.any() else ():

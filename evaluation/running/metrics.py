@@ -13,7 +13,14 @@ import numpy
 
 from ..competitors.kinds import RANKED
 from ..statistics.bootstrap import RESAMPLES, Bootstrap, IntervalEstimate, ratio, share_interval
-from ..statistics.cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
+from ..statistics.cause_split import (
+    EVERYTHING,
+    CauseCosts,
+    cause_sums,
+    compare_by_cause,
+    opponent_of,
+    split_by_cause,
+)
 from ..statistics.cause_split import VARIABLE as CAUSES
 from ..statistics.predictions import correlation, stretch_interval
 from ..statistics.statistic import ALL, Function, Key, Reduction, Statistic, identity, reduce_run
@@ -656,13 +663,13 @@ def contender_of(
             estimate = value if isinstance(value, IntervalEstimate) else bootstrap.interval(value)
             measures.append(Measure(metric, component, window, estimate, unit))
     if (nees := results.get(("episodes", "anees"))) is not None:
-        middle = bootstrap.interval(bootstrap.quantiles(nees, chosen=~numpy.isnan(nees)))
+        middle = bootstrap.interval(bootstrap.quantiles(nees, mask=~numpy.isnan(nees)))
         measures.append(Measure("median_anees", "state", "all", middle, "1"))
     further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
     causes = None
     if ("causes",) in results:
-        found, causes = split(results["causes",], run, bootstrap)
+        found, causes = split_by_cause(results["causes",], run, bootstrap)
         further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
     if (time := time_of(run)) is not None:
         estimate = IntervalEstimate(time.nanoseconds, math.nan, math.nan)
@@ -685,7 +692,7 @@ def _compare_causes(
     costs = {name: float(causes.of(EVERYTHING)[0]) for name, causes in split.items()}
     opponent = opponent_of(contender.name, costs, [c.name for c in contenders if c.kind in RANKED])
     if opponent:
-        for m in compare(split[contender.name], split[opponent], opponent, bootstrap):
+        for m in compare_by_cause(split[contender.name], split[opponent], opponent, bootstrap):
             yield Measure(m.metric, m.opponent, m.cause, m.estimate, "1")
 
 

@@ -136,12 +136,12 @@ class StackedArrays:
         self._episodes, self._drawn = episodes, min(drawn, episodes)
         self._written: list[tuple[int, slice, set[str]]] = []
 
-    def write(self, name: str, part: slice, kept: dict[str, numpy.ndarray]) -> None:
+    def write(self, name: str, part: slice, new_values: dict[str, numpy.ndarray]) -> None:
         """Write a competitor's values in some episodes, ``(episodes, time, ...)`` by name; empty the mapping."""
         place = self._places[name]
-        self._written.append((place, part, set(kept)))
-        while kept:
-            key, values = kept.popitem()
+        self._written.append((place, part, set(new_values)))
+        while new_values:
+            key, values = new_values.popitem()
             shape = values.shape[1:]
             if key == "action":
                 shape = (*shape[:-1], len(self.action_names))
@@ -155,7 +155,7 @@ class StackedArrays:
                 rows[...] = numpy.nan
                 rows[..., [self.action_names.index(each) for each in self.actions[name]]] = values
 
-    def finished(self) -> dict[str, numpy.ndarray]:
+    def finish(self) -> dict[str, numpy.ndarray]:
         """Return the arrays ``(policy, episode, time, ...)`` by name; NaN where nothing was written."""
         for key, array in self._arrays.items():
             for place, part, kept in self._written:
@@ -165,7 +165,7 @@ class StackedArrays:
 
 
 def with_named_axes(
-    kept: StackedArrays,
+    arrays: StackedArrays,
     kinds: Mapping[str, Kind],
     models: Mapping[str, Model],
     windows: Mapping[str, tuple[int, int]],
@@ -174,7 +174,7 @@ def with_named_axes(
     """Return the dataset of the values of all competitors, with coordinates and units.
 
     Args:
-        kept: the values.
+        arrays: the values.
         kinds: kind of every competitor.
         models: model of every competitor.
         windows: windows of the scenario.
@@ -186,7 +186,7 @@ def with_named_axes(
     components = [c.name for c in model.task.components]
     times = numpy.arange(1, model.task.horizon + 1)
     variables: dict[str, Any] = {}
-    for key, values in kept.finished().items():
+    for key, values in arrays.finish().items():
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += ["action_name"] if key == "action" else _further_dimensions(key, values.ndim - 4)
         variables[key] = (dims, values, _attributes(key, model.task.reward.cost))
@@ -218,5 +218,5 @@ def with_named_axes(
         coords["cause_phrase"] = ("cause", [cause.phrase for cause in causes])
         coords["start_measurements"] = Causes.of(model.task).start
     if "action" in variables:
-        coords["action_name"] = kept.action_names
+        coords["action_name"] = arrays.action_names
     return xarray.Dataset(variables, coords)

@@ -303,18 +303,18 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 
 @one_thread()
-def combine_summaries(found: Sequence[Summary]) -> Evaluation:
+def combine_summaries(parts: Sequence[Summary]) -> Evaluation:
     """Return the evaluation (records, curves, costs) of all competitors, from their summaries."""
     evaluation = _heads_together(
-        [one.head for one in found], [one.contender.losses for one in found], found[0].episodes
+        [one.head for one in parts], [one.contender.losses for one in parts], parts[0].episodes
     )
-    costs = {one.contender.name: one.contender.costs for one in found if one.contender.costs is not None}
-    records = records_of([one.contender for one in found], evaluation, cached_bootstrap(found[0].episodes))
-    each = [one.curves for one in found if one.curves is not None]
-    if len(each) < len(found):
+    costs = {one.contender.name: one.contender.costs for one in parts if one.contender.costs is not None}
+    records = records_of([one.contender for one in parts], evaluation, cached_bootstrap(parts[0].episodes))
+    each = [one.curves for one in parts if one.curves is not None]
+    if len(each) < len(parts):
         return Evaluation(evaluation, records, None, costs)
-    each = _actions_by_control(each, [one.contender.control for one in found])
-    curves = stack_curves(each, evaluation, found[0].episodes)
+    each = _actions_by_control(each, [one.contender.control for one in parts])
+    curves = stack_curves(each, evaluation, parts[0].episodes)
     return Evaluation(evaluation, records, curves, costs)
 
 

@@ -163,12 +163,12 @@ class Bootstrap:
         """Weight of every episode in the mean of the data and of each resample, ``(1 + resamples, episodes)``."""
         return self._counts[:, self._resampled(numpy.arange(self.episodes))] / self.totals[:, None]
 
-    def weights_of(self, some: slice) -> numpy.ndarray:
+    def weights_of(self, part: slice) -> numpy.ndarray:
         """Return the weights of a slice of episodes or groups, ``(1 + resamples, some)``; the last are cached."""
-        if self._last is None or self._last[0] != some:
+        if self._last is None or self._last[0] != part:
             self._last = None  # so that only one block of weights is in memory
-            which = some if self._clusters is None else self._clusters[some]
-            self._last = some, self._counts[:, which] / self.totals[:, None]
+            which = part if self._clusters is None else self._clusters[part]
+            self._last = part, self._counts[:, which] / self.totals[:, None]
         return self._last[1]
 
     def sums(
@@ -222,7 +222,7 @@ class Bootstrap:
         return mean_of_sums(functools.reduce(operator.add, parts))
 
     def quantiles(
-        self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
+        self, values: numpy.ndarray, share: float = 0.5, mask: numpy.ndarray | None = None
     ) -> numpy.ndarray:
         """Return a quantile over the episodes of the data and of every resample, ``(1 + resamples,)``.
 
@@ -232,9 +232,9 @@ class Bootstrap:
         Args:
             values: one for each episode, ``(episodes,)``.
             share: share of the weight below the quantile, such as 0.5 for the median.
-            chosen: true for episodes that count, ``(episodes,)`` booleans; None: all.
+            mask: true for episodes that count, ``(episodes,)`` booleans; None: all.
         """
-        which = numpy.arange(len(values)) if chosen is None else numpy.flatnonzero(chosen)
+        which = numpy.arange(len(values)) if mask is None else numpy.flatnonzero(mask)
         found = numpy.full(len(self._counts), numpy.nan)
         if not len(which):
             return found

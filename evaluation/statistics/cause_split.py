@@ -105,7 +105,7 @@ def cause_sums(
     return numpy.stack([numpy.einsum("set,et->es", values, held) for held in holding], axis=1, dtype=float)
 
 
-def split(
+def split_by_cause(
     sums: numpy.ndarray, run: "xarray.Dataset", bootstrap: Bootstrap
 ) -> tuple[list[CauseMeasure], CauseCosts]:
     """Return the shares of cost, mean costs and ANEES of a competitor under each cause that occurs.
@@ -169,7 +169,7 @@ def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) ->
     return min([other for other in others if other in ranked] or others, key=costs.__getitem__, default="")
 
 
-def compare(
+def compare_by_cause(
     own: CauseCosts, other: CauseCosts, opponent: str, bootstrap: Bootstrap
 ) -> Iterator[CauseMeasure]:
     """Yield the paired ratio of a competitor's mean cost to its opponent's, for each cause that both have."""

@@ -114,16 +114,16 @@ def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
     return LikelihoodSums(sums, counts, zlib.crc32(numpy.packbits(there).tobytes()))
 
 
-def likelihood_differences(found: Mapping[str, LikelihoodSums]) -> dict[str, IntervalEstimate]:
+def likelihood_differences(sums_by_name: Mapping[str, LikelihoodSums]) -> dict[str, IntervalEstimate]:
     """Return each competitor's mean log-likelihood of a measurement minus the best one's, by name.
 
     The interval is paired; there is none if the two have log-likelihoods of different measurements.
     """
-    if not found:
+    if not sums_by_name:
         return {}
-    best = max(found.values(), key=lambda one: one.mean)
+    best = max(sums_by_name.values(), key=lambda one: one.mean)
     differences = {}
-    for name, one in found.items():
+    for name, one in sums_by_name.items():
         if one.known == best.known:
             sums = numpy.stack([one.sums - best.sums, best.counts], axis=1)
             differences[name] = interval_of_sums(sums, best.counts, ratio)

@@ -111,10 +111,10 @@ class BlockBootstrap(Bootstrap):
         return numpy.concatenate([own, numpy.full((len(self._counts) - 1, *own.shape[1:]), math.nan)])
 
     def quantiles(
-        self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
+        self, values: numpy.ndarray, share: float = 0.5, mask: numpy.ndarray | None = None
     ) -> numpy.ndarray:
         """Return the episode's own value in the first row and NaN for every resample."""
-        return self.means(values if chosen is None else numpy.where(chosen, values, math.nan))
+        return self.means(values if mask is None else numpy.where(mask, values, math.nan))
 
     @property
     def sentence(self) -> str:
