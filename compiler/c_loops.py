@@ -75,10 +75,7 @@ class Loops:
         self._starts: dict[tuple[int, ...], str] = {}
 
     def loop(self, loop: Loop) -> list[str]:
-        """Return the C lines of a loop, after a comment with the functions of its operations.
-
-        A comment before the first line names the functions of its operations, unless the previous loop has the same.
-        """
+        """Return the C lines of a loop, after a comment with the functions of its operations if it is new."""
         first, *rest = self._lines(loop)
         callers = dict.fromkeys(self.program.callers.get(statement.origin, "") for statement in loop.body)
         names = [caller for caller in callers if caller]
@@ -90,10 +87,7 @@ class Loops:
         return [first, *rest]
 
     def _lines(self, loop: Loop) -> list[str]:
-        """Return the C lines of a loop, or of two nested ones where those need shorter tables.
-
-        The nested loops are over rows and columns, or over runs of members with constant distances.
-        """
+        """Return the C lines of a loop: one, or rows and columns, or runs of members with constant distances."""
         self._choose_form(loop)
         lines = []
         for number, operation, operands, logical, table, kept, _ in loop.body:

@@ -140,10 +140,7 @@ def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str])
 def _loop(
     block: LaneBlock, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
 ) -> list[str]:
-    """Return the LLVM lines of the loop over pairs of normal or uniform numbers.
-
-    It begins after the block ``before`` and ends with the block ``done_KIND``.
-    """
+    """Return the LLVM lines of the loop over pairs of random numbers, from the block ``before`` to ``done_KIND``."""
     text = _VectorText(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [

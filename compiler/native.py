@@ -152,10 +152,7 @@ _EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=F
 
 @contextmanager
 def optimised_code() -> Iterator[None]:
-    """Optimise programs at once inside the context, if they run in a :class:`~.sequence.CallSequence`.
-
-    Measured times then depend neither on the cache nor on the duration of earlier runs.
-    """
+    """Optimise programs in a :class:`~.sequence.CallSequence` at once in the context, for reproducible times."""
     token = _EAGER.set(True)
     try:
         yield

@@ -367,10 +367,7 @@ class Graph:
         return a if y == 1.0 else None
 
     def live(self, wanted: Iterable[int]) -> list[int]:
-        """Return the expressions needed to compute the wanted ones, in topological order, each as late as possible.
-
-        A sum of products is thus complete before the next begins, and its terms need no storage.
-        """
+        """Return the expressions needed to compute the wanted ones, in topological order, each as late as possible."""
         seen = bytearray(len(self.operations))
         order: list[int] = []
         operations, arguments, finish = self.operations, self.arguments, order.append

@@ -79,10 +79,7 @@ class VectorFunction:
 
     @functools.cached_property
     def linear(self) -> numpy.ndarray:
-        """Mask of the constant entries of the Jacobian, ``(m, n)``, from tests at random states of four magnitudes.
-
-        Entries of a wrapped angle are, too: the derivative of ``arctan2(sin(a), cos(a))`` is one.
-        """
+        """Mask of the constant entries of the Jacobian, ``(m, n)``, from random states of four magnitudes."""
         rng, count = numpy.random.default_rng(0), 8
         x = rng.normal(size=(self.inputs, 4 * count)) * numpy.repeat(10.0 ** numpy.arange(4), count)
         given = numpy.repeat(rng.uniform(0.1, 1.0, (self.given, 1)), 4 * count, axis=1)

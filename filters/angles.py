@@ -30,8 +30,5 @@ def unwrap(values: Array, reference: Array, periods: Mapping[int, float]) -> Arr
 
 
 def shorten(difference: Array, periods: Mapping[int, float]) -> Array:
-    """Return the differences ``(n, ...)`` with their angles reduced to within half a turn.
-
-    ``periods`` gives the period of each row that is an angle, by its number.
-    """
+    """Return differences ``(n, ...)`` with their angles within half a turn; ``periods`` by row as in :func:`unwrap`."""
     return unwrap(difference, 0.0 * difference, periods) if periods else difference

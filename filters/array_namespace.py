@@ -67,10 +67,7 @@ def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
 
 
 def select_nested(which: Array, one: Any, other: Any) -> Any:
-    """Return nested arrays ``(..., N)`` with entries of ``one`` where a mask ``(N,)`` is true, else of ``other``.
-
-    None stays None.
-    """
+    """Return nested arrays ``(..., N)`` with entries of ``one`` where a mask ``(N,)`` is true, else of ``other``."""
     return map_nested(functools.partial(namespace(which).where, which), one, other)
 
 

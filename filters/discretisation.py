@@ -41,10 +41,7 @@ class Series(NamedTuple):
 
 
 def choose_series(A: numpy.ndarray, longest: float) -> Series:
-    """Return the series that is exact to rounding for all intervals up to ``longest``, s.
-
-    For a chain of integrators it ends by itself.
-    """
+    """Return the series that is exact to rounding for intervals up to ``longest``, s; for integrators it ends."""
     power = numpy.eye(len(A))
     for k in range(1, len(A) + 1):
         power = power @ A

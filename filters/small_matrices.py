@@ -45,10 +45,7 @@ def transpose(A: Array) -> Array:
 
 
 def mirror_lower(A: Array) -> Array:
-    """Return the symmetric matrix ``(n, n, ...)`` that has the lower triangle of another.
-
-    Rounding makes the two triangles of a product differ.
-    """
+    """Return the symmetric matrix ``(n, n, ...)`` that has the lower triangle of another."""
     xp, rows = namespace(A), range(A.shape[0])
     return xp.stack([xp.stack([A[max(i, j), min(i, j)] for j in rows]) for i in rows])
 

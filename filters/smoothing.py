@@ -288,10 +288,7 @@ def _add_measurement(later: QuadraticLikelihood, arrival: Arrival) -> QuadraticL
 
 
 def _pull_back(likelihood: QuadraticLikelihood, motion: Motion, centre: Array) -> QuadraticLikelihood:
-    """Return the likelihood as a function of the state one scan before, about ``centre``.
-
-    The process noise is integrated out. The centre of the given likelihood is predicted from ``centre``.
-    """
+    """Return the likelihood as a function of the state one scan before, without the process noise, about ``centre``."""
     root = semidefinite_root(motion.Q)
     bent = product(likelihood.curvature, root)
     inner = semidefinite_root(_identity(centre) + product(transpose(root), bent))
@@ -322,9 +319,7 @@ def _posterior(likelihood: QuadraticLikelihood, root: Array) -> tuple[Gaussian, 
 def _likelihood_from_moments(
     centre: Array, root: Array, error: Gaussian, log_evidence: Array
 ) -> QuadraticLikelihood:
-    """Return the likelihood with which ``e ~ N(0, I)`` has this posterior mean and covariance.
-
-    The state is ``x = centre + root e``.
+    """Return the likelihood with which ``e ~ N(0, I)`` has this posterior; ``x = centre + root e``.
 
     In a direction in which the variance is not below one it carries no information.
     """

@@ -20,10 +20,7 @@ Array = Any
 
 
 def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
-    """Return selected entries of the last axis (lanes) of the arrays in nested tuples and dictionaries, as copies.
-
-    An integer selects one entry and removes the axis.
-    """
+    """Return entries of the last axis of nested arrays, as copies; an integer selects one and removes the axis."""
     if part is None:
         return None
     if isinstance(part, dict):
@@ -35,10 +32,7 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
 
 
 def takes_problem(maker: Any) -> bool:
-    """Return whether to call the maker of a competitor with the task or model as its argument.
-
-    That is so if its first argument has no default, or is named task or model.
-    """
+    """Return whether a maker's first argument is the task or model: it has no default, or that name."""
     try:
         first = next(iter(inspect.signature(maker).parameters.values()), None)
     except ValueError:  # for a compiled class

@@ -72,10 +72,7 @@ def kind_of(competitor: Any) -> Kind:
 
 
 def is_filter(competitor: Any) -> bool:
-    """Return whether a competitor is a :class:`.Filter`, or its maker makes one.
-
-    :func:`.filters.as_filter` wraps other estimators in a filter.
-    """
+    """Return whether a competitor is a :class:`.Filter`, or its maker makes one."""
     made = getattr(competitor, "func", competitor)
     return issubclass(made if isinstance(made, type) else type(made), Filter)
 
@@ -103,10 +100,7 @@ def make_competitor(maker: Any, problem: Task | Model) -> Any:
 
 
 def is_made_for_episodes(competitor: Any) -> bool:
-    """Return whether a competitor must be made for the episodes, with ``of_episodes(task, seeds)``.
-
-    A file of estimates is an example. ``of_episodes`` makes the competitor for the episodes with these seeds.
-    """
+    """Return whether a competitor, such as a file of estimates, has ``of_episodes(task, seeds)``."""
     return _has(competitor, "of_episodes")
 
 
@@ -174,11 +168,7 @@ class Policy:
         self.task: Any = model.task
 
     def begin(self, seeds: Sequence[int]) -> Any:
-        """Return the policy's memory at the start of the episodes with these seeds, for their first :meth:`predict`.
-
-        A policy with random numbers draws them from the seeds, so that an episode does not depend on the others beside
-        it.
-        """
+        """Return the policy's memory at the start of episodes; random numbers must be drawn from their seeds."""
         return None
 
     def predict(

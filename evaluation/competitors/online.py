@@ -294,10 +294,7 @@ class OnlineFilter:
         self._state = state._replace(history=History(taken))
 
     def _missed_scans(self, last: Any, at: Any) -> list[Any]:
-        """Return the times of the scans without a detection since the last measurement.
-
-        Only a filter that is set up for a log with a scan interval has such scans.
-        """
+        """Return the times of scans without a detection since the last measurement, for a log with scans."""
         interval = self._scan_interval
         scans = int(max(numpy.rint((at - last) / interval).max(), 1))
         if scans > MOST_MISSED:
@@ -422,12 +419,7 @@ class OnlineFilter:
             ) from None
 
     def _try(self, state: OnlineState) -> None:
-        """Check a state by an update with an example measurement; any error is raised.
-
-        A filter in Python, which may have hidden state, is skipped.
-
-        A filter in Python, which may have hidden state, is skipped.
-        """
+        """Check a state by an update with an example measurement, which may raise any error."""
         taken = state.history.taken
         first_track = lambda array: array[..., [0] * self.tracks]  # noqa: E731
         begun = self._begin(map_arrays(first_track, self.input.initial), {})
@@ -527,10 +519,7 @@ class OnlineFilter:
         return self._usual
 
     def _time_of(self, time: Any) -> Any:
-        """Return the time of a measurement, s, ``(N,)`` or for one track a float.
-
-        The default is one sampling interval after the last.
-        """
+        """Return the time of a measurement, s, ``(N,)`` or a float; by default one interval after the last."""
         if time is None:
             return self._running().input["time"] + self._default_interval()
         if self.tracks == 1 and isinstance(time, float | int) and 0.0 <= time < SINCE_1970:
@@ -564,10 +553,7 @@ class OnlineFilter:
             )
 
     def _padded(self, part: Any) -> Any:
-        """Return arrays with the last track repeated up to a multiple of eight lanes.
-
-        Rounding in matrix products must not depend on the number of tracks.
-        """
+        """Return arrays with the last track repeated up to a multiple of eight, which fixes rounding."""
         return map_arrays(lambda array: numpy.ascontiguousarray(array[..., self._pad]), part)
 
     def _check_restart(self) -> None:

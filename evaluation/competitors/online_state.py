@@ -95,10 +95,7 @@ class History:
 
 
 class OnlineState(NamedTuple):
-    """Complete state of an online filter; it can be pickled.
-
-    ``owner`` names the filter: environment and its interface, filter, tracks, version of the package.
-    """
+    """Complete state of an online filter; it can be pickled."""
 
     filter: Any
     """State of the filter, arrays ``(..., N)``."""

@@ -223,8 +223,6 @@ class ProgramEstimator:
 
         The hello is sent with the first measurement, since it describes its fields.
 
-        The hello is sent with the first measurement, since it describes its fields.
-
         Raises:
             ValueError: if it cannot be started.
         """

@@ -66,10 +66,7 @@ class Decider:
         self.means: DecisionMeans = DecisionMeans(model.fields, self.interval)
 
     def start(self, zero: Array) -> Decisions:
-        """Return the policy's state before the first decision; ``zero`` is an array ``(N,)`` of zeros.
-
-        ``zero`` is an array ``(N,)`` of zeros.
-        """
+        """Return the policy's state before the first decision; ``zero`` is an array ``(N,)`` of zeros."""
         memory = map_arrays(
             lambda array: self.xp.stack([zero] * max(int(numpy.size(array)), 1)), self._template
         )
@@ -81,10 +78,7 @@ class Decider:
         return (state.count == 0.0) | (state.count >= float(self.interval))
 
     def decide(self, observation: Array, state: Decisions) -> tuple[Array, Decisions]:
-        """Return the present action, ``(A, N)`` floats or ``(N,)`` integers, and the state after an observation.
-
-        The observation is ``(fields, N)``.
-        """
+        """Return the present action, ``(A, N)`` or ``(N,)``, and the state after an observation ``(fields, N)``."""
         xp, K = self.xp, self.interval
         first = state.count == 0.0
         due, total = self.is_due(state), state.total
@@ -219,8 +213,6 @@ def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = No
 
 def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Policy], Any]) -> Any:
     """Return a policy as a traced function, or None if it must run in Python.
-
-    Warn if a policy that is declared traceable cannot be traced.
 
     Warn if a policy that is declared traceable cannot be traced.
 

@@ -76,10 +76,7 @@ class SteppingPolicy(Policy):
         return {"control": self.control, **scenario, **self.task_keywords}
 
     def begin(self, seeds: Sequence[int]) -> PolicyMemory:
-        """Return the memory for the first :meth:`predict` in the episodes with these seeds.
-
-        Only policies that draw random numbers need it, such as ``random``; for the others None is enough.
-        """
+        """Return the memory for the first :meth:`predict` in some episodes; needed by random policies only."""
         own = self.policy
         return PolicyMemory(
             [
@@ -292,10 +289,7 @@ class CompiledUpdate:
         self._answers[self._now].run(self._width, self._threads)
 
     def report(self) -> dict[str, Any]:
-        """Return the values that the report function gave after the update, by name, in new arrays ``(..., N)``.
-
-        For one track they have no last axis.
-        """
+        """Return copies of the values that the report function gave after the update, by name, ``(..., N)``."""
         return {name: array.copy() if array.ndim else array[()] for name, array in self._report}
 
     @property
@@ -355,10 +349,7 @@ class ModelUpdate:
         self.state = self._episode.filter
 
     def report(self) -> dict[str, Any]:
-        """Return the values of the report function by name, in new arrays ``(..., N)``.
-
-        For one track they have no last axis.
-        """
+        """Return copies of the report function's values, by name, ``(..., N)``, without N for one track."""
         reported = self._model.run(self._make_report, self._episode)
         return {name: numpy.copy(array[self._cut])[()] for name, array in reported.items()}
 

@@ -113,10 +113,7 @@ def _frame(world: TaskEnv) -> Any:
 
 
 def _palette() -> Image.Image:
-    """Return an image with the palette of the figures' colours and their shades, common to all frames.
-
-    With a palette for each frame colours would flicker, and one chosen from the pixels would drop small details.
-    """
+    """Return an image with one palette for all frames, so that colours do not flicker and details are not lost."""
     from matplotlib.colors import to_rgb
 
     # Imported here, as in the environment, since it is optional.

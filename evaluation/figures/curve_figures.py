@@ -55,10 +55,7 @@ def _bound_abscissa(axis: Any, x: numpy.ndarray) -> None:
 
 
 def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
-    """Label the time axis: seconds below and measurements above, or only measurements below.
-
-    It has seconds if the sampling interval is constant.
-    """
+    """Label the time axis: seconds below and measurements above, or without constant interval only measurements."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
     if "elapsed" not in curves.coords:
@@ -165,10 +162,7 @@ def _draw_bands(
     distinct: Iterable[str],
     look: Mapping[str, Mapping[str, Any]],
 ) -> bool:
-    """Draw the bands about lines; return whether some were left out.
-
-    Bands that on average fill a third of the axis are left out: they would hide all lines.
-    """
+    """Draw the bands about lines, except those over a third of the axis; return whether some were left out."""
     left_out = False
     if panel.low is None or panel.high is None:
         return left_out
@@ -241,9 +235,7 @@ def draw_error_over_time(
 def draw_cost_difference(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Return a figure of the mean cost over time minus that of the paper's algorithm, and minus the best one's.
-
-    The 95 % bands are paired.
+    """Return a figure of mean costs over time minus those of the paper's algorithm and of the best; bands are paired.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -354,10 +346,7 @@ def draw_error_distribution(
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the names of policies whose mode probabilities vary by more than 0.02 over time.
-
-    Each has a list of the policies with the same probabilities.
-    """
+    """Return policies whose mode probabilities vary by over 0.02, each with those that have equal probabilities."""
     probabilities = {name: curves["mode_probability"].sel(policy=name).values for name in names}
     found = {
         name: values
@@ -372,9 +361,7 @@ def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, lis
 def draw_mode_probabilities(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Return a figure of the mode probabilities over time, averaged over episodes, with 95 % bands.
-
-    It contains highlighted policies whose probabilities vary.
+    """Return a figure of the mode probabilities over time of the highlighted policies, with 95 % bands.
 
     Arguments as of :func:`draw_error_over_time`.
     """

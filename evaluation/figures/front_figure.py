@@ -296,10 +296,7 @@ class _Names:
         return nearer
 
     def _crowding(self, boxes: numpy.ndarray) -> numpy.ndarray:
-        """Return the weighted overlap of each box with points, labels, lines and the frame.
-
-        Points weigh more than lines, labels more, and the frame most.
-        """
+        """Return the weighted overlap of each box with lines, points, labels and the frame, in order of weight."""
         left, bottom, right, top = boxes.T[..., None]
         margin = 0.8 * self.pixels
         found = numpy.zeros(len(boxes))

@@ -128,10 +128,7 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
 
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
-    """Return the names of the quantities with an error curve: groups of components, or the first three components.
-
-    Only those with a known truth.
-    """
+    """Return the names of quantities with known truth: groups of components, or the first three components."""
     reported = list(components_and_groups(dataset))
     return [name for name in groups_of(dataset) if name in reported] or reported[:3]
 
@@ -291,10 +288,7 @@ def cost_in_stretches(cost: numpy.ndarray) -> numpy.ndarray:
 
 
 def _stretch_coords(dataset: xarray.Dataset) -> dict[str, Any]:
-    """Return the coordinates of the stretches: the middle of each, as number of a measurement and in seconds.
-
-    In seconds only where the sampling interval is constant.
-    """
+    """Return the middle of each stretch as coordinates: measurement number, and seconds for constant intervals."""
     middles = {
         name: [float(dataset[name].values[stretch].mean()) for stretch in stretches_of(dataset.sizes["time"])]
         for name in ("time", "elapsed")

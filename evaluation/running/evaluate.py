@@ -106,10 +106,7 @@ OPTIONS = (
 
 @dataclass(frozen=True)
 class Experiment:
-    """Environment, episodes and options of an evaluation, as plain data for any process.
-
-    Another process imports the environment by its name.
-    """
+    """Environment, episodes and options of an evaluation, as plain data for any process."""
 
     task: type[Task]
     """Class of the environment's task."""
@@ -271,10 +268,7 @@ LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 
 
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
-    """Run some episodes of one competitor; return its values at all measurements by name, ``(episodes, time, ...)``.
-
-    For a policy whose action is a box they include ``action``, clipped to the limits of the box, as every bank does.
-    """
+    """Run some episodes of one competitor; return its values at all measurements by name, ``(episodes, time, ...)``."""
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
     kept, drawn = StoredValues(experiment.tracks), None
@@ -489,12 +483,7 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
 def _flights_in_turn(
     model: Model, split: str, seed: int, episodes: int
 ) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
-    """Return the seeds, flight numbers and lengths of episodes that fly each flight equally often.
-
-    A seed alone determines the flight and the episode. With fewer episodes than flights there is one of each flight.
-
-    The seed alone determines an episode. With fewer episodes than flights there is one of each flight.
-    """
+    """Return seeds, flight numbers and lengths of episodes that fly each flight equally often, at least once."""
     count = len(model.task.flights)
     share = -(-episodes // count)
     found: list[int] = []

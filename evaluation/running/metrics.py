@@ -130,11 +130,6 @@ def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | N
 
     They determine the length of blocks. Without truth they are sums of the log-likelihood; None where neither is
     known.
-
-    They determine the length of blocks. Without truth they are sums of the log-likelihood; None where neither is
-    known.
-
-    They are sums of the cost, without truth of the log-likelihood; None where neither is known.
     """
     known = [name for name in ("cost", "log_likelihood") if name in run]
     return units.sums_of_present(run[known[0]].values) if known else None
@@ -143,10 +138,7 @@ def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | N
 def bootstrap_over_time(
     units: TimeUnits, series: Sequence[numpy.ndarray | None], resamples: int = RESAMPLES
 ) -> Bootstrap:
-    """Return the bootstrap over blocks of one episode, whose length follows from the series of all competitors.
-
-    Without any series it has no resamples of time.
-    """
+    """Return the bootstrap over blocks of one episode; the series of all competitors determine their length."""
     known = [one for one in series if one is not None]
     return BlockBootstrap(units, known, resamples) if known else Bootstrap(1, resamples)
 
@@ -178,12 +170,7 @@ class Reduced(NamedTuple):
 
 
 def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
-    """Return the sums and samples over one competitor's episodes, from which its records follow.
-
-    The environment's ``metrics`` are not used for recordings.
-
-    The environment's ``metrics`` are not used for recordings.
-    """
+    """Return the sums and samples over one competitor's episodes, from which its records follow."""
     # An environment's own metrics need more of the truth than a recording contains.
     own = None if run.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)
@@ -194,12 +181,7 @@ def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) 
 
 
 def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset") -> Bootstrap:
-    """Return the bootstrap over the episodes of a reduced evaluation; for one episode over blocks of time.
-
-    It equals that of :func:`bootstrap_of`.
-
-    It equals that of :func:`bootstrap_of`.
-    """
+    """Return the bootstrap over the episodes of a reduced evaluation; for one episode over blocks of time."""
     if (units := reduced[0].units) is None:
         return bootstrap_of_episodes(evaluation)
     return bootstrap_over_time(units, [one.series for one in reduced])
@@ -246,8 +228,6 @@ def record_statistics(
     run: "xarray.Dataset", episodes: int, metrics: OwnMetrics | None = None
 ) -> Iterator[Statistic]:
     """Yield the statistics needed for a competitor's records, as declarations (:class:`.Statistic`).
-
-    Their keys contain metric, component, window and unit. The costs of all episodes are declared, too.
 
     Their keys contain metric, component, window and unit. The costs of all episodes are declared, too.
 
@@ -328,13 +308,6 @@ def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[
     Of a consistent filter the mean is one, and 95 % of the measurements are inside the chi-square distribution's
     two-sided interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001,
     5.4).
-
-    Of a consistent filter the mean is one, and the share of measurements inside the chi-square distribution's
-    two-sided interval 95 % (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation,
-    2001, 5.4).
-
-    The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
-    interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4).
     """
     component = "state" if metric == "nees" else "measurement"
     normalised, degrees = _over_dimension(run, metric)
@@ -419,11 +392,9 @@ def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarra
 def score(
     cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
 ) -> IntervalEstimate:
-    """Return ``(C_paper - C) / (C_paper - C_reference)`` with its interval, from mean costs or mean log costs.
+    """Return ``(C_paper - C) / (C_paper - C_reference)`` with its interval; NaN if the reference is hardly better.
 
-    Each is ``(1 + resamples,)``. It is NaN unless the reference is significantly better than the paper's algorithm.
-
-    Each is ``(1 + resamples,)``. It is NaN unless the reference is significantly better than the paper's algorithm.
+    Each is the mean of costs or log costs in the data and every resample, ``(1 + resamples,)``.
     """
     room = paper - reference
     # Where the reference is not significantly better than the paper, a ratio to their difference means nothing, and
@@ -488,11 +459,7 @@ class _Against:
         }
 
     def _columns(self, part: slice) -> numpy.ndarray:
-        """Return cost, log cost, loss and win of every competitor for some episodes, ``(some, columns)``.
-
-        For every competitor: the cost, its logarithm, whether the track is lost, and whether the cost is less than that
-        of the paper's algorithm.
-        """
+        """Return cost, log cost, loss and win of every competitor for some episodes, ``(some, columns)``."""
         costs = [own[part] for own in self.costs.values()]
         with numpy.errstate(divide="ignore", invalid="ignore"):
             columns = [*costs, *map(numpy.log, costs), *(own > self.bound for own in costs)]
@@ -501,10 +468,7 @@ class _Against:
         return numpy.stack(columns, axis=1)
 
     def behind_best(self, name: str) -> Iterator[Measure]:
-        """Yield the paired ratio of the cost to the best one's, minus one, and the share of resamples won.
-
-        That is the share in which this competitor has the lowest cost.
-        """
+        """Yield the paired ratio of the cost to the best one's, minus one, and the share of resamples that it wins."""
         if name in self.ranked:
             difference = self._difference(name, self.best)
             yield Measure("behind_best", self.best, "all", difference, "1")

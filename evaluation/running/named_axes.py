@@ -77,10 +77,7 @@ def recording_coords(
 
 
 def _further_dimensions(key: str, count: int) -> list[str]:
-    """Return the names of a variable's dimensions after policy, episode and time.
-
-    Their number is ``count`` plus one; below zero there are none.
-    """
+    """Return the names of a variable's ``count + 1`` dimensions after policy, episode and time."""
     if count < 0:
         return []
     key = key.removeprefix(DRAWN_PREFIX)

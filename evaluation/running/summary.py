@@ -285,10 +285,7 @@ def summaries(
 
 
 def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:
-    """Return the pieces of work as lists of pieces that share a model, so that one process traces it once.
-
-    A batch takes the place of its first piece, and contains at most ``BATCH`` measurements, or one piece.
-    """
+    """Return lists of requests that share a model, with at most ``BATCH`` measurements; a process traces it once."""
     batches: list[list[tuple[int, EvaluationRequest]]] = []
     last: dict[Any, tuple[list[tuple[int, EvaluationRequest]], int]] = {}
     for i, piece in pieces:
@@ -331,12 +328,7 @@ def _actions_by_control(
 
 
 class SeparateResults(NamedTuple):
-    """Reduced results of one competitor over flights, a recording or one episode.
-
-    All competitors are resampled together.
-
-    All competitors are resampled together.
-    """
+    """Reduced results of one competitor over flights, a recording or one episode; all are resampled together."""
 
     reduced: Reduced
     flights: list[Reduced]

@@ -50,10 +50,7 @@ def ratio(sums: numpy.ndarray) -> numpy.ndarray:
 
 
 def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
-    """Return the means, ``(1 + resamples, ...)``, from the sums :meth:`Bootstrap.sums` over all episodes.
-
-    NaN where no episode has a number.
-    """
+    """Return the means ``(1 + resamples, ...)`` from the sums :meth:`Bootstrap.sums` of all episodes; NaN for none."""
     return sums[:, 0] if sums.shape[1] == 1 else ratio(sums)
 
 
@@ -150,10 +147,7 @@ class Bootstrap:
         return episodes // self._group if self._clusters is None else self._clusters[episodes]
 
     def _weigh(self, numbers: numpy.ndarray) -> numpy.ndarray:
-        """Return the sums of integers ``(clusters, ...)``, weighted by the counts of each resample.
-
-        The result has shape ``(1 + resamples, ...)``.
-        """
+        """Return sums ``(1 + resamples, ...)`` of integers ``(clusters, ...)``, with the counts of each resample."""
         numbers = numbers.astype(float)
         parts = (self._counts[i : i + AT_ONCE] for i in range(0, len(self._counts), AT_ONCE))
         return numpy.concatenate([part.astype(float) @ numbers for part in parts])
@@ -260,19 +254,13 @@ class Bootstrap:
         return found
 
     def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
-        """Return the percentile interval of a statistic of the data and its resamples, ``(1 + resamples,)``.
-
-        With one episode it has no ends.
-        """
+        """Return the percentile interval of a statistic in the data and its resamples, ``(1 + resamples,)``."""
         if self._counts.shape[1] == 1:
             statistics = statistics[:1]
         return IntervalEstimate(*percentile_interval(statistics).tolist())
 
     def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
-        """Return the paired relative difference of two competitors' means, with its interval.
-
-        Both are from :meth:`means`.
-        """
+        """Return the paired relative difference of two competitors' :meth:`means`, with its interval."""
         return self.interval(means / others - 1.0)
 
     def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:

@@ -46,10 +46,7 @@ def library_versions(libraries: Iterable[str]) -> dict[str, str]:
 
 @functools.cache
 def code_digest() -> str:
-    """Return a hexadecimal SHA-256 digest of the package's files and the versions of Python and numerical libraries.
-
-    It is computed once for a process, which does not run later edits.
-    """
+    """Return a cached SHA-256 digest of the package's files and the versions of Python and numerical libraries."""
     installed = library_versions(LIBRARIES)
     versions = [python_version(), *(installed.get(library, "") for library in LIBRARIES)]
     return hashlib.sha256(f"{versions} {files_digest(package_folders())}".encode()).hexdigest()

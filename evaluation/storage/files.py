@@ -64,10 +64,7 @@ def _make_folder(path: Path) -> Iterator[None]:
 
 
 def _lock(handle: int) -> bool:
-    """Try to lock an open file or folder; return False if another process has locked it.
-
-    The lock ends when the file is closed, or with the process.
-    """
+    """Try to lock an open file or folder until it is closed; return False if another process has locked it."""
     try:
         if fcntl is None:
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
@@ -246,8 +243,6 @@ def whole_files(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder; its files are moved into ``folder`` when the context ends without error.
 
     Files in its subfolders go into the same subfolders of ``folder``.
-
-    Files of its subfolders go into the same subfolders there.
 
     Raises:
         ValueError: if they cannot be written.
