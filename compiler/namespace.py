@@ -572,7 +572,10 @@ def _is_loop(matrix: Any) -> builtins.bool:
 
 
 def matmul(a: Any, b: Any, /) -> Traced:
-    """Return the matrix product, with terms in order, without constant zeros; a large constant matrix makes a loop."""
+    """Return the matrix product, with terms added in order and those with a constant zero left out.
+
+    Where the graph allows loops, the product with a large matrix of constants is a loop.
+    """
     if _is_loop(b):  # x^T B = (B^T x)^T
         return matmul(b.T, asarray(a).mT).mT if asarray(a).ndim > 1 else matmul(b.T, a)
     if _is_loop(a):

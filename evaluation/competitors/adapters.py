@@ -20,7 +20,7 @@ Array = Any
 
 
 def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
-    """Return entries of the last axis of nested arrays, as copies; an integer selects one and removes the axis."""
+    """Return lanes (entries of the last axis) of nested arrays, as copies; an integer removes the axis."""
     if part is None:
         return None
     if isinstance(part, dict):

@@ -62,7 +62,7 @@ class Adapter(Filter[Task, Any, AdaptedState]):
         return self.first(initial, self.own.start(initial, initial.mean.shape[-1]))
 
     def first(self, initial: Any, memory: Any) -> AdaptedState:
-        """Return the state before the first measurement, with the estimator's memory."""
+        """Return the filter's state before the first measurement, with the initial estimate and a memory."""
         return AdaptedState(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
 
     def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:

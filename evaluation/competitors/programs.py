@@ -322,7 +322,7 @@ class ProgramEstimator:
         return C + C * C + (0 if self._feedback_field is None else _count([self._feedback_field]))
 
     def _greet(self, measurement: Any) -> None:
-        """Exchange the hello with the program, and send the initial estimate."""
+        """Exchange the first messages (hello and format) with the program, and send the initial estimate."""
         assert self._process is not None
         assert self._initial is not None
         hello = self.program.preface + json.dumps(self.hello(measurement)).encode() + b"\n"

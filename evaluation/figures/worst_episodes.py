@@ -79,8 +79,8 @@ def run_episodes(
 
 
 def _with_episodes(plan: Plan, numbers: list[int]) -> Plan:
-    flown, lengths = (None if each is None else each[numbers] for each in (plan.flown, plan.lengths))
-    return plan._replace(seeds=[plan.seeds[i] for i in numbers], flown=flown, lengths=lengths)
+    flown, lengths = (None if each is None else each[numbers] for each in (plan.flight_numbers, plan.lengths))
+    return plan._replace(seeds=[plan.seeds[i] for i in numbers], flight_numbers=flown, lengths=lengths)
 
 
 def describe_worst(

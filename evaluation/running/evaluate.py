@@ -281,10 +281,10 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
         optimised_code() if experiment.timed else nullcontext(),
         report_running(piece.name, tick) as report_progress,
     ):
-        flown = run_episodes(
+        result = run_episodes(
             model, piece.maker, kind, piece.seeds, report, piece.name, report_progress, drawn
         )
-    arrays = dict(flown.found)
+    arrays = dict(result.found)
     if kind == "policy":
         _check_reserved(model, arrays)
     if experiment.strict and "lost" in arrays and arrays["lost"].any():
@@ -295,8 +295,8 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
         raise ValueError(
             f"estimator {piece.name!r}: {reason} in episode {piece.first + i} at measurement {k + 1}"
         )
-    if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
-        box, action = model.action_space, numpy.asarray(flown.action, dtype=numpy.float64)
+    if result.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
+        box, action = model.action_space, numpy.asarray(result.action, dtype=numpy.float64)
         arrays["action"] = numpy.clip(action, box.low, box.high).reshape(*action.shape[:2], -1)
     if kind in ("estimator", "smoother", "reference"):
         for name in LIKELIHOOD:
@@ -327,7 +327,7 @@ class Plan(NamedTuple):
     """Seeds of the planned episodes."""
     first: int
     """Number of the first planned episode."""
-    flown: numpy.ndarray | None
+    flight_numbers: numpy.ndarray | None
     """Number of the flight of each episode."""
     lengths: numpy.ndarray | None
 
@@ -364,17 +364,17 @@ class Plan(NamedTuple):
         """Return the dataset of an evaluation from the arrays of values and the seeds of their episodes."""
         experiment = self.experiment
         dataset = with_named_axes(arrays, self.kinds, self.models, self.scenario.windows, seeds)
-        if self.flown is not None and self.lengths is not None:
+        if self.flight_numbers is not None and self.lengths is not None:
             beyond = dataset["time"].values > self.lengths[:, None]
             for values in dataset.data_vars.values() if beyond.any() else ():
                 values.values[:, beyond[: values.shape[1]]] = numpy.nan
             dataset = dataset.assign_coords(
-                flight=("episode", [self.scenario.flights[i] for i in self.flown]),
+                flight=("episode", [self.scenario.flights[i] for i in self.flight_numbers]),
                 length=("episode", self.lengths),
             )
             if self.scenario.recording is not None:
                 dataset = dataset.assign_coords(
-                    recording_coords(self.scenario.recording, self.flown, dataset)
+                    recording_coords(self.scenario.recording, self.flight_numbers, dataset)
                 )
                 dataset = with_innovations(dataset, next(iter(self.models.values())).task)
         task = next(iter(self.models.values())).task

@@ -198,7 +198,7 @@ def reduce_episodes(
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
     """
     plan = plan_of(request.experiment, {request.name: request.maker}, request.first, request.end)
-    if plan.flown is not None:
+    if plan.flight_numbers is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
     bootstrap = cached_bootstrap(request.episodes)
     block = block_of(plan.models[request.name].task.horizon)

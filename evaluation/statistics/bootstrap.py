@@ -211,7 +211,7 @@ class Bootstrap:
         return self.means_of(lambda part: values[part])
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Return the means over the data and every resample, of values that a function gives for each slice."""
+        """Return the means over the data and every resample, of values that a function gives for episode slices."""
         parts = (self.sums([values(slice(i, i + BLOCK))], i)[0] for i in range(0, self.episodes, BLOCK))
         return mean_of_sums(functools.reduce(operator.add, parts))
 

@@ -38,7 +38,7 @@ class Alteration(NamedTuple):
 
 
 def _cut(stream: Stream, begin: int, end: int | None) -> Stream:
-    """Return a stream cut some measurements after the end of a temporary or the begin of a lasting alteration."""
+    """Return a stream cut some measurements after the end of a temporary or the beginning of a lasting alteration."""
     length = LASTING if end is None else end + AFTERWARDS
     return replace(stream.select(numpy.arange(min(length, len(stream)))), begin=begin, end=end)
 
