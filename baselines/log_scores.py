@@ -240,7 +240,7 @@ class LogScores:
 
     def _log_values(self, values: Any, first: int, rows: int) -> numpy.ndarray:
         """Return the log's values from a measurement on, ``(..., E, rows)``; NaN beyond the end of an episode."""
-        some = values[self._plan.flown, first : first + rows].astype(float)
+        some = values[self._plan.flight_numbers, first : first + rows].astype(float)
         return numpy.where(
             self._there[:, first : first + rows],
             numpy.moveaxis(some, -1, 0) if some.ndim > 2 else some,
