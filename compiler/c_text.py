@@ -68,14 +68,14 @@ class Parameter(NamedTuple):
     name: str
 
 
-def identifier(words: str, taken: Collection[str] = ()) -> str:
+def identifier(text: str, used_names: Collection[str] = ()) -> str:
     """Return a valid C identifier for a text, different from reserved names and those in use.
 
     Args:
-        words: any text.
-        taken: names that are already in use.
+        text: any text.
+        used_names: names that are already in use.
     """
-    plain = unicodedata.normalize("NFKD", words).encode("ascii", "ignore").decode()
+    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:60] or "x"
     if not name[0].isalpha():
         name = f"n{name}"
@@ -83,7 +83,7 @@ def identifier(words: str, taken: Collection[str] = ()) -> str:
     if name in _RESERVED or re.fullmatch(r"[vrw]\d*", name):
         name += "_"
     unique, number = name, 2
-    while unique in taken:
+    while unique in used_names:
         unique, number = f"{name}_{number}", number + 1
     return unique
 

@@ -14,15 +14,12 @@ Statement = int | ProgramResult
 
 
 def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[list[list[Statement]], int]:
-    """Return the statements of each part of a program, and the number of parts before a pause.
+    """Return the statements of each part of a program (at least one part), and the number of parts before a pause.
 
     Args:
         program: the program.
         size: number of statements of a part.
         pause: a step at which a new part begins.
-
-    Returns:
-        Parts, at least one, and the number of parts before the pause.
     """
     results: dict[int, list[Statement]] = {}
     for result in program.results:

@@ -30,9 +30,6 @@ def posterior_cramer_rao_bound(P: Array, H: Array, R: Array) -> Array:
         P: bound before it, ``(n, n, N)``.
         H: measurement matrix, ``(m, n)`` or ``(m, n, N)``.
         R: covariance of the measurement noise at the true state, ``(m, m)`` or ``(m, m, N)``.
-
-    Returns:
-        ``(n, n, N)``.
     """
     nothing = 0.0 * P[:, 0]
     result: Update = update(nothing, P, nothing[: H.shape[0]], H, R)

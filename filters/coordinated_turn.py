@@ -109,15 +109,12 @@ def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple
 
 
 def augment_turn_rate(mean: Array, covariance: Array, variance: float) -> tuple[Array, Array]:
-    """Return mean and covariance of position and velocity, augmented by an independent turn rate of mean zero.
+    """Return mean ``(5, N)`` and covariance of position and velocity, with an independent turn rate of mean zero.
 
     Args:
         mean: mean of position and velocity, ``(4, N)``.
         covariance: their covariance, ``(4, 4, N)``.
         variance: variance of the turn rate, (rad/s)^2.
-
-    Returns:
-        Mean ``(5, N)`` and covariance ``(5, 5, N)``.
     """
     xp = namespace(mean)
     zero = 0.0 * mean

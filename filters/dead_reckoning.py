@@ -54,15 +54,12 @@ def _both_axes(block: list[list[Array]]) -> Array:
 
 
 def start(mean: Array, covariance: Array, deviation: float | Array) -> tuple[Array, Array]:
-    """Return mean and covariance of the state at a first measured position, ``p = z - e - n``.
+    """Return mean ``(6, N)`` and covariance of the state at a first measured position, ``p = z - e - n``.
 
     Args:
         mean: position and velocity, the position as it was measured, ``(4, N)``, m and m/s.
         covariance: covariance of their white errors, ``(4, 4, N)``.
         deviation: s, standard deviation of the receiver's error, m.
-
-    Returns:
-        Mean ``(6, N)`` and covariance ``(6, 6, N)``.
     """
     xp = namespace(mean)
     zero = 0.0 * mean[0]

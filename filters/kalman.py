@@ -79,7 +79,7 @@ def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Upda
 
 
 def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list[float]], list[list[float]]]:
-    """Return F and Q of the constant-velocity model with a piecewise constant white acceleration.
+    """Return F and Q, nested lists, of the constant-velocity model with a piecewise constant white acceleration.
 
     ``F = [[I, T I], [0, I]]``, ``Q = sigma^2 [[T^4/4 I, T^3/2 I], [T^3/2 I, T^2 I]]`` for the state
     (positions, velocities); ``B = [T^2/2, T]`` of the IMM paper with ``w ~ N(0, sigma^2)``.
@@ -88,9 +88,6 @@ def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list
         T: sampling interval, s.
         sigma: standard deviation of the acceleration, m/s^2.
         axes: number of coordinates.
-
-    Returns:
-        F and Q as nested lists.
     """
     n = 2 * axes
     F = [[1.0 if i == j else T if j == i + axes else 0.0 for j in range(n)] for i in range(n)]

@@ -13,13 +13,10 @@ from .array_namespace import Array
 
 
 def ordered_sum(values: Iterable[Array]) -> Array:
-    """Return the sum over the first axis, ``((values[0] + values[1]) + values[2]) + ...``.
+    """Return the sum ``(...)`` over the first axis, ``((values[0] + values[1]) + values[2]) + ...``.
 
     Args:
         values: terms, an array ``(M, ...)`` or any series of at least one array.
-
-    Returns:
-        Sum, ``(...)``.
     """
     return functools.reduce(operator.add, values)
 

@@ -24,14 +24,11 @@ def product(A: Array, B: Array) -> Array:
 
 
 def apply(A: Array, x: Array) -> Array:
-    """Return the matrix-vector product ``y[i] = sum_j A[i, j] x[j]`` for a batch on the last axes.
+    """Return the vectors ``y[i] = sum_j A[i, j] x[j]``, ``(n, ...)``, for a batch of matrices on the last axes.
 
     Args:
         A: matrices, ``(n, m, ...)``.
         x: vectors, ``(m, ...)``, with trailing axes that broadcast against those of ``A``.
-
-    Returns:
-        Vectors, ``(n, ...)``.
     """
     total = A[:, 0] * x[0]
     for j in range(1, x.shape[0]):

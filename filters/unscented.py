@@ -95,16 +95,13 @@ def limit_spread(jacobian: Array, covariance: Array, limit: float) -> Spread:
 def transform(
     mean: Array, covariance: Array, function: Callable[[Array], Array], spread: Spread = GAUSSIAN
 ) -> tuple[Array, Array]:
-    """Return mean and covariance of a function of a Gaussian variable.
+    """Return mean ``(m, ...)`` and covariance ``(m, m, ...)`` of a function of a Gaussian variable.
 
     Args:
         mean: mean, ``(n, ...)``.
         covariance: covariance, ``(n, n, ...)``, positive definite.
         function: function from points ``(n, 2n + 1, ...)`` to ``(m, 2n + 1, ...)``.
         spread: parameters of the transform.
-
-    Returns:
-        Mean ``(m, ...)`` and covariance ``(m, m, ...)``.
     """
     points = function(sigma_points(mean, covariance, spread))
     for_mean, for_covariance = weights(mean.shape[0], spread)

@@ -47,13 +47,13 @@ class Adapter(Filter[Task, Any, AdaptedState]):
 
     Args:
         task: the estimation problem.
-        own: the estimator, made for the task.
+        estimator: the estimator, made for the task.
     """
 
-    def __init__(self, task: Task, own: Any) -> None:
+    def __init__(self, task: Task, estimator: Any) -> None:
         super().__init__(task)
-        self.own = own
-        self.in_python: bool = not getattr(own, "traceable", False)
+        self.own = estimator
+        self.in_python: bool = not getattr(estimator, "traceable", False)
         self.has_likelihood: bool = False
         """Whether the estimator has ever returned a log-likelihood."""
 
@@ -99,9 +99,9 @@ class Adapter(Filter[Task, Any, AdaptedState]):
 class ReferenceAdapter(Adapter):
     """Filter that calls a user's reference, with the truth, see :class:`.kinds.Reference`."""
 
-    def __init__(self, task: Task, own: Any) -> None:
-        super().__init__(task, own)
-        self.knows: str = getattr(own, "knows", "") or "the truth"
+    def __init__(self, task: Task, reference: Any) -> None:
+        super().__init__(task, reference)
+        self.knows: str = getattr(reference, "knows", "") or "the truth"
 
     def initialise(self, given: FilterInput) -> AdaptedState:
         """Start the reference with the initial estimate and the truth; return the state."""
@@ -125,12 +125,12 @@ class BoundAdapter(ReferenceAdapter):
         return limit, None, memory
 
 
-def as_filter(task: Task, own: Any, kind: Kind = "estimator") -> Filter[Any, Any, Any]:
+def as_filter(task: Task, competitor: Any, kind: Kind = "estimator") -> Filter[Any, Any, Any]:
     """Return a filter that calls a user's estimator, reference or bound; a filter is returned unchanged."""
-    if isinstance(own, Filter):
-        return own
+    if isinstance(competitor, Filter):
+        return competitor
     adapters = {"reference": ReferenceAdapter, "bound": BoundAdapter}
-    return adapters.get(kind, Adapter)(task, own)
+    return adapters.get(kind, Adapter)(task, competitor)
 
 
 class PythonFilter(Filter[Task, Any, AdaptedState]):
@@ -138,10 +138,10 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
 
     Args:
         task: the estimation problem.
-        own: the filter; None while the steps of the world are traced.
+        wrapped: the filter; None while the steps of the world are traced.
         name: kind and name of the competitor, for error messages.
         count: number of episodes; further lanes repeat the last episode. None: all lanes are used as they are.
-        stated: components that the filter reports, where ``own`` is None.
+        stated: components that the filter reports, where ``wrapped`` is None.
     """
 
     in_python = True
@@ -149,21 +149,21 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
     def __init__(
         self,
         task: Task,
-        own: Any = None,
+        wrapped: Any = None,
         name: str = "",
         count: int | None = None,
         stated: Stated | None = None,
     ) -> None:
         super().__init__(task)
-        self.own = own
+        self.own = wrapped
         self.name = name
         self.count = count
-        self.stated: Stated | None = getattr(own, "stated", stated)
+        self.stated: Stated | None = getattr(wrapped, "stated", stated)
         self.memory: Any = None
         self.step_number: int = 0
         self.extra: Mapping[str, Array] = {}
         """Records of the last measurement by name, such as the log-likelihood."""
-        self.knows: str = getattr(own, "knows", "")
+        self.knows: str = getattr(wrapped, "knows", "")
 
     @property
     def fault(self) -> int:
@@ -268,11 +268,11 @@ class CheckedFilter(Filter[Task, Any, Checked]):
     itself, so losing an episode is no advantage.
     """
 
-    def __init__(self, task: Task, own: Filter[Any, Any, Any]) -> None:
+    def __init__(self, task: Task, wrapped: Filter[Any, Any, Any]) -> None:
         super().__init__(task)
-        self.own = own
-        self.in_python: bool = own.in_python
-        self.stated: Stated | None = own.stated
+        self.own = wrapped
+        self.in_python: bool = wrapped.in_python
+        self.stated: Stated | None = wrapped.stated
 
     def start(self, initial: Any) -> Checked:
         """Return the state of the filter, started with the initial estimate."""
@@ -340,7 +340,7 @@ def is_lacking(received: Any, xp: Any) -> Array:
     return lacking
 
 
-def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp: Any) -> Array:
+def find_fault(mean: Array, covariance: Array, earlier_fault: Array, any_missing: Array, xp: Any) -> Array:
     """Return the number of the fault of each estimate, ``(N,)``: not finite, not symmetric, not positive definite.
 
     An earlier fault has priority.
@@ -348,8 +348,8 @@ def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp:
     Args:
         mean: means, ``(C, N)``.
         covariance: covariances, ``(C, C, N)``.
-        before: number of the reason why the episode was lost earlier, ``(N,)``; zero where it was not.
-        missed: above zero where a measurement was missing so far, ``(N,)``.
+        earlier_fault: number of the reason why the episode was lost earlier, ``(N,)``; zero where it was not.
+        any_missing: above zero where a measurement was missing so far, ``(N,)``.
         xp: array namespace.
 
     Returns:
@@ -370,9 +370,9 @@ def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp:
     fault = xp.where(definite, fault, 3.0)
     fault = xp.where(finite[1], fault, 2.0)
     fault = xp.where(finite[0], fault, 1.0)
-    unreceived = (missed > 0.0) & ((fault == 1.0) | (fault == 2.0))
+    unreceived = (any_missing > 0.0) & ((fault == 1.0) | (fault == 2.0))
     fault = xp.where(unreceived, AFTER_MISSED, fault)
-    return xp.where(before > 0.0, before, fault)
+    return xp.where(earlier_fault > 0.0, earlier_fault, fault)
 
 
 class AroundBank(Filter[Task, Any, State]):
@@ -415,16 +415,16 @@ class BoundFilter(AroundBank[LimitState]):
 
     Args:
         task: the estimation problem.
-        own: the bound as a filter.
+        bound: the bound as a filter.
         bank: the bank whose estimate closes the loop.
     """
 
-    def __init__(self, task: Task, own: Filter[Any, Any, Any], bank: Any) -> None:
+    def __init__(self, task: Task, bound: Filter[Any, Any, Any], bank: Any) -> None:
         super().__init__(task)
-        self.own = own
+        self.own = bound
         self.bank = bank
-        self.in_python: bool = own.in_python
-        self.knows: str = own.knows or "the truth"
+        self.in_python: bool = bound.in_python
+        self.knows: str = bound.knows or "the truth"
 
     def initialise(self, given: FilterInput) -> LimitState:
         """Return the state at the start of bank and bound; the bound receives the truth."""
@@ -447,11 +447,13 @@ class BoundFilter(AroundBank[LimitState]):
         return {"mean_square": self.own.mean(state.own)}
 
 
-def wrap_for_loop(kind: Kind, model: Model, own: Filter[Any, Any, Any]) -> Filter[Any, Any, Any]:
+def wrap_for_loop(
+    kind: Kind, model: Model, competitor_filter: Filter[Any, Any, Any]
+) -> Filter[Any, Any, Any]:
     """Return an estimator's filter with checks, a bound's with a bank that closes the loop, a reference's unchanged."""
     if kind == "bound":
-        return BoundFilter(model.task, own, model.filter)
-    return CheckedFilter(model.task, own) if kind in TRUTH_FREE_KINDS else own
+        return BoundFilter(model.task, competitor_filter, model.filter)
+    return CheckedFilter(model.task, competitor_filter) if kind in TRUTH_FREE_KINDS else competitor_filter
 
 
 @dataclass(frozen=True)
@@ -485,19 +487,19 @@ def _can_be_traced(maker: Any, own: Filter[Any, Any, Any]) -> bool:
     return True
 
 
-def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
+def check_knowledge(name: str, competitor: Any, kind: Kind, task: Task) -> None:
     """Raise ValueError unless a reference or bound lists every disturbance of the world in ``disturbances``.
 
     Args:
         name: its name, for error messages.
-        own: reference or bound, see :class:`.kinds.Reference`.
+        competitor: reference or bound, see :class:`.kinds.Reference`.
         kind: its kind.
         task: task of the world.
 
     Raises:
         ValueError: if one is missing: a new disturbance could make it worse than estimators without that knowledge.
     """
-    known = getattr(own, "disturbances", ())
+    known = getattr(competitor, "disturbances", ())
     for part in task.world.disturbances.parts if known is not None else ():
         if part.name not in known:
             raise ValueError(

@@ -65,8 +65,7 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
         * ``rmse`` (policy, quantity, time), in the unit of the quantity, with ``rmse_low`` and ``rmse_high``: root of
           the mean square error over episodes;
         * ``error_exceeded`` (policy, quantity, share), in the unit of the quantity: size of error that this share of
-            measurements reaches
-          or exceeds; none of bounds, nor where there are too few measurements for a share;
+          measurements reaches or exceeds; none of bounds, nor where there are too few measurements for a share;
         * ``anees`` and ``anis`` (policy, time): mean NEES and NIS over their dimension, with the 95 % chi-square band
           of that mean, ``anees_low`` and so on, (time);
         * ``mode_probability`` (policy, mode, time) and ``true_class_probability`` (policy, time): means over episodes,
@@ -275,13 +274,10 @@ def stretches_of(times: int) -> list[slice]:
 
 
 def cost_in_stretches(cost: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean cost of every episode in each of its stretches; NaN where it has no cost.
+    """Return the mean cost in each stretch of every episode, ``(episodes, stretches)``; NaN where it has no cost.
 
     Args:
         cost: ``(episodes, time)``; NaN where there is none.
-
-    Returns:
-        ``(episodes, stretches)``.
     """
     means = [ratio(sums_of_present(cost[:, stretch])) for stretch in stretches_of(cost.shape[1])]
     return numpy.stack(means, axis=1)

@@ -96,9 +96,6 @@ def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
 
     Args:
         values: ``(episodes, time)``; NaN stands for no measurement, or no event.
-
-    Returns:
-        ``(episodes, 2)``.
     """
     present = ~numpy.isnan(values)
     return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
@@ -520,9 +517,6 @@ def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
 
     ``prediction_error`` is their root mean square in the sensor's unit. ``innovation_correlation`` is the correlation
     of successive innovations, zero if they are white.
-
-    ``prediction_error`` is the root of their mean square in the sensor's unit, ``innovation_correlation`` the
-    correlation of successive ones, zero where they are white; for every group of measured components.
 
     Args:
         run: one competitor's part of an evaluation.

@@ -112,14 +112,16 @@ class StackedArrays:
         models: model of every competitor.
         acting: names of the competitors whose action is a box.
         episodes: number of episodes of each.
-        drawn: number of first episodes with data for pictures.
+        plotted: number of first episodes with data for pictures.
 
     Attributes:
         actions: names of the actions of each acting competitor, with its control where they use several.
         action_names: all names of actions.
     """
 
-    def __init__(self, models: Mapping[str, Model], acting: Sequence[str], episodes: int, drawn: int) -> None:
+    def __init__(
+        self, models: Mapping[str, Model], acting: Sequence[str], episodes: int, plotted: int
+    ) -> None:
         several = len({models[name].control for name in acting}) > 1
         self.actions: dict[str, list[str]] = {
             name: [
@@ -130,7 +132,7 @@ class StackedArrays:
         self.action_names = list(dict.fromkeys(part for own in self.actions.values() for part in own))
         self._arrays: dict[str, numpy.ndarray] = {}
         self._places = {name: i for i, name in enumerate(models)}
-        self._episodes, self._drawn = episodes, min(drawn, episodes)
+        self._episodes, self._drawn = episodes, min(plotted, episodes)
         self._written: list[tuple[int, slice, set[str]]] = []
 
     def write(self, name: str, part: slice, new_values: dict[str, numpy.ndarray]) -> None:

@@ -170,10 +170,10 @@ def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) ->
 
 
 def compare_by_cause(
-    own: CauseCosts, other: CauseCosts, opponent: str, bootstrap: Bootstrap
+    costs: CauseCosts, opponent_costs: CauseCosts, opponent: str, bootstrap: Bootstrap
 ) -> Iterator[CauseMeasure]:
     """Yield the paired ratio of a competitor's mean cost to its opponent's, for each cause that both have."""
-    for name in own.names:
-        if name in other.names:
-            both = numpy.stack([own.of(name), other.of(name)], axis=1)
+    for name in costs.names:
+        if name in opponent_costs.names:
+            both = numpy.stack([costs.of(name), opponent_costs.of(name)], axis=1)
             yield CauseMeasure("cause_cost_ratio", name, bootstrap.interval(ratio(both)), opponent)
