@@ -127,7 +127,7 @@ class LoopText(Instructions):
         return first if way is None else way if first == 0 else self.new(f"add i64 {way}, {first}")
 
     def _way(self, places: tuple[int, ...]) -> tuple[int, str | None]:
-        """Return the first of some locations, and the name of the turn's distance from it; None: zero."""
+        """Return a base location, and the name of the LLVM value of a turn's distance from it; None: zero."""
         step = common_difference(places)
         if step == 0:
             return places[0], None

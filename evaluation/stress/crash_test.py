@@ -350,7 +350,7 @@ class CrashTest:
         return ""
 
     def _harm(self, alteration: str, fields: Mapping[str, Any]) -> Iterator[str]:
-        """Yield a sentence on the increase of the errors, if they are degraded."""
+        """Yield a sentence on the increase of the competitor's error, if it is above the limit ``HARM``."""
         error, other = fields["error"], fields["reference_error"]
         if not error > HARM:
             return
