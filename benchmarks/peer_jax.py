@@ -22,7 +22,7 @@ from filtergym.envs.engine.scenario_choice import make_task
 
 
 def jitted_step(id: str, control: str, size: int, **keywords: Any) -> Callable[[], None]:
-    """Return one step of ``size`` episodes under ``jax.jit``, compiled already; it waits for its results.
+    """Return a function that runs one step of ``size`` episodes under ``jax.jit``, compiled beforehand.
 
     Raises:
         ImportError: without JAX.

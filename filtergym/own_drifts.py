@@ -14,7 +14,7 @@ LONGEST = 1e4
 
 
 class Discretised(NamedTuple):
-    """A model of an interval."""
+    """A discrete-time model for any interval."""
 
     motion: Callable[[Any, Any, Any], Any]
     """State ``(n,)`` after the interval, from state, interval and inputs ``(p,)``."""
@@ -25,10 +25,10 @@ class Discretised(NamedTuple):
 def discretise_drift(
     drift: VectorFunction, diffusion: numpy.ndarray, interval: float, steps: int
 ) -> Discretised:
-    """Return the model of an interval for a model in continuous time, see :mod:`.filters.discretisation`.
+    """Return the discrete-time model of a drift and a diffusion, see :mod:`.filters.discretisation`.
 
     Args:
-        drift: from state and inputs, ``(n + p,)``, to the derivative of the state, ``(n,)``.
+        drift: function from state and inputs, ``(n + p,)``, to the derivative of the state, ``(n,)``.
         diffusion: spectral density of the noise, ``(n, n)``.
         interval: typical time between measurements, s.
         steps: number of steps of the Runge-Kutta method in an interval.

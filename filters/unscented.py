@@ -18,7 +18,7 @@ so P_y stays positive semidefinite for every alpha up to sqrt(beta).
 Shapes: means ``(n, ...)``, covariances ``(n, n, ...)``, batch last.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from .array_namespace import Array, namespace
@@ -103,8 +103,20 @@ def transform(
         function: function from points ``(n, 2n + 1, ...)`` to ``(m, 2n + 1, ...)``.
         spread: parameters of the transform.
     """
-    points = function(sigma_points(mean, covariance, spread))
-    for_mean, for_covariance = weights(mean.shape[0], spread)
+    return combine(function(sigma_points(mean, covariance, spread)), *weights(mean.shape[0], spread))
+
+
+def combine(points: Array, for_mean: Sequence[Any], for_covariance: Sequence[Any]) -> tuple[Array, Array]:
+    """Return the weighted mean and covariance of points.
+
+    Args:
+        points: ``(m, p, ...)``, that of the mean first.
+        for_mean: weights of the points for the mean, which sum to one, p numbers or arrays ``(...)``.
+        for_covariance: those for the covariance.
+
+    Returns:
+        ``(m, ...)`` and ``(m, m, ...)``.
+    """
     first = points[:, 0]
     # The weights sum to one, and with a small alpha they are large: differences lose fewer digits than points.
     shift = ordered_sum(w * (points[:, i] - first) for i, w in enumerate(for_mean) if i)

@@ -16,8 +16,8 @@ import filtergym
 from filtergym import adapters
 from filtergym.adapters import SingleTrackEstimator
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.maneuvering_target.estimators import KalmanModel
 from filtergym.envs.contract.filter import Initial
+from filtergym.envs.maneuvering_target.constant_velocity import KalmanModel
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.filters import kalman
 

@@ -269,7 +269,7 @@ def test_it_ends_in_sentences(advice):
     lines = list(advice_lines(advice, ["fixed-low"]))
     text = "\n".join(lines)
     assert lines[0].startswith("Take constant-velocity, with the parameters below: ")
-    assert f"than {advice.rival}, the shipped filter that one would take" in lines[0]
+    assert f"than {advice.rival}, the shipped filter chosen on the same" in lines[0]
     assert "times as large as stated, if they are white" in text
     assert "The learned agents were never trained on such data: fixed-low" in text
 
@@ -336,7 +336,7 @@ def test_a_short_log_says_that_it_is_short(one_family, tmp_path):
     found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
     text = "\n".join(advice_lines(found, []))
     assert "measurements are few" in text
-    assert "which flatters it" in text
+    assert "where its error is underestimated" in text
 
 
 def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_path):

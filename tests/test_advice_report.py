@@ -82,7 +82,7 @@ def test_the_sentence_comes_first_and_tables_hold_what_was_fitted(advice, page):
         assert sentence.replace("'", "&#39;") in text
     assert "10 missed measurements: these have no row" in text
     assert "read 158 measurements after the start of 1 track, 10 of them missed" in text
-    assert re.search(r"that are fitted, that choose, that judge: \d+ / \d+ / \d+\.", text)
+    assert re.search(r"for fit, choice and judgement: \d+ / \d+ / \d+\.", text)
     assert "filtergym advise log.csv" in text
 
 

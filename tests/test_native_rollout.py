@@ -192,22 +192,35 @@ def test_a_function_may_make_another_estimator_next_time():
 
 
 def test_a_time_is_that_of_a_decision_without_setting_up(monkeypatch):
-    """A clock that goes by 3 ms for every run and by 40 us for every measurement of all episodes."""
+    """A clock that advances by 3 ms in every run and by 40 us in every measurement of all episodes, of which the world
+    takes 15 us.
+    """
     given = model_of("ManeuveringTarget", "imm", "random", horizon=90)
     clock, flown = [0.0], []
 
     def run(self, report, compiled_policy, measurements):
-        clock[0] += 3e-3 + 40e-6 * measurements
-        flown.append(measurements)
+        idle = compiled_policy is None
+        clock[0] += 3e-3 + (15e-6 if idle else 40e-6) * measurements
+        if not idle:
+            flown.append(measurements)
 
     monkeypatch.setattr(rollouts.Lanes, "run", run)
     monkeypatch.setattr(rollouts.time, "process_time", lambda: clock[0])
     found = rollouts.measure_time(*given[:3], SEEDS, "imm")
     assert found.compiled
-    assert found.nanoseconds == pytest.approx(40e3 / rollouts.TIMED_EPISODES, rel=1e-9)
+    assert found.nanoseconds == pytest.approx(25e3 / rollouts.TIMED_EPISODES, rel=1e-9)
     # A run of about twenty milliseconds, were setting it up all that a first decision takes; some of them.
     assert set(flown) == {1, 8}
     assert flown.count(8) >= rollouts.FEWEST_RUNS
+
+
+@pytest.mark.parametrize("backend", ["compiled", "numpy"])
+def test_an_estimator_that_does_nothing_takes_the_least_time(backend, monkeypatch):
+    """Which the time of its run less that of the world cannot fall below."""
+    monkeypatch.setattr(rollouts, "LEAST_NANOSECONDS", 1e9)
+    model = make_model(problem_of(ID).task, "gain", "random", backend=backend)
+    found = rollouts.measure_time(model, rollouts.IdleEstimator, "estimator", SEEDS)
+    assert found == (1e9, backend == "compiled", False)
 
 
 @pytest.mark.parametrize("name", ["ManeuveringTarget", "LooselyCoupledNavigation"])

@@ -638,7 +638,7 @@ def test_record_and_evaluate_on_the_command_line(command, tmp_path):
     assert len((tmp_path / "estimates.csv").read_text().splitlines()) == 25
     # A table has no truth; the file of the first names its environment as a scenario, too.
     code, out = command("evaluate", TARGET, "--recording", table(tmp_path / "plots.csv", **PLOTS), *words)
-    assert "log-likelihood: of what was measured" in out
+    assert "log-likelihood: of a measurement under its prediction" in out
     metrics = {record["metric"] for record in json.loads((tmp_path / "records.json").read_text())}
     assert {"log_likelihood", "anis", "anis_band", "prediction_error", "innovation_correlation"} <= metrics
     assert not {"rmse", "cost", "anees"} & metrics

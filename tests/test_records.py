@@ -12,7 +12,7 @@ from comparison import compared_policies
 from contract import assert_properties
 from front import panels_of
 from made_results import results_of
-from readme import with_numbers
+from readme import insert_numbers
 from records import (
     FOLDER,
     BenchmarkRecords,
@@ -113,7 +113,7 @@ def test_every_record_is_small_and_shown():
 def test_readme_and_paper_show_the_records(name):
     """If not: ``python docs/make readme NAME``."""
     page = DOCS.parent / name
-    assert with_numbers(page) == page.read_text(encoding="utf-8")
+    assert insert_numbers(page) == page.read_text(encoding="utf-8")
 
 
 def test_readme_gets_its_numbers(tmp_path, make_page, monkeypatch):

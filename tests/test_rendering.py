@@ -30,7 +30,10 @@ def played(steps, seed=1, **keywords):
     return env
 
 
-@pytest.mark.parametrize(("control", "general"), [("gain", False), ("evidence", False), ("evidence", True)])
+@pytest.mark.parametrize(
+    ("control", "general"),
+    [("gain", False), ("sigma-points", False), ("evidence", False), ("evidence", True)],
+)
 def test_frames_are_images_that_change(control, general, monkeypatch):
     """Drawn with the task's own picture, and with the one for tasks that have none."""
     if general:

@@ -219,7 +219,7 @@ def test_rows_of_ones_own_are_marked(width, result, command_console):
         for r in result.records
     ]
     own = {r.policy for r in records} - {"ppo"}
-    tables = results_tables(records, {}, width, own=own)
+    tables = results_tables(records, {}, width, user_names=own)
     text = command_console(width, *tables)
     assert text.count("> isolated:mine") == len(own) * len(tables)
     assert "> ppo" not in text

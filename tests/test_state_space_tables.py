@@ -227,5 +227,5 @@ def test_a_filter_is_exported_and_tried_on_a_table(make, tmp_path):
 
 def test_names_of_what_is_measured_can_be_told_apart(make):
     for measured in (["one"], ["a", "A"], ["a", "time"], ["a", "truth_x"], ["a", ""]):
-        with pytest.raises(ValueError, match=r"measured must|names of what is measured must"):
+        with pytest.raises(ValueError, match=r"measured must|names of measured numbers must"):
             make(measured=measured)

@@ -298,7 +298,7 @@ def test_the_same_seeds_show_only_that_the_cost_is_unattainable(cheats, command,
     code, shown, errors = command("verify", cheats / "Stored.json", "--trust", "--same-seeds")
     assert code == 0, errors
     assert "suspicious: in scenario 'random' the cost is 100 % below that of 'known-turn'" in shown
-    assert "stored answers would hold, too" in shown
+    assert "stored results would pass, too" in shown
 
 
 def test_an_honest_submission_holds_on_any_fresh_episodes_and_they_can_be_repeated(honest, untimed):

@@ -25,7 +25,7 @@ from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.statistics.statistic import reduce_run
 from filtergym.filters import linear_systems
 from filtergym.papers import uav_autopilot_kalman as paper
-from filtergym.papers.uav_autopilot_kalman import experiment
+from filtergym.papers.uav_autopilot_kalman import experiment, structure
 
 ID = "filtergym/UavAutopilot-v0"
 BOTH = pytest.mark.parametrize("plant", ["P", "U"])
@@ -313,6 +313,61 @@ def test_theory_spectra_integrate_to_the_variances(plant: str) -> None:
     assert sums["observation"] == pytest.approx(theory.output_variance + d.R[shown, shown], rel=1e-9)
     # The error of an optimal estimate is orthogonal to it.
     assert sums["estimate"] == pytest.approx(theory.output_variance - d.steady.posterior[i, i], rel=1e-9)
+
+
+@BOTH
+def test_the_control_reaches_what_one_control_at_a_time_reaches(plant: str) -> None:
+    """Naive oracle: where each of n controls in a row leads, by the equation of motion."""
+    F, B, H, *_ = experiment.matrices(make_model(ID, "gain", "paper-noise", plant=plant).task)  # type: ignore[arg-type]
+    n = len(F)
+    reached = []
+    for k in range(n):
+        x = numpy.zeros(n)
+        for i in range(n):
+            x = F @ x + B[:, 0] * (i == k)
+        reached.append(x)
+    C = structure.controllability_matrix(F, B)
+    numpy.testing.assert_allclose(C[:, ::-1], numpy.transpose(reached), rtol=0, atol=1e-12)
+    assert numpy.linalg.matrix_rank(structure.controllability_matrix(F.T, H.T)) == n
+    modes = structure.unreached_modes(F, B)
+    if plant == "P":
+        assert numpy.linalg.det(C) == pytest.approx(-(0.25**3), rel=1e-12)
+        assert len(modes) == 0
+    else:
+        # The gust alone: V = 35 m/s over its scale of 50 m, in 0.02 s.
+        assert modes == pytest.approx([math.exp(-35.0 / 50.0 * 0.02)], rel=1e-9)
+
+
+@BOTH
+def test_width_and_approximations_are_those_of_a_long_run(plant: str) -> None:
+    """Naive oracle: the loop run as it is written, its periodogram and its differences."""
+    task: Any = make_model(ID, "gain", "paper-noise", plant=plant).task
+    F, B, H, L, K, Q, R = experiment.matrices(task)
+    random, runs, length = numpy.random.default_rng(0), 400, 1024
+    root, sensor = linear_systems.noise_factor(Q), numpy.linalg.cholesky(R)
+    x = estimate = numpy.zeros((len(F), runs))
+    states = []
+    for _ in range(200 + length):
+        u = -L @ estimate
+        x = F @ x + B @ u + root @ random.standard_normal(x.shape)
+        predicted = F @ estimate + B @ u
+        reading = H @ x + sensor @ random.standard_normal((len(R), runs))
+        estimate = predicted + K @ (reading - H @ predicted)
+        states.append(x)
+    path = numpy.array(states[200:])
+    T = task.parameters.value("sampling_interval")
+    y, rate = path[:, task.output], path[:, 1]
+    frequency, power = experiment.spectrum(y.T * numpy.hanning(length), T)
+    share = numpy.cumsum(power) / power.sum()
+    width = structure.spectral_width(task)
+    # Frequencies are T^-1 / 1024 apart, a fiftieth and a hundredth of the width, and the window spreads over two.
+    assert width == pytest.approx(float(frequency[numpy.argmax(share >= 0.99)]), rel=0.05)
+    step = y[1:] - y[:-1]
+    acceleration = (rate[1:] - rate[:-1]) / T
+    errors = step, step - T * rate[:-1], step - T * rate[:-1] - T**2 / 2 * acceleration
+    measured = [numpy.sqrt((error**2).mean() / (y**2).mean()) for error in errors]
+    # Of 400 runs of some twenty independent values each.
+    assert structure.approximation_errors(task) == pytest.approx(measured, rel=0.02, abs=1e-12)
 
 
 # ---------------------------------------------------------------- noise estimated in the loop

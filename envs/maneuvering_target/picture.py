@@ -28,6 +28,7 @@ from .banks import AlphaBeta, Filters
 from .hypotheses import GROUPS, HypothesesState
 from .kalman_net import FRAME
 from .problem import TargetProblem
+from .unscented_banks import UnscentedState
 
 ELLIPSE_SIGMAS = 2.0
 """Half axes of the covariance ellipse, standard deviations."""
@@ -106,6 +107,12 @@ class ManeuveringTargetPicture(Picture):
             innovation, variance = estimator.innovation[:, 0], numpy.ones(2)
             groups = dict(zip(GROUPS, estimator.probabilities[:, 0], strict=True))
             values |= {f"kind.{kind}": sum(groups[group] for group in those) for kind, those in KINDS.items()}
+        elif isinstance(estimator, UnscentedState):
+            innovation, variance = estimator.innovation[:, 0], numpy.ones(2)
+            ratio = numpy.exp(2.0 * estimator.prior[:, 0])
+            values |= {
+                f"share.{axis}": share for axis, share in zip("xy", ratio / (1.0 + ratio), strict=True)
+            }
         else:
             assert isinstance(estimator, Filters)
             predicted = numpy.exp(estimator.log_predicted)
@@ -146,6 +153,9 @@ class ManeuveringTargetPicture(Picture):
         elif self.model.control == "hypotheses":
             axes = FRAME
             steered = Strip("probabilities", {kind: f"kind.{kind}" for kind in KINDS}, (-0.04, 1.04))
+        elif self.model.control in ("sigma-points", "unscented"):
+            shares = {axis: f"share.{axis}" for axis in "xy"}
+            steered = Strip("position gain before the action", shares, (0.0, 1.0))
         else:
             gains = self.task.parameters.gains
             named = {f"filter {j + 1}, alpha {gain:g}": f"weight.{j}" for j, gain in enumerate(gains)}

@@ -23,6 +23,7 @@ from .parameters import ManeuveringTargetParameters
 from .problem import TargetProblem
 from .scenarios import SCENARIOS
 from .student import RadarStudentBank
+from .unscented_banks import ScalingBank, SigmaPointsBank
 from .world import RadarWorld
 
 
@@ -107,6 +108,8 @@ class ManeuveringTarget(TargetProblem):
         "gain": GainBank,
         "hypotheses": HypothesesBank,
         "mode": FilterBank,
+        "sigma-points": SigmaPointsBank,
+        "unscented": ScalingBank,
         "weights": FilterBank,
     }
     scenarios = SCENARIOS
@@ -140,6 +143,11 @@ class ManeuveringTarget(TargetProblem):
                 "has ended (9), is a turn (1.5); predicted covariances in straight flight and in manoeuvres (1.25 each); variance "
                 "of the measurement (1.25); **0 is the estimator `semi-markov`**",
                 "mode": "the filter of the bank that is believed; the bank collapses to one filter that switches",
+                "sigma-points": "factors 5^a of the weights of the 11 sigma points in the estimator `unscented-turn` at this scan: "
+                "ten for the mean, normalised, eleven for the covariance (MA-UKF); **0 is that estimator**",
+                "unscented": "factors r^a in the estimator `unscented-turn` at this scan: spread of the sigma points "
+                "(r = sqrt(2)), variances of the acceleration and of the change of the turn rate (30 each), variance of "
+                "the measurement (10); **0 is that estimator**",
                 "weights": "weights of the bank, normalised; all zero is uniform",
             },
             {"evidence": ("evidence_scale",)},

@@ -63,8 +63,8 @@ class UavAutopilotParameters(TaskParameters):
     """Measurements in an episode. Ours: some thirty settling times of either loop."""
 
     sensors: tuple[str, ...] | None = None
-    """Coordinates that are measured. P: both, the paper's case ``H = I``. U: pitch, rate gyro, and the
-    potentiometer of the elevator, the kinds the paper lists."""
+    """Coordinates that are measured. P: both, the paper's case ``H = I``. U: rate gyro and potentiometer of the
+    elevator, as in the paper, and pitch (ours) in place of its accelerometers: acceleration is no coordinate."""
     sensor_sigmas: tuple[float, ...] | None = parameter(None, above=0.0)
     """Nominal standard deviation of one reading of each sensor. P: 1 m, 1 m/s, ours: as large as the unit
     step. U: 0.5 deg, 1 deg/s, 0.5 deg, ours: cheap sensors."""

@@ -1,16 +1,17 @@
-"""The paper's claims and what it does not mention, with verdicts, and the tables of the report."""
+"""The paper's claims and open questions with verdicts, and the tables of the report."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy
 
 from ...baselines.uav_autopilot.theory import stationary
+from ...envs.uav_autopilot.task import UavAutopilot
 from ...filters import linear_systems
 from ..grid import Grid
 from ..quantities import means, quantity
-from ..reproduction import Statement
+from ..reproduction import Statement, verdict_if
 from .experiment import (
     AFTER_STEP,
     CASES,
@@ -20,16 +21,18 @@ from .experiment import (
     covariance_curves,
     flatness,
     innovation_variance,
+    interval,
     loop_theory,
     matrices,
     settled_output,
 )
+from .structure import approximation_errors, controllability_matrix, spectral_width, unreached_modes
 
 SCALES = (0.01, 1.0, 100.0)
 
 
 def _excess(datasets: dict[str, Any]) -> str:
-    """Return the cost of the paper's filter above that of the filter given the noise, and its consistency."""
+    """Return a text with the paper's filter's cost over that of the filter with known noise, and its ANEES."""
     ours, best = (datasets[name]["cost"].values.mean(axis=1) for name in ("kalman", "matched"))
     nees = datasets["kalman"]["nees"].values.mean() / datasets["kalman"].sizes["component"]
     return f"{quantity(means(ours) / means(best) - 1.0):.0%}, NEES {nees:.1f} per coordinate"
@@ -72,6 +75,26 @@ CLAIMS = (
         "reproduced",
     ),
     Statement(
+        "Controllability",
+        "The model serves to study the controllability of a channel; with H = I the state is completely observable.",
+        "rank of [B, F B, ..., F^(n-1) B]: {reached[0]} (P, where det [B, F B] = -T³ = {determinant:.6f}), "
+        "{reached[1]} (U: the elevator does not reach the gust, whose eigenvalue exp(-V T / L) = {gust:.4f} decays); "
+        "of [H; H F; ...]: {seen[0]} (P, H = I), {seen[2]} (P, H = [1 0]), {seen[1]} (U)",
+        "singular values; reproduced if both ranks of P are complete",
+        lambda q: verdict_if(q.reached[0] == q.seen[0] == "2 of 2"),
+    ),
+    Statement(
+        "Interval",
+        "The measuring interval is T = 1 / (2 ΔF), ΔF the spectral width of the controlled coordinate; within it "
+        "the coordinate is constant, linear or quadratic.",
+        "P: ΔF = {width[0]:.3f} Hz admits {longest[0]:.2f} s, the printed T = {T[0]:g} s suits {suits[0]:g} Hz. "
+        "U: {width[1]:.2f} Hz admits {longest[1]:.3f} s, T = {T[1]:g} s suits {suits[1]:g} Hz. After T the constant, "
+        "linear and quadratic approximations err by {errors[0]} (P) and {errors[1]} (U) of the coordinate's deviation",
+        "ΔF contains 99 % of the coordinate's variance in the settled loop (the paper defines no width), by its "
+        "transfer functions; errors by the Lyapunov equation; reproduced if T is at most 1 / (2 ΔF)",
+        lambda q: verdict_if(all(most >= T for most, T in zip(q.longest, q.T, strict=True))),
+    ),
+    Statement(
         "5",
         "Command: equation (6) prints none.",
         "with the feedback alone in the prediction, as (6) is printed, a unit command settles at {literal[0]:.3f} (P) "
@@ -103,11 +126,39 @@ CLAIMS = (
         "scenario random, {r.episodes} episodes, same noise; a consistent filter has NEES 1 per coordinate",
     ),
 )
-"""The paper's claims, and what it does not mention; of pairs the first is of plant P."""
+"""The paper's claims, and questions that it leaves open; of pairs of numbers the first is of plant P."""
+
+
+def structure(tasks: Sequence[UavAutopilot]) -> dict[str, Any]:
+    """Return the quantities of controllability, observability and measuring interval.
+
+    Args:
+        tasks: of plant P, plant U and plant P with position alone.
+    """
+    loops = [matrices(task) for task in tasks]
+
+    def rank(F: numpy.ndarray, B: numpy.ndarray) -> str:
+        return f"{numpy.linalg.matrix_rank(controllability_matrix(F, B))} of {len(F)}"
+
+    reached, seen = ([rank(s.F, s.B) for s in loops], [rank(s.F.T, s.H.T) for s in loops])
+    widths, T = [spectral_width(task) for task in tasks[:2]], [interval(task) for task in tasks[:2]]
+    return {
+        "reached": reached,
+        "seen": seen,
+        "determinant": float(numpy.linalg.det(controllability_matrix(loops[0].F, loops[0].B))),
+        "gust": float(unreached_modes(loops[1].F, loops[1].B)[0].real),
+        "T": T,
+        "suits": [0.5 / each for each in T],
+        "width": widths,
+        "longest": [0.5 / width for width in widths],
+        "errors": [
+            ", ".join(f"{100.0 * error:.1f} %" for error in approximation_errors(task)) for task in tasks[:2]
+        ],
+    }
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities of the claims."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     plants = ("P, H = I", "U")
     ours = P, U = [r.noise[plant]["kalman"] for plant in plants]
     raw = [r.noise[plant]["raw-sensors"] for plant in plants]
@@ -119,9 +170,10 @@ def quantities(r: Results) -> dict[str, Any]:
     settled, alone, blind, gusts = covariance_curves(U.task).values()
     theory = [[loop_theory(s.task, scale) for scale in SCALES] for s in ours]
     transients = [r.transient(plant) for plant in plants]
+    tasks = [r.noise[case]["kalman"].task for case in (*plants, "P, H = [1 0]")]
 
     def mean_ratio(values: Callable[[Any], numpy.ndarray]) -> list[float]:
-        """Mean without the filter over that with it, of both plants."""
+        """Return the mean without the filter over the mean with it, for both plants."""
         return [float(values(a).mean() / values(b).mean()) for a, b in zip(raw, ours, strict=True)]
 
     return {
@@ -137,6 +189,7 @@ def quantities(r: Results) -> dict[str, Any]:
         "asleep": (gusts[1, 599], gusts[1, -1]),
         "flat": ", ".join(flat),
         "white_flatness": 1 - 0.5 / r.episodes,
+        **structure(tasks),
         "literal": [settled_output(s.task, predicts_command=False) for s in ours],
         "predicted": [settled_output(s.task, predicts_command=True) for s in ours],
         "overshoot": [100 * over for over, _, _ in transients],
@@ -152,7 +205,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     rows = []
     for case, loops in r.noise.items():
         for name, s in loops.items():
