@@ -24,7 +24,7 @@ from ..envs.data.foreign_files import parse_json, read_content
 from ..envs.engine.catalogue import short_name, task_class
 from ..evaluation.competitors.kinds import Policy
 from ..evaluation.storage.files import whole_file
-from ..evaluation.storage.stored import fits
+from ..evaluation.storage.stored import has_type
 from .gate import wrap_as_trained
 from .learned_estimator import EstimatorMaker
 from .training_run import TrainingRun
@@ -237,7 +237,7 @@ def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
             raise ValueError(
                 f"unknown output {header['output']!r:.80} or activation {header['activation']!r:.80}"
             )
-        if not fits(header["fields"], list[str]):
+        if not has_type(header["fields"], list[str]):
             raise ValueError("its header has no list of fields")
         _check_run(header["run"])
         header["answers"] = _count_answers(arrays, len(header["fields"]))
@@ -257,7 +257,7 @@ def _check_run(run: Any) -> None:
     if not isinstance(run, dict):
         raise ValueError("its header has no record of a run")
     for name, hint in get_type_hints(TrainingRun).items():
-        if name in run and not fits(run[name], hint):
+        if name in run and not has_type(run[name], hint):
             raise ValueError(
                 f"{name} of its run must be {getattr(hint, '__name__', hint)}, got {run[name]!r:.80}"
             )

@@ -15,7 +15,7 @@ from ..envs.contract.log_format import LogFormat, LogSetup
 from ..envs.contract.parameters import quote_shortened
 from ..evaluation.competitors.kinds import Competitor, CompetitorFiles
 from ..evaluation.storage.files import write_text
-from ..evaluation.storage.stored import fits, read_json
+from ..evaluation.storage.stored import has_type, read_json
 from .fitting import NOISE_SCALE, OUTLIER_SHARE, Fit, Interval, with_noise_scale, with_outliers
 from .problem import Problem
 from .table import Tunable, tunable
@@ -174,7 +174,7 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
     except FileNotFoundError:
         raise ValueError(f"there is no file {path}") from None
     known = {"environment": str, "filter": str, "values": dict[str, float]}
-    if not isinstance(table, dict) or not all(fits(table.get(key), kind) for key, kind in known.items()):
+    if not isinstance(table, dict) or not all(has_type(table.get(key), kind) for key, kind in known.items()):
         raise ValueError(f"{path} is not the file of an advised filter: filtergym advise writes one")
     if table["environment"] != problem.id:
         raise ValueError(f"{path} is fitted to {quote_shortened(table['environment'])}, not to {problem.id}")
@@ -211,7 +211,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
     }
     if (
         not isinstance(log, dict)
-        or not all(fits(log.get(key), kind) for key, kind in kinds.items())
+        or not all(has_type(log.get(key), kind) for key, kind in kinds.items())
         or not 0.0 < log["interval"] < math.inf
         or not {*log["columns"], *log["deviations"]} <= names
         or not all(0.0 < value < math.inf for value in log["deviations"].values())

@@ -238,7 +238,7 @@ class LogScores:
 
     def _log_values(self, values: Any, first: int, rows: int) -> numpy.ndarray:
         """Return ``rows`` of a log's values from ``first`` on, ``(..., E, rows)``; NaN beyond an episode's end."""
-        some = values[self._plan.flown, first : first + rows].astype(float)
+        some = values[self._plan.flight_numbers, first : first + rows].astype(float)
         return numpy.where(
             self._there[:, first : first + rows],
             numpy.moveaxis(some, -1, 0) if some.ndim > 2 else some,

@@ -11,7 +11,7 @@ from ..envs.contract.parameters import quote_shortened
 from ..envs.engine.catalogue import nearest, short_name
 from ..evaluation.competitors.kinds import Kind
 from ..evaluation.storage.files import whole_file
-from ..evaluation.storage.stored import fits, read_json
+from ..evaluation.storage.stored import has_type, read_json
 from .table import Tunable
 
 FOLDER = Path("tuned")
@@ -157,7 +157,7 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
         ValueError: if they are not a number for each parameter, within its limits.
     """
     limits = tunable.limits
-    if not fits(values, dict[str, float]) or values.keys() != limits.keys():
+    if not has_type(values, dict[str, float]) or values.keys() != limits.keys():
         raise ValueError(
             f"it must give a number for each of {', '.join(limits)}, got {quote_shortened(values)}"
         )
@@ -200,7 +200,7 @@ def read_table(place: Any) -> dict[str, dict[str, Any]]:
         table = read_json(place)
     except FileNotFoundError:
         return {}
-    if not fits(table, dict[str, dict[str, Any]]):
+    if not has_type(table, dict[str, dict[str, Any]]):
         raise ValueError(f"{place} is not a table of tuned policies: correct or remove it")
     return table
 

@@ -11,7 +11,7 @@ from .baselines.problem import Problem, import_problem
 from .envs.contract.parameters import quote_shortened
 from .envs.engine.catalogue import import_user_module, nearest
 from .evaluation.competitors.kinds import Competitor, CompetitorFiles, check_competitor
-from .evaluation.running.supervision import running
+from .evaluation.running.supervision import report_running
 from .extensions import PREFIXES, SOURCES, load, load_present
 
 MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -65,7 +65,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
             if os.path.isfile(f"{name}{ending}"):
                 raise ValueError(f"unknown policy {name!r}: write the whole file name, {name}{ending}")
         raise nearest("policy", name, shipped_names(problem))
-    with running(name):
+    with report_running(name):
         holder = import_user_module(module, f"cannot load policy {name!r}")
     if not hasattr(holder, attribute):
         raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")

@@ -7,7 +7,7 @@ import numpy
 
 from .compiler import namespace
 from .compiler.vector_functions import VectorFunction
-from .filters.discretisation import choose_series, discretise, held_noise, runge_kutta
+from .filters.discretisation import choose_series, constant_matrix_noise, discretise, runge_kutta
 
 LONGEST = 1e4
 """Sampling intervals over which linear models are exact to rounding."""
@@ -41,7 +41,7 @@ def discretise_drift(
 
         def held(x: Any, dt: Any, u: Any) -> Any:
             A = drift.jacobian(namespace.concat([x, u])[:, None], namespace)[:, :n, 0]
-            return held_noise(A, diffusion, dt)
+            return constant_matrix_noise(A, diffusion, dt)
 
         return Discretised(lambda x, dt, u: runge_kutta(lambda y: slope(y, u), x, dt, steps), held)
     A = drift.matrix[:, :n]

@@ -21,7 +21,7 @@ from filtergym.evaluation.running.curves import BAND_RESAMPLES, cost_in_stretche
 from filtergym.evaluation.running.summary import Evaluation
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.statistics.cause_split import (
-    held_causes,
+    active_causes,
     opponent_of,
     phrases_of,
     reason_weight,
@@ -58,7 +58,7 @@ def value(records, policy, metric, window):
 def test_causes_follow_from_the_context_of_the_episode(dataset):
     """The causes in the episodes by the info of the environment, measurement by measurement."""
     env = gymnasium.make(ENV, context=True, detailed_info=True)
-    held = dict(held_causes(dataset.sel(policy="imm")))
+    held = dict(active_causes(dataset.sel(policy="imm")))
     for episode in range(4):
         env.reset(seed=int(dataset["episode_seed"].values[episode]))
         for k in range(dataset.sizes["time"]):
@@ -78,7 +78,7 @@ def test_causes_follow_from_the_context_of_the_episode(dataset):
 def test_shares_costs_and_consistency_by_a_loop_over_episodes(policy, dataset, records):
     run = dataset.sel(policy=policy)
     weights = Bootstrap(EPISODES).weights
-    for name, held in held_causes(run):
+    for name, held in active_causes(run):
         count, cost, nees = np.zeros(EPISODES), np.zeros(EPISODES), np.zeros(EPISODES)
         for i in range(EPISODES):
             for k in range(dataset.sizes["time"]):
@@ -113,7 +113,7 @@ def test_the_opponent_is_met_on_the_same_episodes(dataset, records):
     sums = []
     for policy in ("imm", "kalman-imm-turn"):
         run = dataset.sel(policy=policy)
-        held = dict(held_causes(run))["manoeuvre"]
+        held = dict(active_causes(run))["manoeuvre"]
         sums.append(weights @ np.where(held, run["cost"].values, 0.0).sum(axis=1))
     ratios = sums[0] / sums[1]  # their counts are the same
     assert found.value == pytest.approx(ratios[0], rel=1e-12)
@@ -134,7 +134,7 @@ def test_every_environment_describes_its_causes(env_id):
     dataset = filtergym.evaluate(env_id, [problem_of(env_id).baselines.score_paper], None, 6)
     phrases = phrases_of(dataset)
     assert len(phrases) > 5
-    held = dict(held_causes(dataset.isel(policy=0)))
+    held = dict(active_causes(dataset.isel(policy=0)))
     assert set(held) == {"all", *phrases}
     assert sum(flags.any() for flags in held.values()) > 4
     # They complete "most of its cost falls".
@@ -146,7 +146,7 @@ def test_a_recording_has_the_causes_that_can_be_known(tmp_path):
     recording = filtergym.record(ENV, "missed-detections", 4, seed=2)
     simulated = filtergym.evaluate(ENV, ["imm"], "missed-detections", 4, seed=2)
     replayed = filtergym.evaluate(ENV, ["imm"], recording)
-    own, other = (dict(held_causes(d.isel(policy=0))) for d in (simulated, replayed))
+    own, other = (dict(active_causes(d.isel(policy=0))) for d in (simulated, replayed))
     for name in ("missed", "outlier", "range of 30 to 60 km", "start"):
         assert own[name].sum() == other[name].sum()
     assert own["manoeuvre"].any()
@@ -251,7 +251,7 @@ def test_the_worst_episodes_are_those_that_cost_most_and_are_flown_again_bit_for
 
 def test_main_causes_of_an_episode_by_a_loop(dataset):
     run = dataset.sel(policy="imm").isel(episode=slice(5))
-    held = dict(held_causes(run))
+    held = dict(active_causes(run))
     for i, causes in enumerate(main_causes(run)):
         cost = run["cost"].values[i]
         weights = {}

@@ -181,7 +181,7 @@ def test_taking_coloured_errors_away_is_a_linear_map(measured):
     mean, covariance = rng.normal(size=(size, 4)), numpy.einsum("ikb,jkb->ijb", root, root)
     A = numpy.eye(3, size)
     A[range(measured), range(3, size)] = -1.0
-    states, both = class_fusion.take_away_coloured_errors(mean, covariance, measured)
+    states, both = class_fusion.remove_coloured_errors(mean, covariance, measured)
     for b in range(4):
         numpy.testing.assert_allclose(states[:, b], A @ mean[:, b], rtol=1e-12)
         numpy.testing.assert_allclose(both[..., b], A @ covariance[..., b] @ A.T, rtol=1e-10, atol=1e-12)

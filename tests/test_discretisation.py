@@ -66,9 +66,9 @@ def test_held_noise_is_the_integral_to_its_order():
     """The series ends with s^3, so of an interval of 0.01 s the error is below (3 s)^5 of the integral."""
     A, D = slope_matrix([0.7, 0.0]), np.diag([0.0, 0.1])
     _, Q = discretisation.discretise(A, D, 0.01, discretisation.choose_series(A, 1.0))
-    found = discretisation.held_noise(A, D, 0.01)
+    found = discretisation.constant_matrix_noise(A, D, 0.01)
     np.testing.assert_allclose(found, Q, rtol=1e-6)
-    stiff = discretisation.held_noise(A * 300.0, D, 0.1)
+    stiff = discretisation.constant_matrix_noise(A * 300.0, D, 0.1)
     assert np.linalg.eigvalsh(stiff).min() >= -1e-12 * np.abs(stiff).max()
 
 

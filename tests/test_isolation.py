@@ -311,7 +311,7 @@ def test_a_class_that_ends_its_process_or_hangs_costs_its_own_row(tmp_path):
     for name, ending in (
         ("wretched:Exits", "it has ended the process with exit status 3"),
         ("wretched:Kills", "it has ended the process by SIGKILL"),
-        ("wretched:Hangs", "it has not answered within 1 s, see --time-limit"),
+        ("wretched:Hangs", "it has not responded within 1 s, see --time-limit"),
         ("unborn:Class", "it has ended the process with exit status 0"),
     ):
         assert f"{name!r} takes no part: {ending}" in done.stderr

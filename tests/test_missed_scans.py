@@ -366,7 +366,7 @@ def test_left_of_an_acceleration_that_goes_on():
     position, velocity = (1 - alpha) * d, a * grown - beta / grown * d
     position, velocity = position + since * velocity + a * since**2 / 2, velocity + a * since
     nothing = alpha_beta.Covariance(*np.zeros(3))
-    left = alpha_beta.left_by_acceleration(nothing, d**2, alpha, beta, grown, since)
+    left = alpha_beta.add_acceleration_error(nothing, d**2, alpha, beta, grown, since)
     np.testing.assert_allclose(left, [position**2, position * velocity, velocity**2], rtol=1e-13)
 
 

@@ -54,7 +54,7 @@ CALLS = [
     (alpha_beta.update, (Z2, Z2, Z2, ALPHA, BETA, 6.0)),
     (alpha_beta.predict_covariance, (P2, 6.0)),
     (alpha_beta.update_covariance, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
-    (alpha_beta.left_by_acceleration, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
+    (alpha_beta.add_acceleration_error, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
     (alpha_beta.predict_joint_covariance, (COVARIANCES, 6.0)),
     (alpha_beta.update_joint_covariance, (COVARIANCES, np.abs(Z2)[:, None], GAIN, GAIN, 6.0)),
     (bounds.predict_bound, (P4, F4[..., None], Q4[..., None])),

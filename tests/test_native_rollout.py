@@ -15,7 +15,7 @@ from filtergym.evaluation.running import rollout as rollouts
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import rollout, run_episodes
 from filtergym.evaluation.running.seeds import episode_seeds
-from filtergym.evaluation.running.stored_values import StoredValues, limits
+from filtergym.evaluation.running.stored_values import StoredValues, bound_values
 
 pytest.importorskip("llvmlite")
 
@@ -36,7 +36,7 @@ def model_of(environment, name, scenario, threads=1, **keywords):
     control = control_of(maker, None, problem.task, name)
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     model = make_model(problem.task, control, scenario, backend="compiled", threads=threads, **keywords)
-    return model, maker, kind, limits if kind == "bound" else StoredValues(tracks=True)
+    return model, maker, kind, bound_values if kind == "bound" else StoredValues(tracks=True)
 
 
 def run_stepped(model, maker, kind, report, seeds=SEEDS):

@@ -12,7 +12,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.seeds import episode_seeds
-from filtergym.evaluation.running.transitions import member, transitions_of
+from filtergym.evaluation.running.transitions import clip_to_space, transitions_of
 from filtergym.names import competitor
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -87,7 +87,7 @@ def test_episodes_of_different_length_end_where_they_end():
 
 def test_actions_are_brought_into_their_space():
     box = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    action = member(box, np.array([[1.0 + 1e-12, -3.0], [0.1, 0.2]]))
+    action = clip_to_space(box, np.array([[1.0 + 1e-12, -3.0], [0.1, 0.2]]))
     assert all(map(box.contains, action))
     np.testing.assert_array_equal(action, np.array([[1.0, -1.0], [0.1, 0.2]], dtype=np.float32))
 

@@ -18,7 +18,7 @@ from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...evaluation.running.metrics import chi_square_quantile, sums_of_present
 from ...evaluation.running.own_metrics import Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap, ratio
-from ...evaluation.statistics.cause_split import VARIABLE, held_causes
+from ...evaluation.statistics.cause_split import VARIABLE, active_causes
 from ...evaluation.storage.dataset import keywords_of
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     found["beyond_protection_level"] = numpy.where(numpy.isnan(nees), math.nan, nees > quantile)
     # A learned estimator reports no innovations.
     if VARIABLE in run and "nis" in run and not numpy.isnan(run["nis"].values).all():
-        causes = dict(held_causes(run))
+        causes = dict(active_causes(run))
         wrong = [causes[name] for name in run["cause"].values.tolist() if name not in ("spoofing", "outlier")]
         spoofed = detection(
             alarms(run["nis"].values, p.axes), causes["spoofing"], numpy.logical_or.reduce(wrong)

@@ -10,7 +10,7 @@ from ...envs.engine.scenario_choice import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.running.own_metrics import Arrays, Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
-from ...evaluation.statistics.cause_split import held_causes
+from ...evaluation.statistics.cause_split import active_causes
 from ...evaluation.storage.dataset import keywords_of, slices_of
 from ..alarm import LARGER, scale_ratio
 from .theory import stationary
@@ -55,7 +55,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
         parts = [_lag_products(run["innovation"].values[:, times]) for times in slices.values()]
         each["innovation"] = numpy.stack(parts, axis=1)
     if "causes" in run and "nis" in run and not numpy.isnan(run["nis"].values).all():
-        held = dict(held_causes(run))
+        held = dict(active_causes(run))
         raised = held["disturbance"] | held["sensor noise"]
         each["detection"] = detect_raised_noise(run["nis"].values, run["nis_degrees"].values, raised)
     return MetricInputs(each, averaged)

@@ -28,7 +28,7 @@ from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.evaluate import check_sendable
 from filtergym.evaluation.running.metrics import components_and_groups, mean_over_time, score, squared_errors
 from filtergym.evaluation.running.parallel import Workers, check_workers
-from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes, stem_of
+from filtergym.evaluation.running.summary import EvaluationRequest, file_stem, reduce_episodes
 from filtergym.evaluation.statistics.bootstrap import CONFIDENCE, Bootstrap, IntervalEstimate
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.evaluation.storage.code import files_digest
@@ -319,7 +319,7 @@ def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[Evaluati
         if identity is not None:
             agent = hashlib.sha256(member.agent.read_bytes()).hexdigest() if member else ""
             content = json.dumps([identity, agent, name, repr(experiment), _own_digest()])
-            work = Work(f"{stem_of(experiment)}.seeds", content)
+            work = Work(f"{file_stem(experiment)}.seeds", content)
         # An agent's name may be that of a competitor.
         found[name] = EvaluationRequest(experiment, "agent" if member else name, maker, horizon=horizon), work
     return found

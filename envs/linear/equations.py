@@ -28,7 +28,7 @@ from ...filters.angles import shorten, unwrap
 from ...filters.gaussian import log_density
 from ...filters.innovation_update import Received, kalman_gain, keep_received
 from ...filters.small_matrices import apply, product, transpose
-from ...filters.unscented import GAUSSIAN, Spread, narrow, sigma_points
+from ...filters.unscented import GAUSSIAN, Spread, limit_spread, sigma_points
 from ..contract.observation import Array
 from ..contract.task import Task
 from .inputs import Input
@@ -484,7 +484,7 @@ class Equations:
         if not bent:
             return continuous, GAUSSIAN
         turns = self.xp.stack([(J[row] - slopes[row]) / periods[row] for row in bent])
-        return continuous, narrow(turns, covariance, QUARTER)
+        return continuous, limit_spread(turns, covariance, QUARTER)
 
     def receive(self, measurement: StateSpaceMeasurement, mean: Array, R: Array) -> Received:
         """Return the innovation, Jacobian H and noise R of the received numbers of a measurement.

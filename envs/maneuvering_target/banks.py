@@ -312,7 +312,7 @@ class GainBank(RadarBank):
         # Of one direction; beyond this the sum would be singular to rounding.
         largest = LARGEST_SHARE * xp.minimum(f.covariance.position, T**2 * f.covariance.velocity)
         extra_variance = xp.minimum(extra_variance, largest / (1.0 + since / T) ** 4)
-        P = alpha_beta.left_by_acceleration(f.covariance, extra_variance, f.alpha, beta, T, since)
+        P = alpha_beta.add_acceleration_error(f.covariance, extra_variance, f.alpha, beta, T, since)
         zero = 0.0 * P.cross[0]
         entries = ((P.position, P.cross), (P.cross, P.velocity))
         return xp.stack(

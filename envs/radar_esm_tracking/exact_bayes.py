@@ -339,7 +339,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         moved = self.change(moved, measurement.scan)
         looked = measurement.looked
         first, later = (
-            emitters.fall_silent(table, self.grid, looked) for table in (moved.first, moved.later)
+            emitters.predict_silence(table, self.grid, looked) for table in (moved.first, moved.later)
         )
         look = self.look_likelihood(measurement)
         first, later = first * look, later * look
@@ -355,7 +355,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             xp.reshape(memory.weights, (size, -1)),
         )
         if self.prior.coloured:
-            estimate, covariance = class_fusion.take_away_coloured_errors(estimate, covariance)
+            estimate, covariance = class_fusion.remove_coloured_errors(estimate, covariance)
         return ClassState(estimate, mirror_lower(covariance), memory, likelihood)
 
     def change(self, m: ClassTracks, scan: Array) -> ClassTracks:

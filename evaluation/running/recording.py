@@ -1,4 +1,4 @@
-"""Recordings made from the simulation: measurements in episodes of a scenario, with the truth."""
+"""Recording of simulated episodes of a scenario: their measurements and the truth."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -24,10 +24,10 @@ CHUNK = 256
 
 
 class NoFilter(Filter[Task, Any, Initial]):
-    """Filter that always returns the initial estimate, for runs without an estimator."""
+    """Filter whose estimate is always the initial one, for runs without an estimator."""
 
     def start(self, initial: Any) -> Initial:
-        """Return the initial estimate."""
+        """Return the initial estimate as the state."""
         return Initial(initial.mean, initial.covariance)
 
     def update(self, state: Initial, inputs: FilterInput) -> Initial:
@@ -40,7 +40,7 @@ def _no_filter(model: Model) -> NoFilter:
 
 
 def record_experiment(experiment: Experiment, progress: Progress | None = None) -> Recording:
-    """Record the measurements in the episodes of an experiment, and the truth.
+    """Return a recording of the measurements and the truth in the simulated episodes of an experiment.
 
     They are the episodes of an evaluation of the experiment. Replayed on the same backend, observations, estimates and
     costs are the same, bit for bit.
@@ -96,7 +96,7 @@ def record_experiment(experiment: Experiment, progress: Progress | None = None) 
 
 
 def _check_size(task: Task, episodes: int) -> None:
-    """Raise ValueError for more episodes than a recording may contain, or a closed loop."""
+    """Raise ValueError if the episodes have more numbers than a recording may contain, or for a closed loop."""
     arrays = dict(named_arrays(measure_once(task)[1]))
     row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(task.components) + 1
     if row * episodes * (task.horizon + 1) > MOST_NUMBERS:
@@ -109,7 +109,7 @@ def _check_size(task: Task, episodes: int) -> None:
 def _record(
     model: Model, seeds: Sequence[int], tick: Progress
 ) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
-    """Return the measurements and truth, ``(E, T, ...)``, and the values given at the start, ``(E, ...)``."""
+    """Return measurements and truth by name, ``(E, T, ...)``, and the initial values given to filters, ``(E, ...)``."""
     initial: dict[str, numpy.ndarray] = {}
     series: dict[str, list[numpy.ndarray]] = {}
     count, interval = len(seeds), model.task.decision_interval
@@ -148,5 +148,5 @@ def _measured(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _episodes_first(values: numpy.ndarray, count: int) -> numpy.ndarray:
-    """Return arrays ``(..., N)`` as ``(episodes, ...)``, without the padding."""
+    """Return an array ``(..., N)`` as ``(episodes, ...)``, without the padding lanes."""
     return numpy.moveaxis(values[..., :count], -1, 0).copy()

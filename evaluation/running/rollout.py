@@ -407,7 +407,9 @@ class IdleEstimator:
         """Return the initial mean and covariance."""
         return initial.mean, initial.covariance
 
-    def update(self, memory: tuple[Array, Array], measurement: Any) -> tuple[Array, Array, tuple[Array, Array]]:
+    def update(
+        self, memory: tuple[Array, Array], measurement: Any
+    ) -> tuple[Array, Array, tuple[Array, Array]]:
         """Return the initial mean and covariance again."""
         return *memory, memory
 

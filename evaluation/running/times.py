@@ -43,7 +43,6 @@ def longest_equal(nanoseconds: float) -> float:
     return max(EQUAL_TIMES * nanoseconds, nanoseconds + EQUAL_NANOSECONDS)
 
 
-
 def with_times(dataset: "xarray.Dataset", times: Sequence[ProcessorTime | None]) -> "xarray.Dataset":
     """Return an evaluation with the time of each of its competitors, or one competitor's part of one."""
     values = [math.nan if time is None else time.nanoseconds for time in times]

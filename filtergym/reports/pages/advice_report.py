@@ -17,7 +17,7 @@ from ...envs.contract.log_format import LogFormat
 from ...envs.contract.task import Task
 from ...evaluation.competitors.likelihood import Span
 from ...evaluation.running.metrics import chi_square_band
-from ...evaluation.statistics.innovations import received
+from ...evaluation.statistics.innovations import measured_quantities
 from ..tables.advice import (
     PRICES,
     ParameterText,
@@ -87,7 +87,7 @@ def advice_html(
                 "drop": DROP,
             }
         ),
-        has_track=received(replay.isel(policy=0), task) is not None,
+        has_track=measured_quantities(replay.isel(policy=0), task) is not None,
         has_innovations="prediction_error" in replay,
         has_nis="nis" in replay,
         has_onboard=advice.onboard is not None,
@@ -167,7 +167,7 @@ def _track(
     run: xarray.Dataset, task: Task, names: Sequence[str], step: int, is_outlier: numpy.ndarray
 ) -> dict[str, Any]:
     """Return measurements, estimates, truth and outliers of a track as lists: x and y, or the main component."""
-    measured = received(run.isel(policy=0), task)
+    measured = measured_quantities(run.isel(policy=0), task)
     log_format = find_companion(task, LogFormat)
     if measured is None or log_format is None:
         return {}

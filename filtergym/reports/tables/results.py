@@ -15,7 +15,7 @@ import xarray
 
 from ...envs.engine.catalogue import bare_name
 from ...evaluation.competitors.kinds import RANKED
-from ...evaluation.running.curves import spread
+from ...evaluation.running.curves import evenly_spaced
 from ...evaluation.running.metrics import Record
 from ...evaluation.storage.code import library_versions
 from ...evaluation.storage.files import write_text
@@ -154,7 +154,7 @@ def select_competitors(
 
 def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
     """Return curves at most at ``MOST_TIMES`` times, and error distributions at every other share."""
-    fewer = curves.isel(time=spread(curves.sizes["time"], MOST_TIMES))
+    fewer = curves.isel(time=evenly_spaced(curves.sizes["time"], MOST_TIMES))
     return fewer.isel(share=slice(None, None, 2)) if "share" in fewer.dims else fewer
 
 
@@ -187,7 +187,7 @@ def track_of(
     which = [dataset["component"].values.tolist().index(name) for name in components]
     episode = episode.isel(component=which, other_component=which)
     there = numpy.flatnonzero(numpy.isfinite(episode["drawn_estimate"].values).any(axis=(0, 2)))
-    episode = episode.isel(time=spread(int(there[-1]) + 1, TRACK_TIMES))
+    episode = episode.isel(time=evenly_spaced(int(there[-1]) + 1, TRACK_TIMES))
     names = {str(name): str(name).removeprefix("drawn_") for name in kept}
     found = episode.rename(names).transpose(
         "policy", "component", "other_component", "time", missing_dims="ignore"
