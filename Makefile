@@ -9,7 +9,7 @@ FUZZ_SECONDS ?= 600
 VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := docs/conf.py docs/make filtergym compiler filters envs evaluation baselines agents tests benchmarks
-WORDS := compiler filters envs evaluation baselines agents filtergym benchmarks docs papers README.md CHANGELOG.md CONTRIBUTING.md SECURITY.md RELEASING.md Makefile
+WORDS := compiler filters envs evaluation baselines agents filtergym benchmarks docs papers tests README.md CHANGELOG.md CONTRIBUTING.md SECURITY.md RELEASING.md Makefile
 
 # Numbers, and every library once: gymnasium, scipy, pandas, xarray, matplotlib, typer and rich, safetensors, msgspec.
 CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.py test_parameters.py \
@@ -21,7 +21,7 @@ CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.p
   test_rendering.py::test_frames_are_images_that_change \
   test_agents_policies.py::test_shipped_agents_need_no_torch \
   test_command_line.py::test_help_of_every_command_ends_with_an_example \
-  test_command_line.py::test_progress_bar_says_nothing_where_nobody_looks \
+  test_command_line.py::test_progress_bar_is_silent_without_a_terminal \
   test_command_line.py::test_list_names_everything \
   test_command_line.py::test_evaluate_writes_tidy_records_and_figures)
 # What reads files beside the packages, so that an unpacked source distribution must hold them.

@@ -1,4 +1,4 @@
-"""Reinforcement learning on top of the environments.
+"""Learned agents: training with Stable-Baselines3 or through the filter, policies as arrays, gates.
 
 Names are imported on first use: a learned policy is evaluated without torch, and only training needs
 Stable-Baselines3.

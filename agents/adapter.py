@@ -23,7 +23,8 @@ from .residual import check_residual
 
 STAGGERED_GROUPS = 16
 """Groups of environments that finish together, where episodes are staggered. A step with resets takes much longer than
-another; with sixteen groups a rollout still covers all parts of an episode evenly."""
+another; with sixteen groups a rollout still covers all parts of an episode evenly.
+"""
 
 
 def to_sb3(
@@ -75,7 +76,7 @@ def to_sb3(
 
 
 class TaskVecEnv(VecEnv):
-    """A native vector environment with the interface of Stable-Baselines3, see :func:`to_sb3`."""
+    """A native vector environment with the interface of Stable-Baselines3, made by :func:`to_sb3`."""
 
     def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any, gate: Gate | None) -> None:
         self.env = env
@@ -122,11 +123,11 @@ class TaskVecEnv(VecEnv):
         return observation
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
-        """Give every environment a seed of its own for the next reset."""
+        """Set the seed of every environment's next episode."""
         self._seeds = list(seeds)
 
     def step_async(self, actions: numpy.ndarray) -> None:
-        """Store the actions for :meth:`step_wait`."""
+        """Store the agent's actions, corrected by policy and gate if there are any, for the next :meth:`step_wait`."""
         if self.residual_to is not None or self.gate is not None:
             shown = self._shown["observation"] if self.env.privileged else self._shown
         if self.residual_to is not None:
@@ -139,7 +140,7 @@ class TaskVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, numpy.ndarray, numpy.ndarray, list[dict[str, Any]]]:
-        """Step every environment."""
+        """Step every environment by the stored actions; return observations, rewards, dones and infos."""
         observation, reward, _, finished, info = self.env.step(self._actions)
         self.returns += reward
         self.lengths += 1
@@ -170,7 +171,7 @@ class TaskVecEnv(VecEnv):
     # --- whole state, for checkpoints
 
     def snapshot(self) -> dict[str, Any]:
-        """Return everything that later steps depend on: lanes, running returns, the memory of a policy.
+        """Return the state on which later steps depend: episodes, running returns, memory of a corrected policy.
 
         Returns and memory are shared with this object, so pickle the snapshot before the next step.
         """
@@ -179,7 +180,7 @@ class TaskVecEnv(VecEnv):
         return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths, "policy": policy}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Continue from a snapshot of an environment made with the same arguments.
+        """Restore a state from :meth:`snapshot`, of an environment made with the same arguments.
 
         Raises:
             ValueError: if the number of environments differs.
@@ -194,7 +195,7 @@ class TaskVecEnv(VecEnv):
         return list(self._get_indices(indices))
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Return an attribute of the vector environment, once for each of the given environments."""
+        """Return an attribute of the vector environment in a list, once for each of the given environments."""
         return [getattr(self.env, attr_name) for _ in self._indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
@@ -214,5 +215,5 @@ class TaskVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
-        """Return True for ``Monitor``, whose statistics the adapter reports, and False for other wrappers."""
+        """Return whether each environment has a wrapper: true for ``Monitor``, whose statistics the adapter reports."""
         return [wrapper_class is Monitor for _ in self._indices(indices)]

@@ -123,16 +123,16 @@ class NetworkPolicy(torch.nn.Module):
 
     @property
     def layers(self) -> list[torch.nn.Linear]:
-        """Layers in order, after the memory if there is one; tanh follows the last, the rectifier those before."""
+        """Linear layers in order, after the memory if there is one; tanh follows the last, the rectifier the others."""
         return [*cast("Iterable[torch.nn.Linear]", self.hidden), self.head]
 
     @property
     def memory_size(self) -> int:
-        """Size of the memory."""
+        """Number of units of the recurrent memory; 0 without one."""
         return 0 if self.gru is None else self.gru.hidden_size
 
     def new_memory(self, envs: int) -> torch.Tensor:
-        """Return the memory at the start of episodes, ``(envs, memory_size)``."""
+        """Return the memory at the start of episodes, zeros ``(envs, memory_size)``."""
         return self.mean.new_zeros(envs, self.memory_size)
 
     def forward(self, observation: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -155,11 +155,13 @@ class NetworkPolicy(torch.nn.Module):
         return numpy.sort(numpy.argsort(-strength, kind="stable")[:count])
 
     def use_fields(self, count: int) -> None:
-        """Limit the fields in use to the ``count`` fields with the largest weights."""
+        """Limit the observation fields in use to the ``count`` fields with the largest weights."""
         self.used[numpy.setdiff1d(numpy.arange(len(self.used)), self.strongest_fields(count))] = 0.0
 
     def arrays(self) -> dict[str, numpy.ndarray]:
-        """Return the arrays of a :class:`~.learned_policy.LearnedPolicy`, restricted to the strongest fields."""
+        """Return the network's arrays by name, as in a file, restricted to the observation fields with largest
+        weights.
+        """
         columns = self.strongest_fields(self.fields_kept)
         named = {"observation_mean": self.mean[columns], "observation_scale": self.scale[columns]}
         if self.gru is not None:
@@ -176,7 +178,7 @@ class NetworkPolicy(torch.nn.Module):
         return {name: tensor.detach().numpy().copy() for name, tensor in named.items()}
 
     def fields(self, model: Model) -> list[str]:
-        """Return the names of the fields that the policy of :meth:`arrays` reads."""
+        """Return the names of the observation fields that the saved agent reads."""
         return [model.fields[i].name for i in self.strongest_fields(self.fields_kept)]
 
 
@@ -187,26 +189,29 @@ def descend_episodes(
     descend: Callable[[], None],
     gate: Gate | None = None,
     largest: float | None = None,
+    penalty: float = 0.0,
 ) -> float:
-    """Simulate one episode in every environment and descend the gradient of the mean cost.
+    """Simulate an episode in every environment, with a gradient step after each window; return the mean cost.
 
     Args:
         env: environments with torch backend and autoreset mode "Disabled".
         policy: the policy, to whose gradients are added.
         truncation: decisions through which the gradient flows back.
-        descend: called every ``truncation`` decisions and at the end, when the policy's gradients are those of
-            the mean cost of a decision since the last call; uses and clears them.
+        descend: function that uses and clears the policy's gradients. It is called every ``truncation`` decisions and
+            at the end, when they are those of the mean cost of a decision since the last call.
         gate: gate that decides whether the policy acts; other decisions have no gradient.
         largest: norm to which the gradient of an episode's costs since the last call with respect to one of its actions
             is clipped. In episodes that lose the track the gradient grows with every decision that it flows back:
             without clipping, few episodes dominate the sum.
+        penalty: cost, in the unit of the reward, of an action whose numbers have the sum of squares one. It keeps
+            actions near zero, the filter itself, where they gain little.
 
     Returns:
         Mean cost of a measurement, in the unit of the reward and compressed in the same way.
     """
     observation, _ = env.reset()
     hidden = policy.new_memory(env.num_envs)
-    total, pending = 0.0, torch.zeros(())
+    total, pending, penalties = 0.0, torch.zeros(()), torch.zeros(())
     memory, start = None, numpy.ones(env.num_envs, dtype=bool)
 
     def cut(gradient: torch.Tensor, largest: float) -> torch.Tensor:
@@ -226,12 +231,14 @@ def descend_episodes(
             action.register_hook(functools.partial(cut, largest=largest))
         observation, reward, _, _, _ = env.step(action)
         pending = pending - reward.mean()
+        penalties = penalties + penalty * action.square().sum(dim=1).mean()
         window = (decision - 1) % truncation + 1
         if window == truncation or decision == env.last_decision:
-            (pending / window).backward()
+            ((pending + penalties) / window).backward()
             total += float(pending.detach())
             descend()
-            pending, hidden, observation = torch.zeros(()), hidden.detach(), observation.detach()
+            pending, penalties = torch.zeros(()), torch.zeros(())
+            hidden, observation = hidden.detach(), observation.detach()
             env.fleet.detach()
     return total / env.last_decision
 
@@ -290,7 +297,7 @@ def _reward_to_descend(run: TrainingRun) -> str:
 
 
 def _reward_with_teacher(run: TrainingRun) -> TrainingObjective:
-    """Return the reward to differentiate, with the share of a teacher.
+    """Return the objective of a run's training: the reward, and the share of a teacher's estimates.
 
     Raises:
         ValueError: if a student cannot be trained with this reward.
@@ -350,29 +357,32 @@ class Descent:
         self.steps_done: int = 0
 
     def flight(self) -> Callable[[Callable[[], None]], float]:
-        """Return the function that simulates an episode in every environment, descends, and returns the mean cost."""
+        """Return a function that simulates an episode in every environment, descends, and returns the mean cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
-        teacher = self.values.get("teacher")
+        teacher, penalty = self.values.get("teacher"), self.values.get("action_penalty", 0.0)
+        check("action_penalty", penalty, float, ParameterLimits(at_least=0.0))
         if env.backend == "compiled":
             reward = _reward_with_teacher(self.run)
             beside = None if teacher is None else Teacher(env, teacher)
-            return Unrolled(env, policy, truncation, reward, beside, gate, largest).descend_episodes
+            return Unrolled(env, policy, truncation, reward, beside, gate, largest, penalty).descend_episodes
         if teacher is not None:
             raise ValueError(
                 f"teacher {teacher!r} needs compiled episodes, and these run on torch: leave it out"
             )
-        return functools.partial(descend_episodes, env, policy, truncation, gate=gate, largest=largest)
+        return functools.partial(
+            descend_episodes, env, policy, truncation, gate=gate, largest=largest, penalty=penalty
+        )
 
     def update(self) -> float:
-        """Descend the accumulated gradient and return its norm."""
+        """Do an optimiser step along the accumulated gradient, and return the gradient's norm."""
         norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.values["max_grad_norm"])
         self.optimiser.step()
         self.optimiser.zero_grad()
         return float(norm)
 
     def follow_schedule(self) -> None:
-        """Set the learning rate and the fields in use for the current share of the run."""
+        """Set the learning rate and the observation fields in use for the current share of the run."""
         done, policy = self.steps_done / self.run.steps, self.policy
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate(1.0 - done)
@@ -381,7 +391,7 @@ class Descent:
         policy.use_fields(math.ceil(every * (policy.fields_kept / every) ** min(1.0, done / PRUNED)))
 
     def trainee(self) -> Trainee:
-        """Return the agent with its functions for saving."""
+        """Return the agent as a :class:`Trainee`: its policy, and functions that save checkpoint and agent."""
         run, policy = self.run, self.policy
         agent = functools.partial(_make_agent, policy, run.gated)
 
@@ -393,7 +403,7 @@ class Descent:
         return Trainee(steered, self.save_checkpoint, save_agent)
 
     def save_checkpoint(self, folder: Path) -> None:
-        """Write everything that later steps depend on."""
+        """Write a checkpoint into a folder: everything on which later steps depend."""
         generators = [generator.bit_generator.state for generator in self.env.fleet.generators]
         kept = {
             "policy": self.policy.state_dict(),
@@ -407,7 +417,7 @@ class Descent:
         (folder / "checkpoint.pt").write_bytes(written.getvalue())
 
     def load_checkpoint(self, folder: Path) -> None:
-        """Load a checkpoint to continue from.
+        """Restore network, optimiser and environments from the checkpoint in a folder.
 
         Raises:
             ValueError: if it cannot be read.
@@ -426,7 +436,7 @@ class Descent:
 
 
 def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
-    """Train until ``run.steps`` environment steps are done, or until Ctrl-C or SIGTERM.
+    """Train through the filter until ``run.steps`` environment steps, or Ctrl-C or SIGTERM; return the run.
 
     Args:
         run: run from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.

@@ -12,11 +12,11 @@ from typing import Any
 import torch
 
 EXCLUDED = ("add_param_group", "zero_grad", "state_dict", "load_state_dict")
-"""Methods of an optimiser that torch excludes from compilation when they are first called."""
+"""Names of an optimiser's methods that torch excludes from compilation when they are first called."""
 
 
 def exclude_from_compilation() -> None:
-    """Mark these methods as excluded from compilation, which torch otherwise does through its compiler."""
+    """Mark the optimisers' methods as excluded from compilation, without an import of torch's compiler."""
     for name in EXCLUDED:
         method = getattr(getattr(torch.optim.Optimizer, name), "__wrapped__", None)
         if method is not None and not hasattr(method, "__dynamo_disable"):
@@ -24,7 +24,7 @@ def exclude_from_compilation() -> None:
 
 
 def step_eagerly(optimizer: torch.optim.Optimizer) -> None:
-    """Make this optimiser step without calling torch's compiler, unless it is differentiable."""
+    """Make an optimiser step without an import of torch's compiler, unless it is differentiable."""
     step: Any = getattr(type(optimizer).step, "__wrapped__", None)
     while hasattr(step, "__wrapped__"):
         step = step.__wrapped__

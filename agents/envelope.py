@@ -31,9 +31,9 @@ EPISODES = 512
 EPISODES_NOW = 16
 """Episodes of the evaluated scenario."""
 MOST_DECISIONS = 400
-"""Decisions of an episode that are compared."""
+"""Largest number of decisions of an episode that are compared."""
 TOLERATED = 0.1
-"""Share of a field's values outside the range of training that is not reported."""
+"""Largest share of a field's values outside the range of training that is not reported."""
 
 
 USUAL = 1e-3
@@ -55,7 +55,9 @@ class TrainingRange(NamedTuple):
     """Largest values, ``(fields,)``."""
 
     def is_outside(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return which values of observations ``(n, fields)`` are outside the range; NaN is."""
+        """Return a boolean mask of the values of observations ``(n, fields)`` outside the range; NaN counts as
+        outside.
+        """
         return numpy.logical_not((observation >= self.low) & (observation <= self.high))
 
 
@@ -82,7 +84,7 @@ class EnvelopeAlarm(Alarm):
 
 
 class NetworkWatch:
-    """Share of a network's recent observations that lie outside the range of its training.
+    """Monitor of a live network: share of its recent observations outside the range of its training.
 
     Args:
         model: the model whose observations are passed.
@@ -101,7 +103,7 @@ class NetworkWatch:
         self.memory: numpy.ndarray | None = None
 
     def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
-        """Update the shares with observations ``(tracks, fields)``."""
+        """Update the shares of values outside the range with observations ``(tracks, fields)``."""
         outside = self.range.is_outside(observation[:, self.columns])
         before = 0.0 * outside if self.memory is None else self.memory
         if start.any():
@@ -109,7 +111,7 @@ class NetworkWatch:
         self.memory = before + (outside - before) / WINDOW
 
     def describe(self) -> list[str]:
-        """Return for each track a sentence about the field that is outside too often; empty where none is."""
+        """Return a sentence for each track on the field that is most often outside; empty where none is too often."""
         if self.memory is None:
             return []
         most, share = self.memory.argmax(axis=1), self.memory.max(axis=1)
@@ -123,7 +125,7 @@ class NetworkWatch:
 
 
 def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
-    """Return the range of an agent's training, from its file or from new episodes of its training distribution.
+    """Return the range of each observation field in an agent's training, from its file or new episodes.
 
     Args:
         cls: the task.
@@ -147,21 +149,21 @@ def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
 
 
 def _stored(maker: Any) -> Any:
-    """Return the stored policy inside a learned policy or estimator; None if its training is unknown."""
+    """Return the stored policy inside the maker of an agent; None if its training is unknown."""
     for inside in ("maker", "policy"):  # of a gate, of an estimator
         maker = getattr(maker, inside, maker)
     return maker if getattr(maker, "header", None) is not None else None
 
 
 def _own_parameters(cls: type[Task], run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters of the task that an agent was trained with."""
+    """Return the task parameters of an agent's training by name, from the record of its run."""
     known = parameter_names(cls)
     given = run.get("hyperparameters", {}).get("env_kwargs", {})
     return {name: value for name, value in given.items() if name in known}
 
 
 class Departure(NamedTuple):
-    """Difference between the task that an agent is to act in and its training."""
+    """Difference between the task in which an agent acts and its training."""
 
     share: float
     """Share of the values of one field outside the range of training: the field with the largest share."""
@@ -182,7 +184,7 @@ class Departure(NamedTuple):
 
 
 def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str, Any]) -> Departure | None:
-    """Compare the task that an agent is to act in with its training.
+    """Return how the task in which an agent is to act differs from its training; None if it does not.
 
     Args:
         cls: the task.
@@ -220,7 +222,7 @@ def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str,
 def _observations(
     cls: type[Task], stored: Any, scenario: Any, keywords: Mapping[str, Any], seeds: Sequence[int]
 ) -> numpy.ndarray:
-    """Return the fields that an agent reads, at all decisions of some episodes under it, ``(n, fields)``."""
+    """Return the observations of an agent at all decisions of some episodes that it controls, ``(n, fields)``."""
     model = make_model(cls, stored.control, scenario, backend="auto", **keywords)
     lanes = start_lanes(model, seeds)
     policy = SteppingPolicy(model, make_competitor(stored, model))
@@ -234,13 +236,13 @@ def _observations(
 
 
 def observe_network(model: Model, episode: Episode) -> Array:
-    """Report the observation of the network of a learned estimator in a closed loop after a measurement."""
+    """Return the observation of a learned estimator's network after a measurement, in a closed loop."""
     own, received = model.filter.own, fill_missing(model.task.world.mask_missing(episode.measurement))
     return own.model.observe(Episode(None, received, episode.filter.own.bank))
 
 
 def watch_live(model: Model, maker: Any, kind: Kind) -> NetworkWatch | None:
-    """Return the comparison of a live agent's observations with its training; None if the range is unknown."""
+    """Return a monitor that compares a live agent's observations with its training; None: unknown range."""
     seen = training_range(type(model.task), maker)
     if seen is None:
         return None

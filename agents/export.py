@@ -14,7 +14,7 @@ CHECK_EPISODES = 32
 
 
 def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
-    """Write the best agent of a run as ``out``, with its ``run.json`` beside it under the same name.
+    """Write the best agent of a training run as a file, with its ``run.json`` beside it; return the run.
 
     Args:
         folder: folder of the run.

@@ -54,7 +54,8 @@ SIGNIFICANT = 3.0
 """Standard errors beyond which a fallback is rejected for its cost, and normalised innovations are too large."""
 NIS_MEMORY = 50.0
 """Measurements over which the normalised innovation squared is averaged, and degrees of freedom of the initial mean of
-one; ours."""
+one; ours.
+"""
 
 
 class FallbackAction(ConstantPolicy):
@@ -87,7 +88,7 @@ class TrustMemory(NamedTuple):
 
     alarm: Any
     envelope: Any
-    """None without an envelope."""
+    """Memory of the alarm on observations outside the training; None without an envelope."""
     active: Array
     """Remaining decisions for which the alarm is active, ``(N,)``."""
     outside: Array
@@ -95,7 +96,7 @@ class TrustMemory(NamedTuple):
 
 
 class Trust:
-    """Rule that trusts an agent, or not, at every decision.
+    """Rule that decides at every decision whether an agent is trusted.
 
     Args:
         model: the model whose observations are passed.
@@ -125,7 +126,7 @@ class Trust:
     def listen(
         self, observation: numpy.ndarray, memory: TrustMemory | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, TrustMemory]:
-        """Return where the agent is trusted.
+        """Update the alarms with an observation; return a boolean mask of the lanes in which the agent is trusted.
 
         Args:
             observation: ``(N, fields)``.
@@ -153,14 +154,14 @@ class Trust:
 
 
 class GateMemory(NamedTuple):
-    """Memory of a gate."""
+    """Memory of a gate: alarms, fallback policy."""
 
     trust: TrustMemory | None
     fallback: Any
 
 
 class Gate:
-    """Choice between an agent's action and that of a fallback, in training.
+    """Choice in training between an agent's action and a fallback's, by the agent's trust.
 
     Args:
         model: the model whose observations are passed.
@@ -184,7 +185,7 @@ class Gate:
             raise ValueError(f"the fallback is made for control {own!r}, but the task has {model.control!r}")
 
     def begin(self, seeds: Sequence[int]) -> GateMemory:
-        """Return the memory at the start of the episodes with these seeds."""
+        """Return the gate's memory at the start of the episodes with these seeds."""
         return GateMemory(None, self.fallback.begin(seeds) if isinstance(self.fallback, Policy) else None)
 
     def choose(
@@ -194,7 +195,7 @@ class Gate:
         memory: GateMemory | None,
         start: numpy.ndarray,
     ) -> tuple[numpy.ndarray, numpy.ndarray, GateMemory]:
-        """Return for every episode the action where the gate is open, and elsewhere the fallback's.
+        """Return the agent's actions where the gate is open and the fallback's elsewhere, the mask, and the memory.
 
         Args:
             observation: ``(N, fields)``.
@@ -244,13 +245,13 @@ class Gated(Policy):
         expose_spaces(self, self.policy)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory] | None:
-        """Return the memories of policy and gate; None if both are traceable, as such policies draw no numbers."""
+        """Return the initial memories of policy and gate for seeds; None if neither draws random numbers."""
         if self.traceable:
             return None
         return (self.policy.begin(seeds) if isinstance(self.policy, Policy) else None), self.gate.begin(seeds)
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Run the policy, then the gate."""
+        """Return the policy's actions, replaced by the fallback's where the gate is closed, and the memory."""
         memory, gate_memory = (None, None) if state is None else state
         own, memory = self.policy.predict(observation, memory, start, deterministic=True)
         action, _, gate_memory = self.gate.choose(observation, own, gate_memory, start)
@@ -287,7 +288,7 @@ class MonitoredPolicy(Policy):
     def act(
         self, observation: numpy.ndarray, state: MonitoredMemory | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, MonitoredMemory]:
-        """Run the policy, then the alarms."""
+        """Return the policy's actions unchanged, and the memory with the mask of trust."""
         memory, trust = (None, None) if state is None else state[:2]
         action, memory = self.policy.predict(observation, memory, start, deterministic=True)
         trusted, trust = self.trust.listen(observation, trust, start)
@@ -312,7 +313,7 @@ class GatedState(NamedTuple):
 
 
 class GatedEstimator(Filter[Any, Any, GatedState]):
-    """An agent's filter and a fallback side by side.
+    """An agent's filter and a fallback side by side; the estimate is that of the trusted one.
 
     The agent is not trusted while the fallback has predicted the measurements better. The log-likelihood ratios of the
     two are summed within :data:`MOST_ODDS`, so that new ratios soon outweigh old ones. A fallback that uses data that
@@ -339,23 +340,23 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         self.in_python: bool = fallback.in_python or not is_traceable(policy.policy)
 
     def start(self, initial: Any) -> GatedState:
-        """Start both from the initial estimate."""
+        """Return the state with both filters at the initial estimate."""
         none = 0.0 * initial.mean[0]
         expected = none + NIS_MEMORY
         states = self.agent.start(initial), self.fallback.start(initial)
         return GatedState(*states, none > 0.0, none, expected, expected)
 
     def predict(self, state: GatedState, measurement: Any) -> GatedState:
-        """Let both predict."""
+        """Return the state with both filters predicted to a measurement."""
         return state._replace(
             agent=self.agent.predict(state.agent, measurement),
             fallback=self.fallback.predict(state.fallback, measurement),
         )
 
-    def update(self, state: GatedState, given: FilterInput) -> GatedState:
-        """Update both filters with the measurement, and decide which one is trusted."""
-        xp, measurement = self.xp, given.measurement
-        agent, fallback = self.agent.update(state.agent, given), self.fallback.update(state.fallback, given)
+    def update(self, state: GatedState, inputs: FilterInput) -> GatedState:
+        """Return the state with both filters updated by a measurement, and the choice of the trusted one."""
+        xp, measurement = self.xp, inputs.measurement
+        agent, fallback = self.agent.update(state.agent, inputs), self.fallback.update(state.fallback, inputs)
         mean, other_mean = self.agent.mean(agent), self.fallback.mean(fallback)
         own = Likelihood.of_records(self.agent.records(agent, measurement))
         other = Likelihood.of_records(self.fallback.records(fallback, measurement))
@@ -377,16 +378,18 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         return GatedState(agent, fallback, trusted, odds, squares, degrees)
 
     def mean(self, state: GatedState) -> Array:
-        """Return the mean of the trusted filter."""
+        """Return the mean of the trusted filter's estimate in each lane, ``(C, N)``."""
         return self.xp.where(state.trusted, self.agent.mean(state.agent), self.fallback.mean(state.fallback))
 
     def covariance(self, state: GatedState) -> Array:
-        """Return the covariance of the trusted filter, the fallback's times its variance factor."""
+        """Return the trusted filter's covariance in each lane, ``(C, C, N)``; the fallback's times its variance
+        factor.
+        """
         other = self._variance_factor(state.squares, state.degrees) * self.fallback.covariance(state.fallback)
         return self.xp.where(state.trusted, self.agent.covariance(state.agent), other)
 
     def records(self, state: GatedState, measurement: Any) -> dict[str, Array]:
-        """Return no metrics: the estimate changes between two filters."""
+        """Return no records: the estimate changes between two filters."""
         return {}
 
     def _sum_squares(self, memory: GatedState, likelihood: Likelihood) -> tuple[Array, Array]:
@@ -419,7 +422,7 @@ def is_gateable(maker: Any) -> bool:
 
 
 class GatedMaker:
-    """Factory of an agent behind a gate, which an evaluation calls with a task.
+    """Maker of an agent behind a gate, which an evaluation calls with a task.
 
     Args:
         problem: the problem of agent and fallback.
@@ -487,7 +490,7 @@ class GatedMaker:
             )
 
     def __call__(self, task: Task, replace: Callable[[Any], Any] | None = None) -> GatedEstimator:
-        """Make the gated estimator.
+        """Return the gated estimator for a task.
 
         Args:
             task: the task.
@@ -527,7 +530,7 @@ def _excess_cost(name: str, fallback: str) -> tuple[float, float]:
 
 
 def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
-    """Return the excess cost of a competitor over the paper's algorithm, on validation episodes.
+    """Return a competitor's relative excess cost over the paper's on validation episodes, and its standard errors.
 
     Args:
         problem: the problem of both; the episodes are of its training distribution.
@@ -542,7 +545,7 @@ def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
 
 
 class PolicyMaker:
-    """Factory of a policy with wrappers, which is called with a model.
+    """Maker of a wrapped policy, which is called with a model.
 
     Args:
         maker: the policy inside, or a factory of it.
@@ -560,12 +563,12 @@ class PolicyMaker:
             self.control = control
 
     def __call__(self, model: Model) -> Any:
-        """Make the policy."""
+        """Return the wrapped policy for a model."""
         return self.wrap(model, make_competitor(self.maker, model))
 
 
 def wrap_as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool = False) -> Any:
-    """Return an agent as it acts in its training run.
+    """Return an agent's network wrapped as in its training: added to a corrected policy, behind a gate.
 
     Args:
         model: model of the run.
@@ -583,6 +586,6 @@ def wrap_as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool
 
 
 def find_gated(name: str, inner: str, problem: Problem, find: Callable[[str], Competitor]) -> Competitor:
-    """Return the competitor of ``gated:NAME``."""
+    """Return the competitor ``gated:NAME``: the agent ``inner`` beside the environment's fallback."""
     policy = find(inner)
     return Competitor(name, GatedMaker(problem, inner, policy.maker), policy.learned)

@@ -31,21 +31,21 @@ class LearnedEstimator(SteeredFilter):
         self.network = network
 
     def predict(self, state: PolicyFilterState, measurement: Any) -> PolicyFilterState:
-        """Predict in the bank."""
+        """Return the bank's state predicted to a measurement, with zeros for missing values."""
         return super().predict(state, fill_missing(measurement))
 
-    def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
-        """Run the network on the measurement, and update with its action."""
-        return super().update(state, FilterInput(fill_missing(given.measurement)))
+    def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
+        """Run the network on the measurement, update the bank with its action, and return the state."""
+        return super().update(state, FilterInput(fill_missing(inputs.measurement)))
 
 
 def fill_missing(measurement: Any) -> Any:
-    """Replace missing values by zeros: banks weight values by their availability."""
+    """Return a measurement with zeros in place of missing values; banks weight values by their availability."""
     return map_arrays(numpy.nan_to_num, measurement)
 
 
 class EstimatorMaker:
-    """Factory of a learned estimator, which an evaluation calls with a task.
+    """Maker of a learned estimator, which an evaluation calls with a task.
 
     Args:
         bank: name of the filter among the trained banks of the task.
@@ -60,6 +60,6 @@ class EstimatorMaker:
         self.policy = policy
 
     def __call__(self, task: Task) -> LearnedEstimator:
-        """Make the learned estimator."""
+        """Return the learned estimator for a task."""
         model = Model(task, self.bank)
         return LearnedEstimator(model, self.policy(model.on_numpy()))

@@ -24,7 +24,7 @@ from ..envs.data.foreign_files import parse_json, read_content
 from ..envs.engine.catalogue import short_name, task_class
 from ..evaluation.competitors.kinds import Policy
 from ..evaluation.storage.files import whole_file
-from ..evaluation.storage.stored import fits
+from ..evaluation.storage.stored import has_type
 from .gate import wrap_as_trained
 from .learned_estimator import EstimatorMaker
 from .training_run import TrainingRun
@@ -50,7 +50,7 @@ ROWS = 8
 
 
 def _product(rows: numpy.ndarray, weight: numpy.ndarray) -> numpy.ndarray:
-    """Return ``rows @ weight.T`` in products of one shape.
+    """Return ``rows @ weight.T``, computed in matrix products of one shape so that rounding is reproducible.
 
     BLAS rounds by the shape, and an observation's action must not depend on the number of others. The compiler makes a
     loop of traced rows.
@@ -108,7 +108,7 @@ class LearnedPolicy(Policy):
         ]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Run the network in the precision of its arrays.
+        """Return the network's action for observations, in the precision of its arrays, and the memory.
 
         Interpreted, compiled with the filters and written in NumPy, the outputs agree to rounding.
         """
@@ -134,13 +134,13 @@ class LearnedPolicy(Policy):
         return space.low + (space.high - space.low) * 0.5 * (1.0 + numpy.tanh(x)), state
 
     def _memory(self, state: Any, start: numpy.ndarray, width: int) -> numpy.ndarray:
-        """Return the memory, ``(N, width)``; zeros at the start of an episode."""
+        """Return the network's memory ``(N, width)``, with zeros where an episode starts."""
         dtype = self.arrays["observation_mean"].dtype
         memory = numpy.zeros((len(start), width), dtype) if state is None else state
         return numpy.where(start[:, None], dtype.type(0.0), memory)
 
     def _gru_step(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
-        """Apply one step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
+        """Return the memory after a step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
         a = self.arrays
         from_input = _product(x, a["gru_input_weight"]) + a["gru_input_bias"]
         from_input = numpy.split(from_input, 3, axis=1)
@@ -152,7 +152,7 @@ class LearnedPolicy(Policy):
         return (1.0 - update) * new + update * memory
 
     def _long_short_term(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
-        """Apply one step of the long short-term memory (Gers et al., 2000); return outputs, then cells."""
+        """Return outputs and cells after a step of the long short-term memory (Gers et al., 2000)."""
         a = self.arrays
         shown, cells = numpy.split(memory, 2, axis=1)
         gates = _product(x, a["lstm_input_weight"]) + a["lstm_input_bias"]
@@ -170,7 +170,10 @@ def write_arrays(
     activation: str = "tanh",
     fields: Sequence[str] | None = None,
 ) -> None:
-    """Write a learned policy and the record of its run; arguments as of :class:`LearnedPolicy`."""
+    """Write a learned policy's arrays and the record of its run as a safetensors file.
+
+    Arguments are those of :class:`LearnedPolicy`.
+    """
     from safetensors.numpy import save
 
     model = run.make_model()
@@ -234,7 +237,7 @@ def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
             raise ValueError(
                 f"unknown output {header['output']!r:.80} or activation {header['activation']!r:.80}"
             )
-        if not fits(header["fields"], list[str]):
+        if not has_type(header["fields"], list[str]):
             raise ValueError("its header has no list of fields")
         _check_run(header["run"])
         header["answers"] = _count_answers(arrays, len(header["fields"]))
@@ -246,7 +249,7 @@ def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
 
 
 def _check_run(run: Any) -> None:
-    """Check the types of the run's record in a header.
+    """Raise ValueError unless the run's record in a file's header has the right types.
 
     Raises:
         ValueError: for a value of another type.
@@ -254,7 +257,7 @@ def _check_run(run: Any) -> None:
     if not isinstance(run, dict):
         raise ValueError("its header has no record of a run")
     for name, hint in get_type_hints(TrainingRun).items():
-        if name in run and not fits(run[name], hint):
+        if name in run and not has_type(run[name], hint):
             raise ValueError(
                 f"{name} of its run must be {getattr(hint, '__name__', hint)}, got {run[name]!r:.80}"
             )
@@ -263,7 +266,7 @@ def _check_run(run: Any) -> None:
 
 
 def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
-    """Check that arrays form a network, and return the number of its outputs.
+    """Return the number of a network's outputs; raise ValueError unless its arrays fit together.
 
     Args:
         arrays: arrays of the file.
@@ -300,7 +303,7 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
 
 
 class StoredPolicy:
-    """Factory of the policy of a file, which an evaluation calls with a model."""
+    """Maker of the policy in a file, which an evaluation calls with a model."""
 
     def __init__(self, path: Path) -> None:
         self.arrays, self.header = read_arrays(path)
@@ -314,12 +317,12 @@ class StoredPolicy:
 
     @property
     def task_keywords(self) -> dict[str, Any]:
-        """Parameters of the reach of its actions (:class:`.Actions`) that its training set."""
+        """Task parameters of its training that set the range of its actions (:class:`.Actions`)."""
         reach = action_reach(task_class(self.header["environment"]), self.control)
         return {name: value for name, value in self._keywords.items() if name in reach}
 
     def _check_reach(self, model: Model) -> None:
-        """Raise ValueError if the reach of the model's actions differs from that in training."""
+        """Raise ValueError if the range of the model's actions differs from that in training."""
         now, keywords = model.task.parameters, self.task_keywords
         defaults = type(now)()
         for name in action_reach(model.task, self.control):
@@ -333,7 +336,7 @@ class StoredPolicy:
                 )
 
     def __call__(self, model: Model) -> Policy:
-        """Make the policy, with the policy that it corrects and its gate."""
+        """Return the policy for a model, with the policy that it corrects and its gate."""
         if self.header["interface"] != str(model.task.interface):
             raise ValueError(
                 f"{self.path} was trained with another meaning of the fields or actions of {model.task.id} (its "
@@ -359,7 +362,7 @@ class StoredPolicy:
 
 
 def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
-    """Load the factory of a learned policy or estimator of an environment from a file.
+    """Return the maker of a learned policy or estimator, loaded from a file of an environment.
 
     Raises:
         ValueError: if the file is not a learned policy, or belongs to another environment.

@@ -20,14 +20,14 @@ def pretrained_agents(id: str) -> list[str]:
 
 
 def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
-    """Return the factory of a learned policy; None for another name.
+    """Return the maker of the learned policy of a name, file or folder; None for another name.
 
     Args:
         cls: the environment.
         name: name of a shipped agent (``ppo``, ``bptt``); or a file: ``.safetensors``, or the ``.zip`` of a
             Stable-Baselines3 model, which can execute code while it is loaded; or the folder of a training run, which
             means its best agent.
-        trust: load such a zip.
+        trust: whether to load a zip.
 
     Raises:
         ValueError: if the content of the file or folder does not match its name, or needs ``trust``.
@@ -51,7 +51,7 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
 
 
 def load_zipped_model(cls: type[Task], path: Path, control: str | None, trust: bool) -> Any:
-    """Load a model of Stable-Baselines3, the network alone.
+    """Return a model of Stable-Baselines3, loaded from its zip: the network alone.
 
     Raises:
         ValueError: if the file is not a model, or is not trusted.
@@ -64,7 +64,7 @@ def load_zipped_model(cls: type[Task], path: Path, control: str | None, trust: b
 
 
 def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
-    """Load the best agent of a run of ``filtergym train`` or rl-zoo3, from plain arrays where they exist."""
+    """Return the best agent of a run of ``filtergym train`` or rl-zoo3, from plain arrays where they exist."""
     if not (folder / "run.json").exists():
         # rl-zoo3: ENV_1/best_model.zip if there was an evaluation, and ENV_1/ENV.zip at the end.
         for name in ("best_model", folder.absolute().name.rpartition("_")[0]):
@@ -81,7 +81,7 @@ def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
 
 
 def _wrap_as_in_run(model: Any, run: TrainingRun) -> Any:
-    """Return a model with the policy that it corrects, its gate, and the reach of its actions."""
+    """Return the maker of a model's policy as in its run: with corrected policy, gate, and range of actions."""
     reach = action_reach(run.problem.task, run.control)
     model.task_keywords = {name: run.task_keywords[name] for name in reach if name in run.task_keywords}
     if not (run.residual_to or run.gated):
@@ -101,7 +101,7 @@ def with_normalisation(found: Any) -> Any:
 
 
 def _find_learned(name: str, problem: Problem, trust: bool, find_shipped: Any) -> Competitor | None:
-    """Return a shipped agent, or that of a file or folder; None for another name."""
+    """Return the competitor of a shipped agent, or of one in a file or folder; None for another name."""
     maker = find_learned_policy(problem.task, name, trust)
     if maker is None:
         return None

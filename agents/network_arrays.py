@@ -1,4 +1,4 @@
-"""The plain arrays of a trained model's network, in the form of a learned policy."""
+"""Conversion of a trained model of Stable-Baselines3 to the arrays of a learned policy."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import torch
 
 
 def _layers(*modules: torch.nn.Module) -> tuple[dict[str, numpy.ndarray], str]:
-    """Return the arrays of the linear layers in order, and the activation between them."""
+    """Return weights and biases of the linear layers in torch modules, by name, and the activation between them."""
     parts = [part for module in modules for part in module.modules() if not list(part.children())]
     linear = [part for part in parts if isinstance(part, torch.nn.Linear)]
     between = {type(part) for part in parts} - {torch.nn.Linear, torch.nn.Flatten}
@@ -36,14 +36,14 @@ def _lstm(module: torch.nn.LSTM) -> dict[str, numpy.ndarray]:
 
 
 def network_arrays(agent: Any, algorithm: str) -> tuple[dict[str, numpy.ndarray], str, str]:
-    """Return the arrays, float32, output and activation of a trained model's deterministic action.
+    """Return a trained model's network as float32 arrays by name, its output map and its activation.
 
     Raises:
         ValueError: for an algorithm or network that a learned policy cannot represent.
     """
     policy: Any = agent.model.policy
     discrete = not hasattr(agent.action_space, "low")
-    if algorithm in ("ppo", "recurrent-ppo"):
+    if algorithm in ("ppo", "recurrent-ppo", "rl-ukf"):
         arrays, activation = _layers(policy.mlp_extractor.policy_net, policy.action_net)
         output = "argmax" if discrete else "clip"
         if algorithm == "recurrent-ppo":

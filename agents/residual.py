@@ -1,7 +1,7 @@
 """Residual agents: the agent's action is added to that of an existing policy.
 
-Zero is exactly the policy, so training starts from it. The sum is clipped to the action space, as every action is.
-Training over many environments: ``to_sb3(env, residual_to=policy)``.
+The action zero gives exactly that policy, so training starts from it. The sum is clipped to the action space, as every
+action is. Training over many environments: ``to_sb3(env, residual_to=policy)``.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ def check_residual(model: Model, policy: Any) -> None:
 
 
 def policy_to_correct(model: Model, name: str) -> Any:
-    """Make the policy that an agent corrects in a training run.
+    """Return the policy that an agent corrects in a training run, made for a model.
 
     Args:
         model: the model of both.
@@ -74,7 +74,7 @@ class ResidualPolicy(Policy):
         expose_spaces(self, agent)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, Any] | None:
-        """Return the memories of both; None if both are traceable, as such policies draw no numbers."""
+        """Return the initial memories of both policies for seeds; None if neither draws random numbers."""
         if self.traceable:
             return None
         both = self.policy, self.agent
@@ -82,7 +82,7 @@ class ResidualPolicy(Policy):
         return first, second
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the sum of both actions."""
+        """Return the sum of the policy's and the agent's actions, clipped, and both memories."""
         memory, agent_memory = (None, None) if state is None else state
         own, memory = self.policy.predict(observation, memory, start, deterministic=True)
         correction, agent_memory = self.agent.predict(observation, agent_memory, start, deterministic=True)

@@ -8,7 +8,7 @@ from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "ppo": PPO, "recurrent-ppo": RecurrentPPO, "sac": SAC, "dqn": DQN,
+    "ppo": PPO, "recurrent-ppo": RecurrentPPO, "sac": SAC, "dqn": DQN, "rl-ukf": PPO,
 }  # fmt: skip
 """Classes of the algorithms by their names."""
 SPACES: dict[str, tuple[type[gymnasium.Space[Any]], ...]] = {
@@ -16,5 +16,6 @@ SPACES: dict[str, tuple[type[gymnasium.Space[Any]], ...]] = {
     "recurrent-ppo": (gymnasium.spaces.Box, gymnasium.spaces.Discrete),
     "sac": (gymnasium.spaces.Box,),
     "dqn": (gymnasium.spaces.Discrete,),
+    "rl-ukf": (gymnasium.spaces.Box,),
 }
 """Action spaces of each algorithm."""

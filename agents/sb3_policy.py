@@ -1,6 +1,6 @@
-"""Trained models of Stable-Baselines3 and sb3-contrib as policies, with the normalisation that they expect.
+"""Trained models of Stable-Baselines3 and sb3-contrib as policies, with the normalisation of their training.
 
-A model that was trained under ``VecNormalize`` expects normalised observations, and its zip does not contain the
+A model that was trained under ``VecNormalize`` needs normalised observations, and its zip does not contain the
 statistics: they are in a file of their own. With raw observations such a model runs without an error, but badly.
 """
 
@@ -40,7 +40,8 @@ POLICY_CLASSES: tuple[tuple[type[BaseAlgorithm], str, str], ...] = (
     (TQC, "TQCPolicy", ""),
 )
 """Algorithms of a zip, which does not name its own; the first match counts. Each entry is the algorithm, the class that
-the stored policy is or inherits from, and a value that the zip must contain ("" for none). DDPG is loaded as TD3."""
+the stored policy is or inherits from, and a value that the zip must contain ("" for none). DDPG is loaded as TD3.
+"""
 NAMES = "PPO, RecurrentPPO, A2C, TRPO, SAC, TD3, DDPG, TQC, CrossQ, DQN, QR-DQN and ARS"
 
 
@@ -107,7 +108,7 @@ class Sb3Policy:
 
 
 def _reach(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the reach of actions (:class:`.Actions`) in the environment of a model, where it is not the default."""
+    """Return the task parameters that set the range of actions in a model's environment, if not default."""
     held = model.get_env()
     inner: Any = None if held is None else held.unwrapped
     env = inner.envs[0].unwrapped if isinstance(inner, DummyVecEnv) else getattr(inner, "env", None)
@@ -128,7 +129,7 @@ def _check_shape(normalisation: VecNormalize, model: BaseAlgorithm) -> None:
 
 
 def was_trained_normalised(model: BaseAlgorithm) -> bool:
-    """Return whether a model was detectably trained under ``VecNormalize``.
+    """Return whether a model was trained on normalised observations, as far as its stored observations show.
 
     A model stores its last observation and, under ``VecNormalize``, the original of it. Algorithms with a replay buffer
     store an earlier observation in its place without ``VecNormalize``, too. ``VecNormalize`` returns float32. So with
@@ -145,7 +146,7 @@ def was_trained_normalised(model: BaseAlgorithm) -> bool:
 
 
 def _is_wrapped(model: BaseAlgorithm) -> bool:
-    """Return whether the environment of a model contains Gymnasium's own wrapper of normalisation."""
+    """Return whether the environment of a model contains Gymnasium's ``NormalizeObservation``."""
     env = model.get_env()
     inner = None if env is None else env.unwrapped
     wrapper = gymnasium.wrappers.NormalizeObservation
@@ -153,7 +154,7 @@ def _is_wrapped(model: BaseAlgorithm) -> bool:
 
 
 def statistics_places(path: Path, environment: str | None = None) -> Iterator[Path]:
-    """Return the files that may contain the statistics of a model's zip, nearest first.
+    """Yield the paths of files that may contain the normalisation of a model's zip, most specific first.
 
     Args:
         path: path of the zip.
@@ -174,7 +175,7 @@ def statistics_places(path: Path, environment: str | None = None) -> Iterator[Pa
 def load_sb3_policy(
     path: Path | str, environment: str | None = None, control: str | None = None, *, trust: bool = False
 ) -> Sb3Policy:
-    """Load a model's zip with the statistics of its ``VecNormalize``, if there are any.
+    """Return a policy from a model's zip, with the statistics of its ``VecNormalize`` if there are any.
 
     The statistics may be in ``vecnormalize.pkl`` beside the zip, in rl-zoo3's place (``ENV/vecnormalize.pkl`` below the
     folder), or beside a checkpoint of Stable-Baselines3's ``CheckpointCallback``, under its name for them.
@@ -211,7 +212,7 @@ def load_sb3_policy(
 
 
 def _load_model(path: Path) -> BaseAlgorithm:
-    """Load a zip with the class of its algorithm.
+    """Return the model in a zip, loaded with the class of its algorithm.
 
     Raises:
         ValueError: for an unknown algorithm.

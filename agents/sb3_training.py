@@ -40,7 +40,7 @@ from .training_session import Bookkeeping, Session, Trainee, curve_writer, inter
 
 
 class _Trainer(BaseCallback):
-    """Callback that runs the bookkeeping between an update and the next rollout."""
+    """Callback of Stable-Baselines3 that validates and saves between an update and the next rollout."""
 
     def __init__(self, books: Bookkeeping, progress: Callable[[int], None]) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class _Trainer(BaseCallback):
 
 
 def training_environment(run: TrainingRun) -> TaskVecEnv:
-    """Make the environments of a run."""
+    """Return the vector environment of a training run, made for Stable-Baselines3."""
     env: Any = gymnasium.make_vec(
         run.environment,
         num_envs=run.envs,
@@ -81,7 +81,7 @@ def _step_eagerly(model: BaseAlgorithm) -> None:
 
 
 def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder: Path) -> None:
-    """Write ``model.zip`` and ``vecnormalize.pkl``."""
+    """Write a model and its normalisation as ``model.zip`` and ``vecnormalize.pkl``."""
     # Through memory: on a full disk torch raises its own exception.
     written = io.BytesIO()
     model.save(written)
@@ -91,7 +91,7 @@ def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder:
 
 
 def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
-    """Write a model, and its plain arrays as ``agent.safetensors`` if a learned policy can represent it."""
+    """Write an agent's model, and its plain arrays as ``agent.safetensors`` if a learned policy can represent it."""
     save_model(agent.model, agent.normalisation, folder)
     if run.residual_to or run.gated:
         save_run(run, folder / "run.json")  # with the policy that it corrects, and its gate
@@ -101,7 +101,7 @@ def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
 
 
 def as_saved_agent(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPolicy | Sb3Policy:
-    """Return an agent as :func:`save_agent` stores it, which is several times as fast as the model.
+    """Return an agent's network as plain arrays, several times as fast as the model.
 
     An agent that a learned policy cannot represent is returned unchanged.
     """
@@ -114,7 +114,7 @@ def as_saved_agent(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPol
 def save_checkpoint(
     model: BaseAlgorithm, env: TaskVecEnv, normalisation: VecNormalize | None, folder: Path
 ) -> None:
-    """Write everything that later steps depend on."""
+    """Write a checkpoint of model, environments and normalisation into a folder."""
     save_model(model, normalisation, folder)
     if isinstance(model, OffPolicyAlgorithm):
         model.save_replay_buffer(folder / "replay_buffer.pkl")
@@ -134,7 +134,7 @@ def save_checkpoint(
 def load_checkpoint(
     run: TrainingRun, folder: Path, trust: bool
 ) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
-    """Load a checkpoint to continue from.
+    """Return model, environments and normalisation of a checkpoint, to continue from.
 
     Raises:
         ValueError: if it is not trusted, or a file is missing or corrupt.
@@ -179,7 +179,7 @@ def check_algorithm(run: TrainingRun) -> None:
 
 
 def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
-    """Make the model of a new run, with its environments and their normalisation."""
+    """Return the model of a new run, its environments, and their normalisation."""
     # A deep copy: Stable-Baselines3 writes into policy_kwargs.
     values = copy.deepcopy(run.hyperparameters)
     for name in ("learning_rate", "clip_range"):
@@ -201,7 +201,7 @@ def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormali
 
 
 def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
-    """Train until ``run.steps`` environment steps are done, or until Ctrl-C or SIGTERM.
+    """Train with Stable-Baselines3 until ``run.steps`` environment steps, or Ctrl-C or SIGTERM; return the run.
 
     Args:
         run: run from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.

@@ -17,13 +17,15 @@ from ..envs.engine.catalogue import nearest, parameter_names
 SCIENTIFIC = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 """Numbers such as 1e-3, which YAML 1.1 parses as strings."""
 OPTIONS = ("control", "scenario", "backend")
-"""Keywords of an environment that are also options of a run."""
+"""Keywords of an environment that are also options of a training run."""
 SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training accepts."""
 ESTIMATORS = ("kalman-net", "student")
 """Algorithms that train a learned estimator: a network that acts in a filter of its own (:class:`.TrainedBanks`)."""
-THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", *ESTIMATORS)
+THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", "bptt-strongest", "ma-ukf", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
+RIVALS = {"ma-ukf": "sigma-points", "rl-ukf": "unscented"}
+"""Algorithms of one control, of papers that train policies for it."""
 RUN_ARGUMENTS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 """Arguments of an algorithm that a run sets itself."""
 
@@ -40,7 +42,7 @@ def convert_numbers(value: Any) -> Any:
 
 
 def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge two mappings recursively; the second overrides the first."""
+    """Return two nested mappings merged; the second overrides the first."""
     both = dict(first)
     for name, value in then.items():
         own = both.get(name)
@@ -51,7 +53,7 @@ def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[st
 
 
 def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parse ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
+    """Parse words ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
 
     Returns:
         Keywords of the environment, and hyperparameters.
@@ -80,7 +82,7 @@ def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]
 
 
 def _read_table(path: Path, needs: str) -> dict[str, Any]:
-    """Read a YAML file of sections.
+    """Return the mapping in a YAML file.
 
     Raises:
         ValueError: if it cannot be read, or is not a mapping; ``needs`` describes the expected form.
@@ -96,7 +98,7 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
 
 
 def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
-    """Return the section of an environment, or the default one.
+    """Return the section of an environment in a table of settings, or the section ``default``.
 
     Raises:
         ValueError: if there is none.
@@ -110,7 +112,7 @@ def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
 
 
 def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read a file of settings.
+    """Return the settings of an environment in a user's YAML file: its keywords, and hyperparameters.
 
     Args:
         path: YAML file with hyperparameters in sections by environment id or ``default``, as in rl-zoo3, with
@@ -156,7 +158,14 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
     """
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
-        known |= {"first_action", "fields_kept", "longest_memory", "max_action_grad", "network"}
+        known |= {
+            "action_penalty",
+            "first_action",
+            "fields_kept",
+            "longest_memory",
+            "max_action_grad",
+            "network",
+        }
         known |= {"teacher", "teacher_share"}
     else:
         from .sb3_algorithms import ALGORITHMS

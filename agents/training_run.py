@@ -46,6 +46,7 @@ from .residual import policy_to_correct
 from .settings import (
     ESTIMATORS,
     OPTIONS,
+    RIVALS,
     THROUGH_THE_FILTER,
     check_hyperparameters,
     check_keywords,
@@ -61,8 +62,11 @@ FILES = {
     "bptt": "bptt",
     "bptt-linear": "bptt_linear",
     "bptt-small": "bptt_small",
+    "bptt-strongest": "bptt_strongest",
     "kalman-net": "kalman_net",
     "student": "student",
+    "ma-ukf": "ma_ukf",
+    "rl-ukf": "rl_ukf",
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib")
@@ -70,7 +74,7 @@ LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "s
 
 
 class ValidationEntry(TypedDict):
-    """One validation of a run."""
+    """One validation of a training run: step, cost, and difference to the paper's algorithm."""
 
     steps: int
     cost: float
@@ -78,7 +82,7 @@ class ValidationEntry(TypedDict):
     """Name of the paper's algorithm, where there is one."""
     paper_cost: NotRequired[float]
     relative_cost_difference: NotRequired[list[float]]
-    """Value and 95 % interval."""
+    """Relative cost difference to the paper's algorithm, and its 95 % interval."""
 
 
 class FirstWin(TypedDict):
@@ -91,12 +95,12 @@ class FirstWin(TypedDict):
 
 @dataclass
 class TrainingRun:
-    """The content of ``run.json``."""
+    """The record of a training run, the content of ``run.json``."""
 
     environment: str
     control: str
     scenario: str
-    """A name, or a mixture in words, ``random:0.8,paper:0.2``."""
+    """Name of the scenario, or a mixture in words, ``random:0.8,paper:0.2``."""
     algorithm: str
     seed: int
     envs: int
@@ -125,7 +129,7 @@ class TrainingRun:
 
     @functools.cached_property
     def problem(self) -> Problem:
-        """Problem of the environment."""
+        """Problem (task and baselines) of the environment."""
         return problem_of(self.environment)
 
     @property
@@ -135,26 +139,26 @@ class TrainingRun:
         return {n: value for n, value in self.hyperparameters.get("env_kwargs", {}).items() if n in known}
 
     def make_model(self, scenario: str | None = None) -> Model:
-        """Make the model of the training in one of its scenarios."""
+        """Return the model of the training in one of its scenarios; None: the environment's default one."""
         return make_model(self.problem.task, self.control, scenario, **self.task_keywords)
 
     @property
     def is_complete(self) -> bool:
-        """Whether all requested steps are done."""
+        """Whether all requested environment steps are done."""
         return self.steps_done >= self.steps
 
     @property
     def best(self) -> ValidationEntry | None:
-        """The validation with the lowest cost."""
+        """Validation with the lowest cost so far; None before the first one."""
         return min(self.validation, key=lambda entry: entry["cost"], default=None)
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """A user's options of a run; options that are None come from the algorithm's hyperparameters."""
+    """A user's options of a training run; options that are None come from the algorithm's hyperparameters."""
 
     algorithm: str
-    """One of ``FILES``."""
+    """Name of the algorithm, one of ``FILES``."""
     control: str | None = None
     """Control of the agent; None: that of the settings, or the environment's first."""
     steps: int | None = None
@@ -175,7 +179,8 @@ class RunOptions:
     """Backend of the environments."""
     residual_to: str = ""
     """Name of one of the environment's own policies, to whose actions the agent's are added; the default control is
-    then that policy's."""
+    then that policy's.
+    """
     gated: bool = False
     """Whether the agent acts behind a gate, see :mod:`.gate`."""
 
@@ -232,7 +237,7 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
 
 
 def _merge_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the hyperparameters, and the keywords of the environment that do not come from the shipped file.
+    """Return a run's hyperparameters, and keywords of the environment from the user, merged from all sources.
 
     Raises:
         ValueError: for an unknown name.
@@ -254,7 +259,7 @@ def _check_environment(
     scenarios: Mapping[str, float],
     keywords: Mapping[str, Any],
 ) -> None:
-    """Raise ValueError if the environment of a run cannot be made."""
+    """Raise ValueError if the environment of a run cannot be made with its keywords in all scenarios."""
     known = parameter_names(problem.task)
     parameters = {name: value for name, value in keywords.items() if name in known}
     models = [make_model(problem.task, control, name, **parameters) for name in scenarios]
@@ -266,12 +271,12 @@ def _check_environment(
 
 
 def _as_integer(value: Any) -> Any:
-    """Return a whole number as an integer: files contain 1e6."""
+    """Return a float without fraction as an integer, since files contain 1e6; other values unchanged."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
-    """Raise ValueError if an agent cannot correct that policy, or act behind a gate."""
+    """Raise ValueError if an agent cannot correct the requested policy, or act behind a gate."""
     algorithm, residual_to = options.algorithm, options.residual_to
     if len(models) > 1:
         raise ValueError(
@@ -292,15 +297,18 @@ def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
 
 
 def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
-    """Return the controls that an algorithm can train: those of an environment, or the filter of a learned estimator.
+    """Return the names of the controls that an algorithm can train, or the bank of a learned estimator.
 
     Raises:
         ValueError: if the environment has no such filter.
     """
-    if algorithm not in ESTIMATORS:
+    if algorithm in RIVALS and RIVALS[algorithm] in cls.controls:
+        return (RIVALS[algorithm],)
+    if algorithm not in ESTIMATORS and algorithm not in RIVALS:
         return cls.controls
     if algorithm not in trained_banks(cls):
-        having = [other.id for other in catalogue().values() if algorithm in trained_banks(other)]
+        own = RIVALS.get(algorithm)
+        having = [c.id for c in catalogue().values() if algorithm in trained_banks(c) or own in c.controls]
         raise ValueError(
             f"{cls.id} has no filter for algorithm {algorithm!r}: choose another algorithm, or {', '.join(having)}"
         )
@@ -308,7 +316,7 @@ def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
 
 
 def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
-    """Return the scenarios of a run with their weights.
+    """Return the weight of each scenario of a run, by name.
 
     Raises:
         ValueError: for an unknown scenario, or one that is held out, alone or in a mixture.
@@ -325,14 +333,14 @@ def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
 
 
 def scenario_text(weights: Mapping[str, float]) -> str:
-    """Return a scenario or a mixture in the form of the option ``--scenario`` and of ``gymnasium.make``."""
+    """Return a scenario or a mixture as text, such as ``random:0.8,paper:0.2``."""
     if len(weights) == 1:
         return next(iter(weights))
     return ",".join(f"{name}:{weight!r}" for name, weight in weights.items())
 
 
 def read_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
-    """Return the hyperparameters of an algorithm for an environment; default ones if the file has no section for it.
+    """Return the shipped hyperparameters of an algorithm for an environment, by name; else the default ones.
 
     A file that is ``based_on`` another algorithm's contains only the differences, by default and for an environment.
     """
@@ -347,7 +355,7 @@ def read_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
 
 
 def schedule(name: str, value: float | str) -> Callable[[float], float]:
-    """Return a hyperparameter as a function of the remaining share of the run, 1 to 0.
+    """Return a hyperparameter's value as a function of the remaining share of the run, from 1 to 0.
 
     Args:
         name: its name, such as ``learning_rate``.
@@ -380,12 +388,12 @@ def check_trust(what: str, trust: bool) -> None:
 
 
 def save_run(run: TrainingRun, path: Path) -> None:
-    """Write a run's record in one atomic step."""
+    """Write a run's record to a file in one atomic step."""
     write_text(path, json.dumps(asdict(run), indent=1) + "\n")
 
 
 def load_run(folder: Path, trust: bool = False) -> TrainingRun:
-    """Read ``run.json``.
+    """Return the record of a run, read from ``run.json`` of its folder.
 
     Args:
         folder: folder of the run.
@@ -427,7 +435,7 @@ def best_agent(folder: Path) -> Path:
 
 
 def resume_run(folder: Path, requested: TrainingRun, same: bool = False) -> TrainingRun:
-    """Read the run of a folder to continue it up to the requested steps, and repair folders that a crash left.
+    """Return the run of a folder, to continue it to the requested steps; repair folders that a crash left.
 
     Args:
         folder: folder of the run.
@@ -486,7 +494,7 @@ def has_run(folder: Path) -> bool:
 
 
 def open_run(folder: Path, requested: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
-    """Begin a run in a folder, or continue the one there, and store its command and versions.
+    """Begin a run in a folder or continue the one there, store its command and versions, and return it.
 
     Args:
         folder: folder of the run.

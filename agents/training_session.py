@@ -17,7 +17,7 @@ from .validation import Validation
 
 
 def _curve(entry: ValidationEntry) -> dict[str, float]:
-    """Return the numbers of a validation for the log."""
+    """Return the numbers of a validation for the log, by name."""
     curve = {"validation/cost": entry["cost"]}
     if "paper_cost" in entry and "relative_cost_difference" in entry:
         curve["validation/paper_cost"] = entry["paper_cost"]
@@ -56,7 +56,7 @@ def curve_writer(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
 
 @contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Make the first Ctrl-C or SIGTERM request a stop at the next safe point; the second stops at once."""
+    """Yield a function that returns whether Ctrl-C or SIGTERM has requested a stop; the second stops at once."""
     wished = False
     if threading.current_thread() is not threading.main_thread():  # signals reach the main thread only
         yield lambda: False
@@ -81,7 +81,7 @@ def interruption() -> Iterator[Callable[[], bool]]:
 
 
 def _ignore(value: Any) -> None:
-    """Do nothing."""
+    """Ignore a value; the default callback."""
 
 
 def _never_stop(entry: ValidationEntry) -> bool:
@@ -105,11 +105,11 @@ class Session:
     trust: bool = False
     """Load the checkpoint even if it can execute code; needed to resume a model of Stable-Baselines3."""
     progress: Callable[[int], None] = _ignore
-    """Called with the number of environment steps done."""
+    """Function that is called with the number of environment steps done."""
     report: Callable[[str], None] = _ignore
-    """Called with a sentence about every validation."""
+    """Function that is called with a sentence on every validation."""
     on_validation: Callable[[ValidationEntry], bool] = _never_stop
-    """Called with every validation; returns whether to stop with a checkpoint."""
+    """Function that is called with every validation and returns whether to stop with a checkpoint."""
 
     def __post_init__(self) -> None:
         if self.validate_every is not None:
@@ -121,25 +121,25 @@ class Session:
 
 
 class Trainee(NamedTuple):
-    """An agent while it is trained."""
+    """An agent in training: its policy, and functions that save it."""
 
     policy: Any
-    """The policy, for an evaluation."""
+    """Policy of the agent, for an evaluation."""
     save_checkpoint: Callable[[Path], None]
-    """Writes all that later steps depend on into an empty folder."""
+    """Function that writes a checkpoint into an empty folder."""
     save_agent: Callable[[Path], None]
-    """Writes the agent alone into an empty folder."""
+    """Function that writes the agent alone into an empty folder."""
 
 
 class Bookkeeping:
-    """Validations and checkpoints of a run, with its record.
+    """Bookkeeping of a run in training: validations, checkpoints, and the record.
 
     Args:
         run: the record, which is updated.
         session: settings of the session; every validation is followed by a checkpoint.
         trainee: the agent.
-        stop: returns whether a stop was requested.
-        log: writes numbers by name at a number of environment steps.
+        stop: function that returns whether a stop was requested.
+        log: function that writes numbers by name at a number of environment steps.
         began: ``time.monotonic`` before the environments were made, in s.
     """
 

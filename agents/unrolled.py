@@ -44,11 +44,11 @@ class UnrolledPolicy:
         self._layers = UnrolledLayers(policy.layers, envs, decisions)
 
     def begin(self) -> None:
-        """Set the memory to zero."""
+        """Set the recurrent memory to zero, at the start of episodes."""
         self._seen[0, self._fields : -1] = 0.0
 
     def read(self) -> None:
-        """Copy the current parameters."""
+        """Copy the current parameters from torch to the NumPy arrays."""
         policy = self._policy
         self._mean, self._scale, self._used, self._low, high = (
             part.numpy()[:, None]
@@ -60,7 +60,7 @@ class UnrolledPolicy:
             self._memory.read()
 
     def forward(self, decision: int, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the actions ``(A, N)`` for observations ``(fields, N)``."""
+        """Return the actions ``(A, N)`` for observations ``(fields, N)``, and store what the backward pass needs."""
         seen = self._seen[decision]
         shown = seen[: self._fields]
         numpy.subtract(observation, self._mean, out=shown, casting="same_kind")
@@ -71,7 +71,7 @@ class UnrolledPolicy:
         return self._low + self._half * (1.0 + self._layers.forward(decision, features))
 
     def backward_from_here(self) -> None:
-        """Set the gradient with respect to the current memory to zero."""
+        """Set the gradient with respect to the current memory to zero, at the end of a window."""
         if self._memory is not None:
             self._memory.backward_from_here()
 
@@ -87,7 +87,7 @@ class UnrolledPolicy:
         return of_shown
 
     def add_gradients(self, decisions: int) -> None:
-        """Add the gradients of the parameters, and continue from the memory after ``decisions`` decisions."""
+        """Add a window's gradients to those of torch's parameters, and continue from its last memory."""
         self._layers.add_gradients()
         if self._memory is not None:
             self._memory.add_gradients()
@@ -111,13 +111,13 @@ class UnrolledLayers:
         self._vanished = numpy.sqrt(numpy.finfo(dtype).tiny)
 
     def read(self) -> None:
-        """Copy the current parameters."""
+        """Copy the current parameters from torch to the NumPy arrays."""
         pairs = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in self._layers]
         self._matrices = [numpy.concatenate([weight, bias[:, None]], axis=1) for weight, bias in pairs]
         self._of_matrices = [numpy.zeros_like(matrix) for matrix in self._matrices]
 
     def forward(self, decision: int, features: numpy.ndarray) -> numpy.ndarray:
-        """Return the outputs for features with a last row of ones.
+        """Return the layers' outputs for features with a last row of ones.
 
         The features are stored by reference: they must not change before the backward pass.
         """
@@ -129,7 +129,7 @@ class UnrolledLayers:
         return output
 
     def backward(self, decision: int, gradient: numpy.ndarray) -> numpy.ndarray:
-        """Return the gradient with respect to the features from that with respect to the output."""
+        """Return the gradient with respect to the features, from that with respect to the outputs of a decision."""
         last = len(self._layers) - 1
         for i in reversed(range(len(self._layers))):
             answer = self._outputs[i][decision, :-1]
@@ -142,14 +142,14 @@ class UnrolledLayers:
         return gradient
 
     def add_gradients(self) -> None:
-        """Add the gradients of the parameters."""
+        """Add the window's gradients to those of torch's parameters."""
         for layer, of_matrix in zip(self._layers, self._of_matrices, strict=True):
             _add_gradient(layer.weight, of_matrix[:, :-1])
             _add_gradient(layer.bias, of_matrix[:, -1])
 
 
 class UnrolledMemory:
-    """The recurrent unit of a policy.
+    """Forward and backward pass of the gated recurrent unit of a policy.
 
     All products of a GRU with its parameters are one matrix times one vector of observation (shown), memory, and 1::
 
@@ -178,7 +178,7 @@ class UnrolledMemory:
         self._vanished = numpy.sqrt(numpy.finfo(dtype).tiny)
 
     def read(self) -> None:
-        """Copy the current parameters."""
+        """Copy the current parameters from torch to the NumPy arrays."""
         fields, size = self._fields, self._size
         input, memory, input_bias, memory_bias = (part.detach().numpy() for part in self._gru.parameters())
         self._matrix = matrix = numpy.zeros((4 * size, fields + size + 1), input.dtype)
@@ -189,7 +189,7 @@ class UnrolledMemory:
         self._of_matrix = numpy.zeros_like(matrix)
 
     def forward(self, decision: int) -> numpy.ndarray:
-        """Return the memory after a decision, with a last row of ones."""
+        """Return the recurrent memory after a decision, with a last row of ones."""
         size, seen, gates = self._size, self._seen[decision], self._gates[decision]
         hidden, after = seen[self._fields : -1], self._seen[decision + 1, self._fields :]
         numpy.matmul(self._matrix, seen, out=gates)
@@ -207,11 +207,11 @@ class UnrolledMemory:
         return after
 
     def backward_from_here(self) -> None:
-        """Set the gradient with respect to the current memory to zero."""
+        """Set the gradient with respect to the current memory to zero, at the end of a window."""
         self._of_hidden[...] = 0.0
 
     def backward(self, decision: int, of_after: numpy.ndarray) -> numpy.ndarray:
-        """Return the gradient with respect to the observation from that with respect to the memory after a decision.
+        """Return the gradient with respect to the observation, from that with respect to the memory after a decision.
 
         Args:
             decision: number of the decision; decisions are passed in reverse order.
@@ -242,7 +242,7 @@ class UnrolledMemory:
         return of_seen[:fields]
 
     def add_gradients(self) -> None:
-        """Add the gradients of the parameters."""
+        """Add the window's gradients to those of torch's parameters."""
         fields, size, of_matrix = self._fields, self._size, self._of_matrix
         both = numpy.r_[: 2 * size, 3 * size : 4 * size]
         gradients = (
@@ -313,6 +313,7 @@ class Unrolled:
         teacher: teacher whose estimates are the targets of a share of the reward.
         gate: gate that decides whether the policy acts; other decisions have no gradient.
         largest: norm to which gradients are clipped, see :func:`.bptt.descend_episodes`.
+        penalty: cost of a squared action of one, see :func:`.bptt.descend_episodes`.
     """
 
     def __init__(
@@ -324,10 +325,12 @@ class Unrolled:
         teacher: Teacher | None = None,
         gate: Gate | None = None,
         largest: float | None = None,
+        penalty: float = 0.0,
     ) -> None:
         lanes: Any = env.fleet.only
         self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
         self._truncation, self._largest = min(truncation, env.last_decision), largest
+        self._penalty = penalty
         self._rollout = Rollout(env.model, reward, lanes.width, self._truncation * self._interval)
         self._teacher, self._flown = teacher, 0
         self._policy = UnrolledPolicy(policy, env.num_envs, self._truncation)
@@ -339,7 +342,7 @@ class Unrolled:
         self._last = [i for i in range(len(fields)) if i not in self._means.columns]
 
     def descend_episodes(self, descend: Callable[[], None]) -> float:
-        """Simulate one episode in every environment and descend, see :func:`.bptt.descend_episodes`."""
+        """Simulate an episode in every environment, with a gradient step after each window; return the mean cost."""
         self._begin()
         total, last = 0.0, self._env.last_decision
         for first in range(0, last, self._truncation):
@@ -357,7 +360,7 @@ class Unrolled:
         self._gate_memory, self._start = None, numpy.ones(self._env.num_envs, dtype=bool)
 
     def _add_gradients(self, decisions: int) -> float:
-        """Add the gradients of the mean cost of the next decisions, and return the cost.
+        """Simulate the next decisions, add the gradients of their mean cost to the policy's, and return the cost.
 
         Raises:
             ValueError: if an action is not finite.
@@ -396,6 +399,9 @@ class Unrolled:
                 if interval > 1:
                     rollout.shown_adjoint[self._last] = 0.0
                 of_action = of_action + rollout.action_adjoint[:, :count]
+            if self._penalty > 0.0:
+                action = rollout.action[decision * interval, :, :count]
+                of_action = of_action + 2.0 * self._penalty * share * interval * action
             if self._gate is not None:
                 of_action = of_action * self._opened[decision]
             if self._largest is not None:
@@ -408,7 +414,7 @@ class Unrolled:
         return -reward * share
 
     def _through_gate(self, decision: int, action: numpy.ndarray) -> numpy.ndarray:
-        """Replace actions ``(A, N)`` where the gate is closed, and store where it is open."""
+        """Return actions ``(A, N)`` with the fallback's where the gate is closed, and store the mask."""
         chosen, opened, self._gate_memory = self._gate.choose(
             self._observation.T, action.T, self._gate_memory, self._start
         )

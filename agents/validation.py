@@ -45,7 +45,7 @@ class TrainingEpisodes:
         self._models: dict[tuple[str | None, str, str], Model] = {}
 
     def _model(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Model:
-        """Return a model from a cache, as compilation takes time."""
+        """Return the model of a control and scenario from a cache, as compilation takes time."""
         key = control, scenario, repr(keywords)
         if key not in self._models:
             cls, parameters = self.problem.task, {**keywords, **self.keywords}
@@ -59,7 +59,7 @@ class TrainingEpisodes:
         report: Callable[[Model, Episode], dict[str, numpy.ndarray]] = _cost,
         episodes: int | None = None,
     ) -> dict[str, numpy.ndarray]:
-        """Return the mean of each reported metric over every episode, ``(episodes,)``.
+        """Return a competitor's mean of each reported metric over every episode, ``(episodes,)``, by name.
 
         Args:
             competitor: policy, estimator or reference, or a factory of one.
@@ -79,12 +79,12 @@ class TrainingEpisodes:
         return total
 
     def costs(self, competitor: Any, control: str | None = None) -> numpy.ndarray:
-        """Return the mean cost of every episode, ``(episodes,)``; arguments as of :meth:`means`."""
+        """Return a competitor's mean cost of every episode, ``(episodes,)``; arguments as of :meth:`means`."""
         return self.means(competitor, control)["cost"]
 
 
 def validation_backend(run: TrainingRun) -> str:
-    """Return the backend of a run's validations: policies return NumPy arrays, not torch's tensors."""
+    """Return the name of the backend of a run's validations: the run's own, or "auto" for torch."""
     return "auto" if run.backend == "torch" else run.backend
 
 
@@ -105,11 +105,11 @@ class Validation:
         self.paper_cost = self._costs(problem.competitor(self.paper), None) if self.paper else None
 
     def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
-        """Return the mean cost over the episodes and over every resample of them."""
+        """Return the mean cost over the episodes, then over each bootstrap resample, ``(1 + resamples,)``."""
         return self.bootstrap.means(self.episodes.costs(policy, control))
 
     def score(self, policy: Any) -> ValidationEntry:
-        """Return an entry of ``TrainingRun.validation``."""
+        """Return the validation of a policy: its cost, and the paired difference to the paper's algorithm."""
         acts = self.run.algorithm not in ESTIMATORS
         # A copy, as the factory caches compiled code and the network has changed since the last validation.
         cost = self._costs(copy.copy(policy), self.run.control if acts else None)

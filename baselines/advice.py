@@ -5,10 +5,10 @@ chosen by its likelihood on these and on a quarter more, less one nat for each f
 19, 1974): the simplest that the likeliest does not beat beyond chance. It is fitted to all three quarters. Its rival is
 chosen on the same measurements among the shipped filters, which are not fitted: the paper's algorithm, unless another
 is likelier beyond chance, and then the cheapest that is as good as the likeliest. The fitted one is advised where its
-gain over the rival is beyond chance, or where it is as good and cheaper. The last quarter judges: where the fitted one
-errs more there, beyond chance, the likelihood misleads, and the rival is advised. The filter that is best there in
-hindsight is reported separately: the best of many looks better than it is. Intervals come from whole stretches of
-measurements, since neighbours are not independent.
+gain over the rival is beyond chance, or where it is as good and cheaper. The last quarter serves the judgement: where
+the fitted one errs more there, beyond chance, the likelihood misleads, and the rival is advised. The filter that is
+best there in hindsight is reported separately: the best of many looks better than it is. Intervals come from whole
+stretches of measurements, since neighbours are not independent.
 """
 
 import dataclasses
@@ -61,14 +61,17 @@ from .table import Tunable
 from .tuned_values import make_tuned_policy
 
 FITTED, RUN, REFITTED = 0.35, 0.7, 0.97
-"""Share of an advice that is done when all families are fitted, all competitors have run over the log, and the chosen
-one is fitted again; of logs of some ten thousand measurements."""
+"""Share of the work of :func:`advise` that is done when all families are fitted, all competitors have run over the log,
+and the chosen one is fitted again; of logs of some ten thousand measurements.
+"""
 APART = 10.0
 """Time between the measurements to which anchored filters are fitted, s. Over shorter times the fixes reflect the
-receiver's own filter: one-step predictions then contain much of it and little of errors that last."""
+receiver's own filter: one-step predictions then contain much of it and little of errors that last.
+"""
 COARSE = 4096
 """Measurements, of stretches of all blocks, to which families are fitted first where the blocks contain twice as many:
-a parameter is estimated to 2 % by then, and families that are far behind need not be fitted to the rest."""
+a parameter is estimated to 2 % by then, and families that are far behind need not be fitted to the rest.
+"""
 MEMORY = 8
 """Part of a recording by which the windows of anchored filters begin earlier: an eighth."""
 
@@ -89,36 +92,38 @@ class FittedLog:
 
     @cached_property
     def task(self) -> Task:
-        """Task with the parameters of the recording, but without the recording."""
+        """Task with the parameters of the recording, without its data."""
         scenario = self.recording.scenario(self.problem.task, self.keywords)
         scenario = dataclasses.replace(scenario, recording=None)
         return make_task(self.problem.task, scenario, **{**self.keywords, "horizon": 1})
 
     @cached_property
     def share(self) -> Share:
-        """Blocks that fit, choose and judge."""
+        """Blocks of the recording for the fit, the choice and the judgement."""
         return split_recording(self.recording)
 
     @cached_property
     def interval(self) -> float:
-        """Median time between measurements, s."""
+        """Median time between the recording's measurements, s."""
         return float(numpy.nanmedian(numpy.diff(self.recording.seconds, axis=1)))
 
-    def with_noise(self, family: Tunable, own: bool = False, robust: bool = False) -> Tunable:
-        """Return a tunable with the scale of the measurement noise, where that is wanted and possible. An anchored one
-        is returned unchanged: measurements ``APART`` contain little information on the scale. With ``robust`` the share
-        of outliers is added, except to a user's ``own`` family, whose records may be incomplete.
+    def with_noise(self, family: Tunable, is_own: bool = False, robust: bool = False) -> Tunable:
+        """Return a family with the scale of the measurement noise as one more parameter, if ``noise`` is set.
+
+        A family with a second sensor is returned unchanged: measurements ``APART`` contain little information on the
+        scale. With ``robust`` the share of outliers is added, except to a user's family (``is_own``), whose records
+        may be incomplete.
         """
         log_format = find_companion(self.problem.task, LogFormat)
         if family.anchored or log_format is None or log_format.scale_noise is None:
             return family
-        if robust and not own:
+        if robust and not is_own:
             family = with_outliers(family, log_format.scale_noise)
         return with_noise_scale(family, log_format.scale_noise) if self.noise else family
 
     @cached_property
     def stretches(self) -> list[Span] | None:
-        """Beginnings of the blocks that fit, ``COARSE`` measurements in all; None for a short recording."""
+        """Beginnings of the blocks for the fit, ``COARSE`` measurements in all; None for a short recording."""
         total = sum(span.last - span.first for span in self.share.fitted)
         if total < 2 * COARSE:
             return None
@@ -129,11 +134,11 @@ class FittedLog:
 
     @cached_property
     def _cut(self) -> dict[Any, Windows]:
-        """Windows cut so far, by their spans: filters share them."""
+        """Windows of the recording cut so far, by their spans; all filters use them."""
         return {}
 
     def windows(self, spans: Sequence[Span], anchored: bool = False) -> Windows:
-        """Cut the recording into windows, with measurements ``APART`` for ``anchored`` filters."""
+        """Return spans of the recording cut into windows, with measurements ``APART`` for ``anchored`` filters."""
         every, warm_up = 1, self.share.warm_up
         if anchored:
             warm_up = max(warm_up, int(self.recording.rows.sum()) // MEMORY)
@@ -144,15 +149,17 @@ class FittedLog:
         return self._cut[key]
 
     def likelihood(self, spans: Sequence[Span], tunable: Tunable, thinned: bool = False) -> WindowLikelihood:
-        """Return the likelihood of a tunable's parameters on spans of the recording; for an anchored one, or on
-        request, of measurements that are ``APART``.
+        """Return the likelihood function of a filter family's parameters on spans of the recording.
+
+        For an anchored family, or with ``thinned``, it uses measurements that are ``APART``.
         """
         windows = self.windows(spans, tunable.anchored or thinned)
         return WindowLikelihood(self.task, windows, tunable.start, tunable.apply, tunable.in_lanes)
 
     def fit(self, tunable: Tunable) -> tuple[Fit, WindowLikelihood]:
-        """Fit a tunable to the blocks that fit, and return their likelihood. Of a long recording only stretches are
-        used.
+        """Fit a family to the blocks for the fit; return the fit, and the likelihood function.
+
+        For a long recording the search uses :attr:`stretches` alone.
         """
         if self.stretches is None or tunable.anchored:
             likelihood = self.likelihood(self.share.fitted, tunable)
@@ -163,7 +170,7 @@ class FittedLog:
 
 
 class Fits(NamedTuple):
-    """Families fitted to a log, by name."""
+    """Families of filters fitted to a log, by name: fits, tunables and likelihoods."""
 
     found: dict[str, Fit]
     tunables: dict[str, Tunable]
@@ -171,24 +178,23 @@ class Fits(NamedTuple):
 
     @property
     def anchored(self) -> list[str]:
-        """Names of the families with a second sensor."""
+        """Names of the fitted families that use a second sensor."""
         return [name for name, tunable in self.tunables.items() if tunable.anchored]
 
     def make(self, name: str) -> Any:
-        """Return the maker of the fitted filter."""
+        """Return the maker of a fitted filter, by its name."""
         return make_tuned_policy(f"fitted {name}", self.tunables[name], self.found[name].values)
 
 
 class Anchor(NamedTuple):
-    """Comparison of a filter with a second sensor and the best without one, on predictions of measurements some time
-    apart.
-    """
+    """Comparison of a filter with a second sensor to the best one without, on measurements ``APART`` seconds apart."""
 
     name: str
     other: str
     gain: float
     """Mean log-likelihood less the other's on the measurements of the choice that are ``APART``, nats; both are fitted
-    to such measurements."""
+    to such measurements.
+    """
 
 
 class Prices(Mapping[str, Mapping[str, int] | None]):
@@ -196,7 +202,7 @@ class Prices(Mapping[str, Mapping[str, int] | None]):
 
     Args:
         makers: competitors by name.
-        price_of: returns the costs of one: ``operations`` of an update and further measures.
+        price_of: function from name and maker to the costs of an update: ``operations`` and further measures.
     """
 
     def __init__(
@@ -218,20 +224,20 @@ class Prices(Mapping[str, Mapping[str, int] | None]):
         return len(self.makers)
 
     def operations(self, name: str) -> float:
-        """Return the operations of an update; infinite where they are unknown."""
+        """Return the operations of an update of a competitor; infinite where they are unknown."""
         price = self[name]
         return math.inf if price is None else float(price["operations"])
 
 
 class Advice(NamedTuple):
-    """Result of :func:`advise`."""
+    """Recommendation of a filter for a recording, with the comparison on which it rests."""
 
     recording: Recording
     share: Share
     competitors: list[JudgedFilter]
-    """The advised one first, then by their log-likelihood."""
+    """All compared filters, the advised one first, then by log-likelihood."""
     fitted: JudgedFilter
-    """The simplest of the fitted ones that the likeliest of them does not beat beyond chance."""
+    """The simplest fitted filter that the likeliest fitted one does not beat beyond chance."""
     rival: str
     """Shipped filter chosen without the judged measurements."""
     best_shipped: str
@@ -245,14 +251,15 @@ class Advice(NamedTuple):
     fits: dict[str, Fit]
     tunables: dict[str, Tunable]
     profiles: dict[str, dict[str, Profile]]
-    """Likelihood of the parameters of ``fitted``."""
+    """Profile likelihood of each parameter of ``fitted``, by filter and parameter."""
     anchor: Anchor | None
-    """None where the recording has no second sensor."""
+    """Comparison with the filter that uses a second sensor; None without one."""
     outliers: numpy.ndarray
     """Whether ``fitted`` treats each measurement as an outlier, ``(E, T)``."""
     likeliest: tuple[str, IntervalEstimate] | None
     """Likeliest filter of all, and its gain on the measurements of the choice, nats per measurement, less one nat in
-    all for each parameter; None where it is the advised one."""
+    all for each parameter; None where it is the advised one.
+    """
     prices: "Prices"
     """Costs of an update of each filter."""
     onboard: OnboardJudgement | None = None
@@ -260,7 +267,7 @@ class Advice(NamedTuple):
 
     @property
     def intervals(self) -> dict[str, Interval]:
-        """Intervals of the parameters of ``fitted``."""
+        """95 % intervals of the parameters of ``fitted``."""
         return {name: each.interval for name, each in self.profiles[self.fitted.name].items()}
 
     def make_fitted(self) -> dict[str, Any]:
@@ -269,32 +276,33 @@ class Advice(NamedTuple):
 
     @property
     def advised(self) -> JudgedFilter:
-        """Return the name of the advised filter."""
+        """Return the advised filter, the first of the competitors."""
         return self.competitors[0]
 
 
 def advise(
     log: FittedLog,
     shipped: Mapping[str, Any],
-    own: Mapping[str, Tunable] | None = None,
+    user_families: Mapping[str, Tunable] | None = None,
     progress: Callable[[str, float], None] = lambda what, share: None,
     price_of: Callable[[str, Any], Mapping[str, int] | None] = lambda name, maker: None,
 ) -> Advice:
-    """Fit every family of filters to a recording, choose one, and judge it against the shipped filters.
+    """Fit every family of filters to a recording, and recommend a fitted or a shipped filter for it.
 
     Args:
-        log: the recording, and how filters are fitted to it.
+        log: the recording, with the options of the fits.
         shipped: competitors that are not fitted, by name.
-        own: further families, such as a user's estimator with limits of its parameters.
-        progress: called with a description of the work done, or an empty text, and the share of all work.
-        price_of: returns the costs of an update of a competitor, from its name and its maker: ``operations`` and
-            further measures; None where they are unknown, which ranks it as the most expensive.
+        user_families: further families, such as a user's estimator with limits of its parameters.
+        progress: function that is called with a description of the work done, or an empty text, and the share of all
+            work.
+        price_of: function from a competitor's name and maker to the costs of an update: ``operations`` and further
+            measures; None where they are unknown, which ranks it as the most expensive.
 
     Raises:
         ValueError: if no family can be fitted, or the recording is too short.
     """
     problem, recording = log.problem, log.recording
-    fits = _fit_families(log, own or {}, progress)
+    fits = _fit_families(log, user_families or {}, progress)
     makers = {**shipped, **{name: fits.make(name) for name in fits.found}}
     prices = Prices(makers, price_of)
     counts = {name: len(found.values) for name, found in fits.found.items()}
@@ -319,7 +327,7 @@ def advise(
     competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     chosen, anchor = _choose(log, fits, judgement, competitors)
     name, tunable = chosen.name, fits.tunables[chosen.name]
-    takes_fitted = tunable.anchored or judgement.is_worth(chosen, rival, prices.operations)
+    takes_fitted = tunable.anchored or judgement.is_worthwhile(chosen, rival, prices.operations)
     profiles = _fit_again(log, fits, name, between(RUN, REFITTED))
     if log.share.apart:
         judgement = judge(
@@ -361,8 +369,9 @@ def advise(
 
 
 def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable[[str, float], None]) -> Fits:
-    """Fit every family, and a user's own, to the blocks that fit, first without and then with outliers. The fit with
-    outliers is used where it is likelier.
+    """Fit every family, the user's own too, to the blocks for the fit, and return the fits.
+
+    Each is fitted without and then with outliers; the latter fit is used where it is likelier.
     """
     families = {**families_of(log.problem, log.recording), **own}
     if int(log.recording.rows.sum()) * log.interval < FEWEST * APART:  # too few measurements ``APART``
@@ -388,7 +397,7 @@ def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable
 
 
 def _fit_finalists(log: FittedLog, fits: Fits) -> None:
-    """Fit the families that are near the best with the values of stretches to all blocks that fit."""
+    """Replace the fits of families near the best by fits to all blocks, started at the values from stretches."""
     means = {name: found.log_likelihood / found.measurements for name, found in fits.found.items()}
     known = {name: mean for name, mean in means.items() if name not in fits.anchored}
     for name, mean in known.items():
@@ -404,9 +413,7 @@ def _fit_finalists(log: FittedLog, fits: Fits) -> None:
 def _choose(
     log: FittedLog, fits: Fits, judgement: Judgement, competitors: Sequence[JudgedFilter]
 ) -> tuple[JudgedFilter, Anchor | None]:
-    """Return the simplest fitted filter that the likeliest does not beat, or an anchored one that beats that, and the
-    comparison of the anchored one.
-    """
+    """Return the chosen fitted filter, and the comparison with the one that uses a second sensor, or None."""
     anchored, anchor = fits.anchored, None
     chosen = judgement.simplest([c for c in competitors if c.fitted and c.name not in anchored])
     for name in anchored:
@@ -420,7 +427,7 @@ def _choose(
 def _fit_again(
     log: FittedLog, fits: Fits, name: str, tick: Callable[[float], None] = lambda share: None
 ) -> dict[str, Profile]:
-    """Fit the chosen family to all measurements that do not judge, and return the profiles of its likelihood there."""
+    """Fit the chosen family to all measurements before the judgement; return the profiles of its parameters."""
     tunable, found = fits.tunables[name], fits.found[name]
     if log.share.apart:
         begin = dataclasses.replace(tunable, start=found.values)
@@ -431,7 +438,7 @@ def _fit_again(
 
 
 def _first_verdict(fits: Fits, shipped: int) -> str:
-    """Describe the family that is likeliest on the measurements of its fit, one nat less for each parameter."""
+    """Return a sentence on the family of the highest penalised likelihood on the measurements of the fit."""
     known = {
         name: (found.log_likelihood - len(found.values)) / found.measurements
         for name, found in fits.found.items()
@@ -449,10 +456,10 @@ def _first_verdict(fits: Fits, shipped: int) -> str:
 
 
 def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, Interval]]:
-    """Fit one filter to all of a recording, so that no measurements remain to judge it.
+    """Fit one filter to all of a recording; return the family, the fit, and intervals of the parameters.
 
     Returns:
-        The family with the scale of the noise, the fit, and the intervals of the parameters.
+        The family with the scale of the noise, the fit, and the intervals of the parameters by name.
     """
     share, rows = log.share, log.recording.rows
     spans = [Span(i, min(share.warm_up, int(each) - 1), int(each)) for i, each in enumerate(rows)]
@@ -472,16 +479,14 @@ def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, In
     return tunable, found, {name: each.interval for name, each in profiles.items()}
 
 
-def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit) -> numpy.ndarray:
-    """Return whether a fitted filter treats each measurement of a recording as an outlier, ``(E, T)``; all false where
-    its model has no outliers.
-    """
+def find_outliers(task: Task, recording: Recording, tunable: Tunable, result: Fit) -> numpy.ndarray:
+    """Return a boolean mask ``(E, T)`` of the measurements that a fitted filter treats as outliers."""
     is_outlier: numpy.ndarray = numpy.zeros(recording.seconds.shape, dtype=bool)
-    if OUTLIER_SHARE not in found.values:
+    if OUTLIER_SHARE not in result.values:
         return is_outlier
     template, like = measure_once(type(task)(task.parameters), recording.measurements)
     initial = {name: numpy.moveaxis(values, 0, -1) for name, values in recording.initial.items()}
-    estimator = tunable.apply(found.values)[1](task)
+    estimator = tunable.apply(result.values)[1](task)
     # The scale of the noise is outside, the choice between two updates within.
     scaled = estimator if isinstance(estimator, ScaledNoise) else ScaledNoise(estimator, lambda m, _: m, 1.0)
     robust: Any = scaled.own
@@ -497,8 +502,9 @@ def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit
 
 
 def _compare_anchored(log: FittedLog, tunables: Mapping[str, Tunable], fitted: Fit) -> Anchor:
-    """Compare an anchored filter with the best other one on measurements that are ``APART``, both fitted to such; the
-    former, which is ``fitted``, is the first of the two ``tunables``.
+    """Return the gain of a filter with a second sensor over another one, on measurements ``APART`` seconds apart.
+
+    It is the first of the two ``tunables``, and ``fitted`` is its fit; the other one is fitted here.
 
     This likelihood is comparable: it is of the same measurements, given the same earlier ones. From one measurement to
     the next the other filter follows errors that last, and so predicts them well.

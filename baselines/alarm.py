@@ -1,9 +1,9 @@
 """Alarms, which detect faults from observations alone.
 
-An alarm computes at every decision the log-likelihood ratio of each kind of fault to filters and sensors that are as
-modelled. Each ratio is summed as long as the sum is positive (Page's cumulative sum, 1954); the alarm sounds where a
-sum reaches its limit. Without a fault a sum with limit h reaches it once in exp(h) decisions or less (Lorden, 1971), so
-the limit follows from the tolerated number of false alarms.
+An alarm computes at every decision the log-likelihood ratio of each kind of fault to no fault. Each ratio is summed as
+long as the sum is positive (Page's cumulative sum, 1954); the alarm sounds where a sum reaches its limit. Without a
+fault a sum with limit h reaches it once in exp(h) decisions or less (Lorden, 1971), so the limit follows from the
+tolerated number of false alarms.
 
 Signs of a fault are innovations that are larger than a filter expects, smaller, or to one side, and a reading that
 repeats itself. A missing measurement counts as a sign where the filter does not model it, as with fixed gains; a Kalman
@@ -42,7 +42,7 @@ def scale_ratio(squares: Any, degrees: Any, factor: float) -> Any:
 
 
 def shift_ratio(normalised: Any, mean: float) -> Any:
-    """Return the log-likelihood ratio of normalised innovations with that mean in place of zero."""
+    """Return the log-likelihood ratio of normalised innovations of mean ``mean`` to those of mean zero."""
     return mean * (normalised - 0.5 * mean)
 
 
@@ -51,7 +51,7 @@ def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> nump
 
     Args:
         normalised: innovations over their predicted deviation, ``(N, C)``.
-        there: whether each exists; the value of a missing one is ignored.
+        there: whether each innovation exists; the value of a missing one is ignored.
     """
     ratios = [scale_ratio(normalised**2, 1.0, factor) for factor in (LARGER, SMALLER)]
     ratios += [shift_ratio(normalised, mean) for mean in (SHIFT, -SHIFT)]
@@ -59,12 +59,12 @@ def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> nump
 
 
 def fault_evidence(wrong: numpy.ndarray) -> numpy.ndarray:
-    """Return the evidence of an observation that only a fault explains, ``(N, 1)``; ``wrong`` is ``(N,)``."""
+    """Return the log-likelihood ratio ``(N, 1)``: ``CERTAIN`` where ``wrong`` ``(N,)`` is true, else zero."""
     return numpy.where(wrong, CERTAIN, 0.0)[:, None]
 
 
 class Sums(NamedTuple):
-    """Memory of an alarm."""
+    """Memory of an alarm: its cumulative sums, and the last observation."""
 
     sums: numpy.ndarray
     """Sums of each log-likelihood ratio, ``(N, kinds)``."""
@@ -90,27 +90,26 @@ class Alarm:
         self.decisions: int = max(self.task.horizon // self.task.decision_interval, 1)
 
     def measurements(self, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the number of measurements that an observation covers, ``(N, 1)``: those since the last one; one at an
-        episode's start.
+        """Return the number of measurements since the last observation, ``(N, 1)``; one at the start.
 
         Args:
-            before: the last observation; NaN where an episode begins.
+            before: the last observation, ``(N, fields)``; NaN where an episode begins.
         """
         return numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of a fault to no fault, a column for each kind, ``(N, kinds)``.
+        """Return the log-likelihood ratio of each kind of fault to no fault, ``(N, kinds)``.
 
         Args:
             observation: ``(N, fields)``.
-            before: the last one; NaN where an episode begins.
+            before: the last observation; NaN where an episode begins.
         """
         raise NotImplementedError
 
     def update(
         self, observation: numpy.ndarray, memory: Sums | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, Sums]:
-        """Update the sums with an observation and detect faults.
+        """Update the cumulative sums with an observation; return which lanes have a fault, and the memory.
 
         Args:
             observation: ``(N, fields)``.
@@ -131,8 +130,9 @@ class Alarm:
 
 
 class InnovationAlarm(Alarm):
-    """Alarm of any task whose observation has a block or quantity ``innovation``, each component over its predicted
-    deviation: it detects one that is too large, or for a while too large, too small, or to one side. Where
+    """Alarm for faulty innovations: one that is too large, or several that are too large, too small or to one side.
+
+    It reads the block or quantity ``innovation`` of the observation, each component over its predicted deviation. Where
     ``available`` is zero there is no innovation, which is no evidence.
 
     Raises:
@@ -154,7 +154,7 @@ class InnovationAlarm(Alarm):
             self.available = lambda observation: numpy.ones((len(observation), 1))
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of each component."""
+        """Return the log-likelihood ratios of an innovation that is too large, too small or shifted, ``(N, 4 C)``."""
         innovation, available = self.innovation(observation), self.available(observation)
         there = numpy.broadcast_to(available > 0.0, innovation.shape)
         return innovation_evidence(innovation, there)

@@ -1,7 +1,7 @@
 """Catalogue of the baselines of the environments.
 
-Every folder beside this file contains those of the environment whose folder has the same name, and exports them as
-``BASELINES``; a user's environment may register its own.
+Every folder beside this file contains the baselines of the environment whose folder has the same name, and exports them
+as ``BASELINES``; a user's environment may register its own.
 """
 
 import importlib
@@ -20,7 +20,7 @@ USER_BASELINES: dict[str, Baselines] = {}
 
 @cache
 def package_of(id: str) -> ModuleType | None:
-    """Return the package with the baselines of a Gymnasium id; None where there is none."""
+    """Return the Python package with the baselines of a Gymnasium id; None if this package has none."""
     folder = folders().get(id)
     if folder is None or importlib.util.find_spec(f"{__package__}.{folder}") is None:
         return None
@@ -40,7 +40,7 @@ def baselines_of(id: str) -> Baselines:
 
 @cache
 def _declared_baselines(task: type[Task]) -> Baselines:
-    """Return the baselines that the class of a task declares; an action that is no vector is no constant policy."""
+    """Return the baselines of a task that registered none: the paper's algorithm that it declares, random actions."""
     if not isinstance(task.paper_policy.action, tuple):
         return Baselines(task.id, {"random": RandomPolicy})
     paper = type("DeclaredPaper", (PaperAction,), {"control": task.paper_policy.control})

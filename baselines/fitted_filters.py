@@ -1,4 +1,4 @@
-"""Files of advised filters, which contain a filter and how to read the logs that it runs on."""
+"""Files of advised filters: a fitted or shipped filter, and the options for reading its logs."""
 
 import importlib.metadata
 import json
@@ -15,24 +15,24 @@ from ..envs.contract.log_format import LogFormat, LogSetup
 from ..envs.contract.parameters import quote_shortened
 from ..evaluation.competitors.kinds import Competitor, CompetitorFiles
 from ..evaluation.storage.files import write_text
-from ..evaluation.storage.stored import fits, read_json
+from ..evaluation.storage.stored import has_type, read_json
 from .fitting import NOISE_SCALE, OUTLIER_SHARE, Fit, Interval, with_noise_scale, with_outliers
 from .problem import Problem
 from .table import Tunable, tunable
 from .tuned_values import TunedPolicy, check_values, make_tuned_policy, round_value
 
 SUFFIX = ".filter.json"
-"""Suffix of the names of such files."""
+"""Suffix of the names of advised filters' files."""
 MOST_MEASUREMENTS = 100_000
 """Largest number of measurements of a track that a file may state; an export simulates as many."""
 
 
 def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
-    """Return the filters of a problem that can be fitted to a recording, by name.
+    """Return the filter families of an environment that can be fitted to a recording, by name.
 
     Args:
         problem: problem of the filters.
-        recording: recording that sets the limits; None: any.
+        recording: recording that sets the limits of the parameters; None: those of a typical recording.
     """
     known = problem.baselines
     if known.log_families is not None:
@@ -41,7 +41,7 @@ def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
 
 
 def own_family(name: str, cls: Any) -> Tunable:
-    """Return the tunable parameters of a user's estimator.
+    """Return a user's estimator as a family whose parameters can be fitted.
 
     Args:
         name: name of the estimator in errors.
@@ -67,18 +67,18 @@ def own_family(name: str, cls: Any) -> Tunable:
 
 
 class Artefact(NamedTuple):
-    """Content of the file of an advised filter."""
+    """Content of an advised filter's file."""
 
     filter: str
     """Name of the family, or of the shipped filter."""
     fitted: TunedPolicy | None
     """Maker of the filter; None for a shipped one."""
     log: LogSetup | None
-    """How its log was read; None in files without it."""
+    """Options for reading its log; None in files without them."""
 
 
 def log_setup(problem: Problem, recording: Any) -> LogSetup:
-    """Return the options with which a recording was read."""
+    """Return the options with which a recording was read, to read such a log again."""
     parameters = recording.scenario(problem.task, {}).parameters
     left_out = "horizon", "decision_interval"
     deviations, source = dict(recording.deviations), recording.deviations_from
@@ -103,19 +103,19 @@ def write_advised(
     problem: Problem,
     name: str,
     recording: Any,
-    found: Fit | None,
+    fit: Fit | None,
     intervals: Mapping[str, Interval],
     command: str,
     **further: Any,
 ) -> None:
-    """Write an advised filter, fitted or shipped, with how its log was read.
+    """Write the file of an advised filter, fitted or shipped, with the options for reading its log.
 
     Args:
         path: path of the file, whose name ends in ``SUFFIX``.
         problem: problem of the filter.
         name: name of its family, or of the shipped filter.
         recording: recording on which it was fitted or judged.
-        found: result of the fit; None for a shipped filter.
+        fit: result of the fit; None for a shipped filter.
         intervals: intervals of its parameters.
         command: command that wrote it.
         **further: further entries of the file, such as its held-out numbers.
@@ -127,18 +127,18 @@ def write_advised(
     table: dict[str, Any] = {
         "environment": problem.id,
         "filter": name,
-        "fitted": found is not None,
-        "values": {} if found is None else {key: round_value(value) for key, value in found.values.items()},
+        "fitted": fit is not None,
+        "values": {} if fit is None else {key: round_value(value) for key, value in fit.values.items()},
         "intervals": {
             key: [round_value(each.low), round_value(each.high)] for key, each in intervals.items()
         },
-        "measurements": None if found is None else found.measurements,
+        "measurements": None if fit is None else fit.measurements,
         "log": {
             **log._asdict(),
             "units": {key: known[key].text for key in log.columns if key in known},
-            "noise_scale": 1.0 if found is None else round_value(10.0 ** found.values.get(NOISE_SCALE, 0.0)),
-            "outlier_share": round_value(10.0 ** found.values[OUTLIER_SHARE])
-            if found is not None and OUTLIER_SHARE in found.values
+            "noise_scale": 1.0 if fit is None else round_value(10.0 ** fit.values.get(NOISE_SCALE, 0.0)),
+            "outlier_share": round_value(10.0 ** fit.values[OUTLIER_SHARE])
+            if fit is not None and OUTLIER_SHARE in fit.values
             else None,
             "start": "from the first row"
             if log_format and log_format.regular_rows
@@ -160,7 +160,7 @@ def write_advised(
 
 
 def read_artefact(path: Path, problem: Problem) -> Artefact:
-    """Read the file of an advised filter.
+    """Return the content of an advised filter's file.
 
     Args:
         path: path of a file of :func:`write_advised`.
@@ -174,7 +174,7 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
     except FileNotFoundError:
         raise ValueError(f"there is no file {path}") from None
     known = {"environment": str, "filter": str, "values": dict[str, float]}
-    if not isinstance(table, dict) or not all(fits(table.get(key), kind) for key, kind in known.items()):
+    if not isinstance(table, dict) or not all(has_type(table.get(key), kind) for key, kind in known.items()):
         raise ValueError(f"{path} is not the file of an advised filter: filtergym advise writes one")
     if table["environment"] != problem.id:
         raise ValueError(f"{path} is fitted to {quote_shortened(table['environment'])}, not to {problem.id}")
@@ -186,7 +186,7 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
 
 
 def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
-    """Validate a file's entry on its log."""
+    """Return the validated options for reading the log from a file's entry; None without one."""
     if log is None:
         return None
     kinds = {
@@ -211,7 +211,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
     }
     if (
         not isinstance(log, dict)
-        or not all(fits(log.get(key), kind) for key, kind in kinds.items())
+        or not all(has_type(log.get(key), kind) for key, kind in kinds.items())
         or not 0.0 < log["interval"] < math.inf
         or not {*log["columns"], *log["deviations"]} <= names
         or not all(0.0 < value < math.inf for value in log["deviations"].values())
@@ -227,7 +227,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
 
 
 def _is_place(origin: Mapping[str, float]) -> bool:
-    """Return whether an origin is on the Earth or near it."""
+    """Return whether an origin has a valid latitude and longitude, and a height near the Earth."""
     largest = {"latitude": 90.0, "longitude": 360.0, "altitude": 1e6}
     return origin.keys() == largest.keys() and all(abs(origin[key]) <= most for key, most in largest.items())
 
@@ -260,7 +260,7 @@ def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, f
 def _find_advised(
     name: str, problem: Problem, trust: bool, find_shipped: Callable[[str, str], Competitor]
 ) -> Competitor | None:
-    """Return the filter of a file of ``filtergym advise``, fitted or shipped; None of another file."""
+    """Return the filter in a file of ``filtergym advise`` as a competitor; None for another file."""
     if not name.endswith(SUFFIX):
         return None
     found = read_artefact(Path(name), problem)

@@ -50,7 +50,8 @@ LEAST_GAIN = 1e-4
 """Smallest gain, nats, for another step of it."""
 STEEP = 1.5
 """Largest ratio of the fall of a likelihood to that of a quadratic one; where it falls more a second search starts
-elsewhere."""
+elsewhere.
+"""
 IDENTIFIABLE = 100.0
 """Largest ratio of the ends of an interval of a positive parameter; a wider interval carries no information."""
 
@@ -92,12 +93,11 @@ class Fit(NamedTuple):
 
 
 class ScaledNoise(Filter[Task, Any, Any]):
-    """A filter that multiplies the stated deviations of measurements by a factor; its state is that of the scaled
-    filter.
+    """A filter run with the stated deviations of measurements multiplied by a factor; its state is the inner filter's.
 
     Args:
         own: the filter.
-        scaled: multiplies the deviations stated in a measurement by a factor.
+        scaled: function of a measurement and a factor that multiplies the stated deviations by it.
         factor: a number, or ``(N,)``.
     """
 
@@ -109,38 +109,36 @@ class ScaledNoise(Filter[Task, Any, Any]):
         self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> Any:
-        """Start from the initial estimate, its covariance times the factor's square: a track
-        starts from measurements.
-        """
+        """Return the inner filter's state at the initial estimate, with its covariance times the factor's square."""
         return self.own.start(initial._replace(covariance=initial.covariance * self.factor**2))
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Predict to the scaled measurement."""
+        """Return the inner filter's state predicted to the scaled measurement."""
         return self.own.predict(state, self.scaled(measurement, self.factor))
 
-    def update(self, state: Any, given: FilterInput) -> Any:
-        """Update with the scaled measurement."""
-        return self.own.update(state, FilterInput(self.scaled(given.measurement, self.factor)))
+    def update(self, state: Any, inputs: FilterInput) -> Any:
+        """Return the inner filter's state after an update with the scaled measurement."""
+        return self.own.update(state, FilterInput(self.scaled(inputs.measurement, self.factor)))
 
     def mean(self, state: Any) -> Array:
-        """Return the mean of the filter."""
+        """Return the mean of the inner filter's estimate, ``(C, N)``."""
         return self.own.mean(state)
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of the filter."""
+        """Return the covariance of the inner filter's estimate, ``(C, C, N)``."""
         return self.own.covariance(state)
 
     def records(self, state: Any, measurement: Any) -> dict[str, Array]:
-        """Return the records of the filter."""
+        """Return the inner filter's records of the scaled measurement, by name."""
         return self.own.records(state, self.scaled(measurement, self.factor))
 
 
-def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunable:
-    """Return a tunable estimator with the scale of the measurement noise as one more parameter.
+def with_noise_scale(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tunable:
+    """Return a tunable estimator with the decimal logarithm of the measurement noise's scale as one more parameter.
 
     Args:
         tunable: an estimator.
-        scaled: multiplies the deviations stated in a measurement by a factor.
+        scale: function of a measurement and a factor that multiplies the stated deviations by it.
     """
     low, start, high = NOISE_LIMITS
 
@@ -148,7 +146,7 @@ def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tun
         own = {name: value for name, value in values.items() if name != NOISE_SCALE}
         keywords, make = tunable.apply(own)
         factor = 10.0 ** values[NOISE_SCALE]
-        return keywords, lambda task: ScaledNoise(as_filter(task, make(task)), scaled, factor)
+        return keywords, lambda task: ScaledNoise(as_filter(task, make(task)), scale, factor)
 
     limits = {**tunable.limits, NOISE_SCALE: (low, high)}
     start_values = {**tunable.start, NOISE_SCALE: start}
@@ -159,7 +157,7 @@ class RobustState(NamedTuple):
     """State of a filter that models outliers."""
 
     own: Any
-    """State of the filter."""
+    """State of the inner filter."""
     likelihood: Likelihood
     """Likelihood of the mixture."""
 
@@ -169,7 +167,7 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
 
     Args:
         own: the filter, which reports the log-likelihood.
-        scaled: multiplies the deviations stated in a measurement by a factor.
+        scaled: function of a measurement and a factor that multiplies the stated deviations by it.
         share: share of outliers, a number, or ``(N,)``.
     """
 
@@ -181,20 +179,18 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> RobustState:
-        """Start the filter, with unknown likelihood."""
+        """Return the inner filter's state at the initial estimate, with unknown likelihood."""
         return RobustState(self.own.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: RobustState, given: FilterInput) -> RobustState:
-        """Update as stated and with wide deviations, select the likelier result, and compute the mixture likelihood."""
-        (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(given.measurement, state.own)
+    def update(self, state: RobustState, inputs: FilterInput) -> RobustState:
+        """Return the likelier of two updates, with stated and with wide deviations, and the mixture's likelihood."""
+        (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(inputs.measurement, state.own)
         nis = None if own.nis is None else self.xp.where(is_outlier, other.nis, own.nis)
         likelihood = Likelihood(log_likelihood, nis, own.nis_degrees).fill_unknown(log_likelihood)
         return RobustState(select_nested(is_outlier, wide, usual), likelihood)
 
     def compare(self, measurement: Any, state: Any) -> tuple[Any, Any, Any, Any]:
-        """Return both updates (state and likelihood), whether the second is likelier, and the log-likelihood of the
-        mixture, ``(N,)``.
-        """
+        """Return both updates, whether the second one is likelier, and the mixture's log-likelihood, ``(N,)`` each."""
         xp = self.xp
         usual, wide = (self._step(state, z) for z in (measurement, self.scaled(measurement, WIDE)))
         one = usual[1].log_likelihood + xp.log(1.0 - self.share)
@@ -209,17 +205,18 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         return after, Likelihood.of_records(self.own.records(after, measurement))
 
     def mean(self, state: RobustState) -> Array:
-        """Return the mean of the filter."""
+        """Return the mean of the inner filter's estimate, ``(C, N)``."""
         return self.own.mean(state.own)
 
     def covariance(self, state: RobustState) -> Array:
-        """Return the covariance of the filter."""
+        """Return the covariance of the inner filter's estimate, ``(C, C, N)``."""
         return self.own.covariance(state.own)
 
 
-def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunable:
-    """Return a tunable estimator with the share of outliers as one more parameter; arguments of
-    :func:`with_noise_scale`.
+def with_outliers(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tunable:
+    """Return a tunable estimator with the share of outliers as one more parameter.
+
+    Arguments are those of :func:`with_noise_scale`.
     """
     low, start, high = SHARE_LIMITS
 
@@ -227,7 +224,7 @@ def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunabl
         own = {name: value for name, value in values.items() if name != OUTLIER_SHARE}
         keywords, make = tunable.apply(own)
         share = 10.0 ** values[OUTLIER_SHARE]
-        return keywords, lambda task: RobustEstimator(as_filter(task, make(task)), scaled, share)
+        return keywords, lambda task: RobustEstimator(as_filter(task, make(task)), scale, share)
 
     limits = {**tunable.limits, OUTLIER_SHARE: (low, high)}
     return dataclasses.replace(
@@ -236,7 +233,7 @@ def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunabl
 
 
 def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: int = STARTS) -> Fit:
-    """Maximise the likelihood of a recording's measurements.
+    """Fit the parameters of an estimator by maximum likelihood, from several starts, and return the fit.
 
     Args:
         likelihood: likelihood of the tunable's parameters.
@@ -253,8 +250,9 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
 def fit_stretches(
     likelihood: WindowLikelihood, tunable: Tunable, whole: WindowLikelihood, seed: int = 0
 ) -> Fit:
-    """Maximise the likelihood of stretches of a long recording, and return the end that is likeliest on the whole
-    recording, where it is not yet a maximum.
+    """Fit parameters to stretches of a long recording; return the end that is likeliest on the whole recording.
+
+    It need not be a maximum there.
 
     Args:
         likelihood: likelihood of the stretches.
@@ -272,7 +270,7 @@ def fit_stretches(
 
 
 def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[float]) -> Fit:
-    """Return the fit at the best of several ends, whose log-likelihoods are given."""
+    """Return the fit at ``best``, given the log-likelihoods ``values`` at the ends of all searches."""
     low, high = numpy.array(list(tunable.limits.values())).T
     edge = 1e-3 * (high - low)
     at_limit = tuple(
@@ -285,7 +283,7 @@ def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[
 
 
 def _find_maxima(likelihood: WindowLikelihood, tunable: Tunable, seed: int, starts: int) -> list[Any]:
-    """Return SciPy's results of searches from several starts for the least mean loss, nats per measurement."""
+    """Return SciPy's results of searches from several starts, which minimise nats per measurement."""
     from scipy.optimize import minimize
 
     limits = list(tunable.limits.values())
@@ -329,7 +327,7 @@ def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarra
 
 
 class _Way(NamedTuple):
-    """Values of one parameter from the best one towards a limit, with its profile."""
+    """One side of a profile: values of a parameter from the best one towards a limit."""
 
     distances: list[float]
     """Distances from the best value."""
@@ -340,28 +338,27 @@ class _Way(NamedTuple):
 def fit_profiles(
     likelihood: WindowLikelihood,
     tunable: Tunable,
-    found: Fit,
+    result: Fit,
     tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Fit, dict[str, Profile]]:
-    """Compute the profile likelihood of all parameters, the others searched anew at every step, and the fit at its
-    maximum.
+    """Return the fit at the likelihood's maximum, and the profile likelihood of each parameter.
 
     Where a step of a profile is likelier than the fit, the fit starts again from there.
 
     Args:
         likelihood: likelihood of the tunable's parameters.
         tunable: the estimator, with limits.
-        found: result of :func:`fit`.
-        tick: called with the share of the work done, which falls where the fit starts again.
+        result: result of :func:`fit`.
+        tick: function that is called with the share of the work done, which falls where the fit starts again.
     """
     for _ in range(MOST_RESTARTS):
-        profiles, higher = _search_profiles(likelihood, tunable, found, tick)
+        profiles, higher = _search_profiles(likelihood, tunable, result, tick)
         if higher is None:
-            return found, profiles
+            return result, profiles
         start = dict(zip(tunable.limits, map(float, higher), strict=True))
         again = fit(likelihood, dataclasses.replace(tunable, start=start), starts=1)
-        found = again._replace(spread=found.spread + again.log_likelihood - found.log_likelihood)
-    return found, _search_profiles(likelihood, tunable, found, tick, stop=False)[0]
+        result = again._replace(spread=result.spread + again.log_likelihood - result.log_likelihood)
+    return result, _search_profiles(likelihood, tunable, result, tick, stop=False)[0]
 
 
 def _search_profiles(
@@ -371,7 +368,7 @@ def _search_profiles(
     tick: Callable[[float], None],
     stop: bool = True,
 ) -> tuple[dict[str, Profile], numpy.ndarray | None]:
-    """Return the profiles, and a point that is likelier than the fit or None; with ``stop`` the search ends there."""
+    """Return the profiles, and a point of higher likelihood than the fit, or None; ``stop``: end there."""
     limits = numpy.array(list(tunable.limits.values())).T
     best = numpy.array([found.values[name] for name in tunable.limits])
     information = _information(likelihood, best, limits)
@@ -391,7 +388,7 @@ def _search_profiles(
 
 
 def _profile(best: float, below: _Way, above: _Way) -> Profile:
-    """Sort the values of a profile with the best one among them, and compute its interval."""
+    """Return the profile of two sides and the best value, sorted, with its 95 % interval."""
     (low, open_low), (high, open_high) = _profile_end(below), _profile_end(above)
     values = numpy.array([*(best - d for d in below.distances), *(best + d for d in above.distances), best])
     drops, order = numpy.array([*below.drops, *above.drops, 0.0]), numpy.argsort(values)
@@ -413,9 +410,10 @@ class _Maximum(NamedTuple):
 def _walk_profile(
     likelihood: WindowLikelihood, maximum: _Maximum, first: tuple[int, float], stop: bool
 ) -> tuple[_Way, numpy.ndarray]:
-    """Compute a profile towards a limit, up to where the likelihood has fallen far enough, and its last point; with
-    ``stop`` only up to a point that is likelier than the fit. ``first`` is the number of the parameter and a standard
-    deviation of it up or down.
+    """Return one side of a profile, up to where the likelihood has fallen enough, and its last point.
+
+    ``first`` is the number of the parameter, and its standard deviation upward or downward. With ``stop`` the walk ends
+    at a point of higher likelihood than the fit.
     """
     parameter, deviation = first
     best, (low, high) = maximum.at, maximum.limits
@@ -451,7 +449,7 @@ def _walk_profile(
 def _maximise_others(
     likelihood: WindowLikelihood, maximum: _Maximum, point: numpy.ndarray, others: numpy.ndarray
 ) -> tuple[numpy.ndarray, float]:
-    """Maximise the likelihood over all parameters but one, and return the maximum and its place.
+    """Maximise the likelihood over the parameters ``others``; return the point, and the log-likelihood there.
 
     Steps are Newton's with the curvature at the maximum as long as each gains; where one does not, L-BFGS-B continues.
     """
@@ -489,9 +487,7 @@ def _maximise_others(
 def _newton_step(
     curvature: numpy.ndarray, gradient: numpy.ndarray, low: numpy.ndarray, high: numpy.ndarray
 ) -> tuple[numpy.ndarray, float]:
-    """Return the step to the minimum of a quadratic loss within limits, and its gain. Components beyond a limit stop
-    there, and the others adapt.
-    """
+    """Return the step to the minimum of a quadratic loss within limits, and the decrease of the loss."""
     step, free = numpy.zeros(len(gradient)), numpy.ones(len(gradient), dtype=bool)
     while free.any():
         inside = curvature[numpy.ix_(free, free)]
@@ -505,9 +501,7 @@ def _newton_step(
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:
-    """Return the information matrix, the curvature of the likelihood at its maximum; a direction without a maximum
-    counts as flat.
-    """
+    """Return the information matrix at the maximum; directions without a maximum count as flat."""
     low, high = limits
     step = numpy.minimum(0.02, 0.01 * (high - low))
     H = _hessian(likelihood, numpy.clip(best, low + 2.0 * step, high - 2.0 * step), step)
@@ -518,7 +512,7 @@ def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: nump
 
 
 def _profile_end(way: _Way) -> tuple[float, bool]:
-    """Return the distance at which the likelihood has fallen far enough, and whether it is still high at the limit."""
+    """Return the distance at which the profile has fallen by ``DROP``, and whether the limit comes first."""
     distances = [0.0, *way.distances]
     # A drop grows with the square of the distance: it is interpolated in its root.
     roots = [0.0, *numpy.sqrt(numpy.clip(way.drops, 0.0, None)).tolist()]

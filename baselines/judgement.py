@@ -1,7 +1,4 @@
-"""Comparison of competitors on the parts of a recording for the choice among them and for the judgement.
-
-A recording is cut into blocks on which filters are fitted, chosen and judged.
-"""
+"""Comparison of competitors on two parts of a recording: one for the choice, one for the judgement."""
 
 import itertools
 import math
@@ -21,31 +18,34 @@ LEAST = 5
 """Smallest number of measurements after the start of the track for a fit."""
 FEWEST = 40
 """Smallest number of measurements of a recording that is cut into blocks; a shorter one is used as a whole for every
-purpose."""
+purpose.
+"""
 LARGEST_LOSS = 0.5
 """Nats per measurement by which a fit may be worse over the whole recording than in its windows, each of which starts
-anew: a filter that loses more has lost the track."""
+anew: a filter that loses more has lost the track.
+"""
 AS_GOOD = 0.1
 """Nats per measurement that a cheaper filter may lose, at the end of the interval: innovations of the plane are then
-5 % larger. A difference within chance is not enough: on a short log all differences are."""
+5 % larger. A difference within chance is not enough: on a short log all differences are.
+"""
 BLOCK_MEASUREMENTS = 40
 MOST_BLOCKS = 24
 LONGEST_WARM_UP = 20
 
 
 class Share(NamedTuple):
-    """Spans of a recording on which filters are fitted, chosen and judged."""
+    """Spans of a recording for the fit of filters, the choice among them, and the judgement of the chosen one."""
 
     fitted: list[Span]
     chosen: list[Span]
     judged: list[Span]
     warm_up: int
     apart: bool
-    """Whether the three are different measurements."""
+    """Whether the three sets of measurements are disjoint."""
 
 
 def split_recording(recording: Recording) -> Share:
-    """Cut a recording into spans on which filters are fitted, chosen and judged: a half and two quarters of it.
+    """Cut a recording into spans for the fit, the choice and the judgement: a half and two quarters of it.
 
     Raises:
         ValueError: if it has fewer than ``LEAST`` measurements.
@@ -75,7 +75,7 @@ def split_recording(recording: Recording) -> Share:
 
 
 class JudgedFilter(NamedTuple):
-    """One line of the table of an advice."""
+    """Results of one filter on the measurements of choice and judgement."""
 
     name: str
     fitted: bool
@@ -84,7 +84,8 @@ class JudgedFilter(NamedTuple):
     """Number of fitted parameters."""
     log_likelihood: float
     """Mean over the measurements of the choice, less one nat in all for each fitted parameter, nats; NaN where the
-    filter reports none."""
+    filter reports none.
+    """
     gain: IntervalEstimate
     """Mean log-likelihood of the filter less that of the rival, paired, nats."""
     difference: IntervalEstimate
@@ -101,11 +102,12 @@ class JudgedFilter(NamedTuple):
     """Correlation of successive judged prediction errors; zero where they are white."""
     correlations: Mapping[str, IntervalEstimate]
     """Correlation of successive prediction errors of each measured number, by its name; empty where all are of one
-    kind."""
+    kind.
+    """
 
 
 def roles_of(share: Share, shape: tuple[int, int]) -> Roles:
-    """Return which measurements of a recording choose and which judge, ``(episodes, time)``."""
+    """Return boolean masks ``(episodes, time)`` of the measurements for the choice and for the judgement."""
     choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
     masks = []
     for spans in (choosing, share.judged):
@@ -117,13 +119,13 @@ def roles_of(share: Share, shape: tuple[int, int]) -> Roles:
 
 
 class Judgement:
-    """Comparison of all competitors on the measurements of the choice and of the judgement.
+    """Comparison of all competitors on a log's measurements for the choice and for the judgement.
 
     Args:
         scores: sums of all competitors.
         share: spans of these measurements.
         parameters: number of fitted parameters, by the name of each fitted filter; all others are shipped.
-        default: shipped filter that stands unless another is likelier beyond chance; empty: none.
+        default: shipped filter that is the rival unless another is likelier beyond chance; empty: none.
         anchored: names of filters with a second sensor, whose estimate alone does not determine their prediction.
     """
 
@@ -145,7 +147,7 @@ class Judgement:
         self._chosen, self._judged = scores.log_likelihood
 
     def _least_error(self, squares: PairSums | None, log_likelihood: PairSums) -> str:
-        """Return the shipped filter of smallest mean square; by log-likelihood where there are no squares."""
+        """Return the name of the shipped filter of smallest mean square, or of highest likelihood without squares."""
         numbers = self._numbers
         means = {
             name: -log_likelihood.mean(numbers[name]) if squares is None else squares.mean(numbers[name])
@@ -154,11 +156,13 @@ class Judgement:
         return min(means, key=lambda name: (math.isnan(means[name]), means[name]))
 
     def rival(self, operations: Callable[[str], float]) -> str:
-        """Return the shipped filter chosen by likelihood: the default where the likeliest does not beat it beyond
-        chance, else the cheapest that is ``AS_GOOD`` as the likeliest.
+        """Return the name of the shipped filter with which the fitted ones are compared.
+
+        It is the default where the likeliest does not beat it beyond chance, else the cheapest that is ``AS_GOOD`` as
+        the likeliest.
 
         Args:
-            operations: returns the operations of an update of a competitor by name.
+            operations: function from a competitor's name to the operations of its update.
         """
         chosen, default, numbers = self._chosen, self.default, self._numbers
         means = {name: chosen.mean(numbers[name]) for name in self.shipped}
@@ -174,48 +178,51 @@ class Judgement:
         return min(as_good, key=lambda name: (operations(name), -means[name]))
 
     def simplest(self, fitted: Sequence[JudgedFilter]) -> JudgedFilter:
-        """Return the simplest fitted filter that the likeliest does not beat beyond chance; ``fitted`` lists the
-        simplest first.
+        """Return the first of the fitted filters, sorted simplest first, that the likeliest does not beat beyond
+        chance.
         """
         likeliest = likeliest_of(fitted)
         as_good = (c for c in fitted if self.difference(likeliest.name, c.name).low <= 0.0)
         return next(as_good, likeliest)
 
-    def is_worth(self, fitted: JudgedFilter, rival: str, operations: Callable[[str], float]) -> bool:
+    def is_worthwhile(self, fitted: JudgedFilter, rival: str, operations: Callable[[str], float]) -> bool:
         """Return whether a fitted filter gains beyond chance over the rival, or is cheaper and ``AS_GOOD``."""
         low = fitted.gain.low
         return low > 0.0 or (low > -AS_GOOD and operations(fitted.name) < operations(rival))
 
     def _judged_squares(self) -> PairSums | None:
-        """Return the squares of judged errors, or of prediction errors without truth."""
+        """Return the sums of squared errors in the judgement; without truth those of prediction errors."""
         predicted = self.scores.predicted
         return self.scores.squared or (None if predicted is None else predicted[1])
 
     def best_shipped(self) -> str:
-        """Return the shipped filter that is best on the measurements that judge."""
+        """Return the name of the shipped filter of smallest error on the measurements of the judgement."""
         return self._least_error(self._judged_squares(), self._judged)
 
     def relative_error(self, name: str, other: str) -> IntervalEstimate:
-        """Return the judged error over that of another, less one; without truth the prediction error is used."""
+        """Return the ratio of two filters' RMS errors in the judgement, less one; without truth of prediction
+        errors.
+        """
         squares, known = self._judged_squares(), self._numbers if self.scores.squared else self._predicting
         if squares is None or name not in known or other not in known:
             return UNKNOWN
         return squares.relative_root(self._numbers[name], self._numbers[other])
 
     def difference(self, name: str, other: str) -> IntervalEstimate:
-        """Return the log-likelihood of a filter on the measurements of the choice less that of another, each less one
-        nat in all for each fitted parameter, nats.
+        """Return the difference of two filters' penalised log-likelihoods on the measurements of the choice, nats.
+
+        The penalty is one nat in all for each fitted parameter.
         """
         found = self._chosen.difference(self._numbers[name], self._numbers[other])
         penalty = self._penalty(name) - self._penalty(other)
         return IntervalEstimate(*(value - penalty for value in found))
 
     def _penalty(self, name: str) -> float:
-        """Return one nat for each fitted parameter over the number of measurements of the choice."""
+        """Return the penalty of a filter: its number of fitted parameters over the measurements of the choice, nats."""
         return self.parameters.get(name, 0) / self.scores.chosen_measurements
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
-        """Return the filters that lose the track in the whole recording; none where all do.
+        """Return the names of the fitted filters that lose the track in the whole recording; none where all do.
 
         Args:
             fits: fits with their likelihood in windows.
@@ -234,7 +241,7 @@ class Judgement:
         return tuple(diverging) if len(diverging) < len(fits) else ()
 
     def competitor(self, name: str, rival: str) -> JudgedFilter:
-        """Judge a competitor, paired with a rival."""
+        """Return a filter's results on the measurements for choice and judgement, paired with a rival's."""
         scores, i, other = self.scores, self._numbers[name], self._numbers[rival]
         penalty, predicts = self._penalty(name), name in self._predicting
         gain = self._chosen.difference(i, other)

@@ -1,4 +1,4 @@
-"""Sums over stretches of a log of the likelihoods and errors of competitors.
+"""Likelihoods and errors of competitors on a log, summed over stretches of it.
 
 All competitors process the log side by side, in chunks of measurements. Only sums over stretches are stored: of one
 competitor, and of each pair over the measurements for which both have values. So memory grows neither with the log nor
@@ -31,21 +31,21 @@ ROWS = 1 << 13
 
 
 def report_scores(model: Model, episode: Episode) -> dict[str, Any]:
-    """Report the terms of the sums, arrays ``(..., N)``, without those that the log itself contains."""
+    """Return a filter's likelihoods and estimate after a measurement, arrays ``(..., N)`` by name."""
     records = model.records(episode)
     found = {name: records[name] for name in LIKELIHOOD if name in records}
     return {**found, "estimate": model.mean(episode)}
 
 
 def report_picture(model: Model, episode: Episode) -> dict[str, Any]:
-    """Report the quantities of figures of a log, arrays ``(..., N)``."""
+    """Return the quantities drawn of a log after a measurement, arrays ``(..., N)`` by name."""
     found = {**model.records(episode), **model.track(episode)}
     shown = ("estimate", "truth", *LIKELIHOOD)
     return {name: found[name] for name in found if name in shown or name.startswith("measurement_")}
 
 
 class PairSums:
-    """Sums over stretches of values of competitors, for each pair over the measurements for which both are finite.
+    """Sums of competitors' values over stretches of a log, for each pair over the measurements where both are finite.
 
     Args:
         competitors: number of competitors, n.
@@ -64,7 +64,7 @@ class PairSums:
         self.counts: numpy.ndarray = numpy.zeros(shape)
 
     def add(self, values: numpy.ndarray, first: int) -> None:
-        """Add values of all competitors from a measurement on, ``(n, E, rows)``."""
+        """Add values ``(n, E, rows)`` of all competitors to the sums, from measurement ``first`` on."""
         stretch = self._stretch[:, first : first + values.shape[2]]
         for number in numpy.unique(stretch[stretch >= 0]).tolist():
             some = values[:, stretch == number]
@@ -74,28 +74,28 @@ class PairSums:
             self.counts[number] += there @ there.T
 
     def total(self, i: int) -> tuple[float, int]:
-        """Return the sum of a competitor over all stretches, and its number of measurements."""
+        """Return the sum of competitor i's values over all stretches, and their number."""
         return float(self.sums[:, i, i].sum()), int(self.counts[:, i, i].sum())
 
     def mean(self, i: int) -> float:
-        """Return the mean of a competitor; NaN where no value is finite."""
+        """Return the mean of competitor i's values; NaN where no value is finite."""
         total, count = self.total(i)
         return total / count if count else math.nan
 
     def difference(self, i: int, j: int) -> IntervalEstimate:
-        """Return the mean of competitor i less that of j, paired."""
+        """Return the mean of competitor i's values less j's, paired, with interval."""
         counts = self.counts[:, i, j]
         sums = numpy.stack([self.sums[:, i, j] - self.sums[:, j, i], counts], axis=1)
         return interval_of_sums(sums, counts, ratio)
 
     def relative_root(self, i: int, j: int) -> IntervalEstimate:
-        """Return the ratio of root mean squares of competitors i and j, less one, paired; the values are squares."""
+        """Return the ratio of the root means of competitors i and j, less one, paired; the values are squares."""
         sums = numpy.stack([self.sums[:, i, j], self.sums[:, j, i]], axis=1)
         return interval_of_sums(sums, self.counts[:, i, j], lambda means: numpy.sqrt(ratio(means)) - 1.0)
 
 
 class _Whiteness:
-    """Products of the successive prediction errors of a competitor, summed over stretches.
+    """Sums for the correlation of successive prediction errors of a competitor.
 
     Args:
         stretch: number of the stretch of each measurement, ``(E, T)``; -1 for an excluded one.
@@ -111,7 +111,7 @@ class _Whiteness:
         self._counts = numpy.zeros(self._sums.shape[:2], dtype=int)
 
     def add(self, errors: numpy.ndarray, first: int) -> None:
-        """Add errors from a measurement on, ``(m, E, rows)``."""
+        """Add the products of prediction errors ``(m, E, rows)`` from measurement ``first`` on."""
         before = numpy.concatenate([self._last, errors[..., :-1]], axis=2)
         whole = numpy.concatenate([self._received, errors], axis=2)
         places = numpy.where(numpy.isfinite(whole), numpy.arange(whole.shape[2]), 0)
@@ -128,27 +128,25 @@ class _Whiteness:
                 self._sums[i, :, j] += numpy.bincount(stretch[there], pair[j][there], count)
 
     def correlations(self) -> list[IntervalEstimate]:
-        """Return the correlation of successive errors of the first group together, and of each measured number: of each
-        received one with the last received before.
-        """
+        """Return the correlation of successive errors: of the first group, then of each measured number."""
         pairs = zip(self._sums, self._counts, strict=True)
         return [interval_of_sums(sums, counts, ratio) for sums, counts in pairs]
 
 
 def _products(errors: numpy.ndarray, before: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the products of successive errors, and mean squares, whose ratio of sums is the correlation."""
+    """Return the products of errors with those before, and their mean squares; sums' ratio is the correlation."""
     return errors * before, 0.5 * (errors**2 + before**2)
 
 
 class Roles(NamedTuple):
-    """Masks of the measurements for the choice among competitors, and for the judgement, booleans ``(E, T)``."""
+    """Boolean masks ``(E, T)`` of the measurements for the choice among competitors, and for the judgement."""
 
     chosen: numpy.ndarray
     judged: numpy.ndarray
 
 
 class LogScores:
-    """Sums of competitors over the measurements of a log for the choice, and over those for the judgement.
+    """Sums of competitors' likelihoods and errors over a log's measurements for choice and judgement.
 
     Args:
         plan: plan of their evaluation on the log.
@@ -188,7 +186,7 @@ class LogScores:
             self._estimates = [nothing] * n
 
     def add(self, first: int, reports: Sequence[Mapping[str, numpy.ndarray]]) -> None:
-        """Add the reports of :func:`report_scores` of each competitor from a measurement on, ``(rows, ..., E)``."""
+        """Add each competitor's reports ``(rows, ..., E)`` from measurement ``first`` on to the sums."""
         rows = len(reports[0]["estimate"])
         there = self._there[:, first : first + rows]
         found = [
@@ -223,7 +221,7 @@ class LogScores:
                 sums.add(squares, first)
 
     def _predict(self, i: int, estimate: numpy.ndarray, measurement: Any, first: int) -> numpy.ndarray:
-        """Return the squared prediction errors of the first group, and add the products of successive errors."""
+        """Return competitor i's squared prediction errors of the first group, and add their products to the sums."""
         before = numpy.concatenate([self._estimates[i], estimate[..., :-1]], axis=2)
         self._estimates[i] = estimate[..., -1:].copy()
         assert self._format is not None
@@ -239,8 +237,8 @@ class LogScores:
         return squares
 
     def _log_values(self, values: Any, first: int, rows: int) -> numpy.ndarray:
-        """Return the log's values from a measurement on, ``(..., E, rows)``; NaN beyond the end of an episode."""
-        some = values[self._plan.flown, first : first + rows].astype(float)
+        """Return ``rows`` of a log's values from ``first`` on, ``(..., E, rows)``; NaN beyond an episode's end."""
+        some = values[self._plan.flight_numbers, first : first + rows].astype(float)
         return numpy.where(
             self._there[:, first : first + rows],
             numpy.moveaxis(some, -1, 0) if some.ndim > 2 else some,
@@ -248,20 +246,16 @@ class LogScores:
         )
 
     def nis(self, i: int) -> float:
-        """Return the mean judged normalised innovation squared over its dimension; NaN where it is unknown."""
+        """Return competitor i's mean NIS over its dimension, on the measurements for the judgement; NaN: unknown."""
         squares, degrees = self._nis[i].tolist()
         return squares / degrees if degrees else math.nan
 
     def correlation(self, i: int) -> IntervalEstimate:
-        """Return the correlation of the successive judged prediction errors of competitor i; zero where they are
-        white.
-        """
+        """Return the correlation of competitor i's successive prediction errors in the judgement, first group."""
         return self._whiteness[i].correlations()[0]
 
     def correlations(self, i: int) -> dict[str, IntervalEstimate]:
-        """Return the correlation of successive errors of each measured number, by name; empty where all are of one
-        group.
-        """
+        """Return the correlation of competitor i's successive prediction errors of each measured number, by name."""
         assert self._format is not None
         found = self._whiteness[i].correlations()[1:]
         quantities = self._format.predicted[: len(found)]
@@ -270,7 +264,7 @@ class LogScores:
 
 
 def _start_runs(plan: Plan, report: Report) -> list[Iterator[dict[str, numpy.ndarray]]]:
-    """Return a run of each competitor over a log, in chunks of measurements."""
+    """Return for each competitor an iterator that runs it over a log and yields reports of chunks."""
     rows, models = max(ROWS // len(plan.seeds), 1), plan.models
     return [
         run_stretches(models[name], maker, plan.kinds[name], plan.seeds, report, rows, name)
@@ -291,7 +285,7 @@ def score_log(
         experiment: experiment on the recording.
         competitors: makers by name.
         roles: roles of the measurements of the recording.
-        tick: called with the share of the work done.
+        tick: function that is called with the share of the work done.
     """
     with numpy.errstate(all="ignore"):  # a diverging filter is judged by its numbers
         plan = plan_of(experiment, competitors)
@@ -310,9 +304,7 @@ def score_log(
 
 @one_thread()
 def replay_log(experiment: Experiment, competitors: Mapping[str, Any]) -> "xarray.Dataset":
-    """Run competitors over a log, and return the quantities of figures for every measurement, in the form of an
-    evaluation.
-    """
+    """Run competitors over a log, and return estimates and likelihoods of every measurement as a dataset."""
     plan = plan_of(experiment, competitors)
     task = plan.models[next(iter(competitors))].task
     kept = plan.arrays(len(plan.seeds), len(plan.seeds))

@@ -1,4 +1,4 @@
-"""Models of the noise of a sensor: as stated, or estimated from the innovations.
+"""Models of a sensor's noise variance: as stated, or estimated from the innovations.
 
 Competitors of several environments use them. Equation numbers are those of ``filters/noise_adaptation.py``.
 """
@@ -14,19 +14,19 @@ LEAST = 0.1
 
 
 class MeasurementNoise:
-    """Noise as stated, by the sensor or its data sheet; subclasses estimate it."""
+    """Noise model of a sensor: its variance as stated; subclasses estimate it from innovations."""
 
     def start(self, stated: Array) -> Any:
-        """Return the memory at the start, where only the stated variance is known, ``(N,)``."""
+        """Return the memory at the start of a track, from the stated variance, ``(N,)``."""
         return ()
 
     def update(
         self, memory: Any, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, Any]:
-        """Return the variance of a measurement and memory, in the sensor's unit.
+        """Return the noise variance of a measurement ``(N,)``, and the memory updated by its innovation.
 
         Args:
-            memory: after the measurement before.
+            memory: memory after the last measurement.
             innovation: measurement less prediction, ``(N,)``; of several channels with the same noise the root of their
                 mean square.
             P: variance of the predicted measurement without its noise, ``(N,)``.
@@ -37,28 +37,28 @@ class MeasurementNoise:
 
 
 class Mehra(MeasurementNoise):
-    """Noise estimated by the mean square of the last innovations.
+    """Noise variance estimated by the mean square of the last innovations.
 
     Args:
-        window: measurements in it.
+        window: number of innovations in the mean.
     """
 
     def __init__(self, window: float) -> None:
         self.window: int = max(round(window), 1)
 
     def start(self, stated: Array) -> Array:
-        """Return a window full of the stated variance."""
+        """Return the memory at the start: a window filled with the stated variance."""
         return adaptation.start_window(stated, self.window)
 
     def update(
         self, memory: Array, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, Array]:
-        """Apply equation (5) of ``filters/noise_adaptation.py``."""
+        """Return the noise variance by equation (5) of ``filters/noise_adaptation.py``, and the window."""
         return adaptation.mehra(memory, innovation, P, LEAST * stated, available)
 
 
 class FadingNoise(MeasurementNoise):
-    """Noise estimated with a fading memory.
+    """Base of noise models that estimate the variance with a fading memory.
 
     Args:
         memory: effective number of measurements, ``1 / (1 - b)``.
@@ -71,34 +71,36 @@ class FadingNoise(MeasurementNoise):
 
 
 class SageHusaMeasurementNoise(FadingNoise):
-    """Noise estimated by the fading mean square of the innovations; arguments of :class:`FadingNoise`."""
+    """Noise variance estimated by the fading mean square of the innovations; arguments of :class:`FadingNoise`."""
 
     def start(self, stated: Array) -> adaptation.Level:
-        """Return the level at the stated variance."""
+        """Return the memory at the start: a fading mean at the stated variance."""
         return adaptation.Level(stated, self.trust + 0.0 * stated)
 
     def update(
         self, memory: adaptation.Level, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, adaptation.Level]:
-        """Apply equation (1) of ``filters/noise_adaptation.py``."""
+        """Return the noise variance by equation (1) of ``filters/noise_adaptation.py``, and the fading mean."""
         level = adaptation.sage_husa(memory, innovation, P, self.forgetting, LEAST * stated, available)
         return level.value, level
 
 
 class VariationalBayesMeasurementNoise(FadingNoise):
-    """Noise estimated by an inverse-gamma distribution; arguments of :class:`FadingNoise`, with ``rho`` for ``b``."""
+    """Noise variance estimated as an inverse-gamma distribution; arguments of :class:`FadingNoise`, ``rho`` for
+    ``b``.
+    """
 
     iterations = 2
 
     def start(self, stated: Array) -> adaptation.InverseGamma:
-        """Return the distribution about the stated variance."""
+        """Return the memory at the start: an inverse-gamma distribution about the stated variance."""
         shape = 0.5 * self.trust + 0.0 * stated
         return adaptation.InverseGamma(shape, shape * stated)
 
     def update(
         self, memory: adaptation.InverseGamma, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, adaptation.InverseGamma]:
-        """Apply equations (6) and (7) of ``filters/noise_adaptation.py``."""
+        """Return the noise variance by (6) and (7) of ``filters/noise_adaptation.py``, and the distribution."""
 
         def update(R: Array) -> tuple[Array, Array, Array]:
             rest = R / (P + R)
@@ -120,4 +122,4 @@ RULES: Mapping[str, tuple[type[MeasurementNoise], str]] = {
         "by variational Bayes (Särkkä and Nummenmaa 2009)",
     ),
 }
-"""Rules by their names in tables, with descriptions."""
+"""Classes of the noise models by their names in tables, with descriptions."""

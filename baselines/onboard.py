@@ -1,4 +1,4 @@
-"""Comparison of a vehicle's own filter with the filters of an advice, by fixes that are withheld from these.
+"""Comparison of a vehicle's own filter with fitted and shipped filters on fixes withheld from the latter.
 
 Every fifth fix of a log is withheld. Filters run over the others, and predict the withheld ones. The estimates of the
 vehicle's own filter come from the log; there is no truth. A fix is logged with a delay, so the estimate is read that
@@ -32,10 +32,10 @@ DELAYS = numpy.arange(0.0, 1.0, 0.02)
 
 
 class OnboardJudgement(NamedTuple):
-    """Errors of the vehicle's own filter and of others on the withheld fixes that judge."""
+    """Errors of the vehicle's own filter and of others on the withheld fixes of the judgement."""
 
     source: str
-    """Name of the filter, autopilot and topic."""
+    """Name of the vehicle's filter: autopilot and topic."""
     delay: float
     """Delay of the fixes, s."""
     fixes: int
@@ -55,13 +55,13 @@ def judge_onboard(
     makers: Mapping[str, Any],
     track: OnboardTrack,
 ) -> OnboardJudgement | None:
-    """Judge a vehicle's own filter and others by withheld fixes; None where the log has no estimate at any of them.
+    """Return errors of a vehicle's own filter and of others on withheld fixes; None without estimates at any.
 
     Args:
         problem: problem of the recording.
         recording: positions in metres around its origin.
         keywords: parameters of the task.
-        share: spans of its measurements, with those that judge.
+        share: spans of its measurements for fit, choice and judgement.
         makers: competitors by name, the advised one first.
         track: estimates of the vehicle's own filter.
     """
@@ -101,7 +101,7 @@ def judge_onboard(
 
 
 def _withhold(recording: Recording, withheld: numpy.ndarray) -> Recording:
-    """Return a recording in which some fixes are missed measurements."""
+    """Return a copy of a recording in which the fixes of a boolean mask are missed measurements."""
     measured = dict(recording.measurements)
     measured["available"] = numpy.where(withheld, 0.0, measured["available"])
     measured["position"] = numpy.where(withheld[..., None], 0.0, measured["position"])

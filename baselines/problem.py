@@ -1,4 +1,4 @@
-"""An environment's task, baselines and tuned values as one object, looked up once by its id."""
+"""An environment's task, baselines and tuned values as one object."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Problem:
-    """An environment's task and its baselines; it is pickled by name."""
+    """An environment: its task, baselines and tuned values. It is pickled by name."""
 
     task: type[Task]
     baselines: Baselines
@@ -30,7 +30,7 @@ class Problem:
 
     @classmethod
     def of(cls, task: type[Task]) -> "Problem":
-        """Return the problem of a task's class."""
+        """Return the problem of the environment that a task's class defines."""
         return cls(task, baselines_of(task.id), package_of(task.id))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -71,7 +71,7 @@ class Problem:
         return self.baselines.score_paper
 
     def paper_among(self, competitors: Mapping[str, Any]) -> str:
-        """Return the name of the paper's algorithm that some competitors are compared with; empty without one.
+        """Return which competitor is the paper's algorithm, the base of costs; empty if none is.
 
         Args:
             competitors: makers by name. The stronger reading of the paper is returned where it is among them, under its
@@ -87,7 +87,7 @@ class Problem:
 
     @property
     def knows(self) -> dict[str, str]:
-        """Description of what its references and bounds know beyond the measurements, by name."""
+        """What each reference and bound knows beyond the measurements, in words, by name."""
         makers = {**self.baselines.references, **self.baselines.bounds}
         return {name: maker.knows for name, maker in makers.items()}
 
@@ -99,17 +99,18 @@ class Problem:
 
     @property
     def tuned_policies(self) -> list[str]:
-        """Names of policies with tuned values."""
+        """Names ``NAME-tuned`` of policies and estimators with stored tuned values."""
         return self.tuned_values.names()
 
     @property
     def names(self) -> list[str]:
-        """Names of its policies, estimators, smoothers, references and bounds, and of policies that were tuned."""
+        """Names of its policies, estimators, smoothers, references and bounds, and of tuned ones."""
         return [*self.baselines.names, *self.tuned_policies]
 
     def find(self, name: str) -> Any:
-        """Return the maker of one of its policies, estimators (tuned or not), smoothers, references or bounds; None for
-        an unknown name. Tuned values are read only for a name that ends with ``-tuned``.
+        """Return the maker of a competitor of this name; None for an unknown name.
+
+        Tuned values are read only for a name that ends with ``-tuned``.
         """
         known = self.baselines
         for table in (known.policies, known.estimators, known.smoothers, known.references, known.bounds):
@@ -120,7 +121,7 @@ class Problem:
         return None
 
     def competitor(self, name: str) -> Any:
-        """Return the maker of a competitor of this name, see :meth:`find`.
+        """Return the maker of a competitor of this name; raise ValueError for an unknown name.
 
         Raises:
             ValueError: if there is no such name.
@@ -133,7 +134,7 @@ class Problem:
         return found
 
     def experiment(self, *arguments: Any, **fields: Any) -> Experiment:
-        """Return an experiment on it, with the paper's algorithm and the reference of its baselines.
+        """Return an :class:`.evaluate.Experiment` on this environment, with its paper's algorithm and reference.
 
         Args:
             *arguments: arguments of :class:`.evaluate.Experiment` after the task.
@@ -151,13 +152,13 @@ class Problem:
         workers: Workers | None = None,
         **keywords: Any,
     ) -> "xarray.Dataset":
-        """Run competitors over the same episodes, with the paper's algorithm and the reference of its baselines.
+        """Run competitors over the same episodes of this environment, and return the dataset of the evaluation.
 
         Args:
-            competitors: makers by name, as of :func:`.evaluate.run_experiment`.
-            *arguments: of :meth:`experiment`.
-            progress: as of :func:`.evaluate.run_experiment`.
-            workers: as of :func:`.evaluate.run_experiment`.
+            competitors: makers by name.
+            *arguments: arguments of :meth:`experiment`.
+            progress: function that is called with the number of measurements done.
+            workers: processes that share the work.
             **keywords: fields of :meth:`experiment` that :data:`.evaluate.OPTIONS` names, and parameters of the task.
         """
         options = {name: keywords.pop(name) for name in OPTIONS if name in keywords}
@@ -167,7 +168,7 @@ class Problem:
 
 
 def problem_of(id: str) -> Problem:
-    """Return the problem of an environment id without importing a module.
+    """Return the problem (task and baselines) of a registered environment's id.
 
     Raises:
         ValueError: for an unknown environment.
@@ -176,7 +177,7 @@ def problem_of(id: str) -> Problem:
 
 
 def import_problem(id: str) -> Problem:
-    """Return the problem of an id that a user has given; ``module:id`` imports the module first.
+    """Return the problem (task and baselines) of an id; ``module:id`` imports the module first.
 
     Raises:
         ValueError: for an unknown environment, or if its module cannot be imported.

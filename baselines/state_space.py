@@ -1,6 +1,4 @@
-"""Baselines of a task of state-space models: the filter as written, other filters of the same model, and the filter
-that is given the true model.
-"""
+"""Baselines of a user's state-space model: its Kalman filter, other filters, and the filter with the true model."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,20 +21,20 @@ from ..filters.ordered_sums import ordered_sum
 from .table import Baselines, tunable
 
 NOISE = "_noise"
-"""Ending of the name of a factor on R of a sensor, or on a source of Q."""
+"""Suffix of the parameter that is a factor on R of a sensor, or on a source of Q."""
 UNCERTAIN = 1e-9
-"""Share of Q that is added to the initial covariance of sigma points, which must be positive definite."""
+"""Share of Q that is added to the initial covariance for sigma points, which must be positive definite."""
 
 
 class StateSpaceKalman(ConstantPolicy):
-    """The Kalman filter as written, extended where the model is not linear."""
+    """The Kalman filter of the user's model, extended where the model is not linear."""
 
     control = "noise"
     action: tuple[float, ...] = (0.0, 0.0)
 
 
 class CovarianceMatching(Policy):
-    """Process noise raised while the normalised innovation squared is above its mean, lowered while it is below."""
+    """Process noise raised while the normalised innovation squared is above its mean, and lowered while it is below."""
 
     control = "noise"
     traceable = True
@@ -47,7 +45,7 @@ class CovarianceMatching(Policy):
         self.nis, self.last, self.available = (model.reader(n) for n in ("nis", "last_action", "available"))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Change the last action by a step."""
+        """Return the last action changed by a step, as the NIS is above or below its mean."""
         degrees = numpy.sum(self.available(observation), axis=1)
         excess = numpy.minimum(self.nis(observation)[:, 0], 5.0 * degrees) - degrees
         process = numpy.clip(self.last(observation)[:, 0] + self.step * excess, -1.0, 1.0)
@@ -75,7 +73,7 @@ def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
 
 
 def _zero_missing(measurement: StateSpaceMeasurement, xp: Any) -> Array:
-    """Return the values with zero in place of missing ones."""
+    """Return a measurement's values ``(m, N)`` with zero in place of missing ones."""
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
 
@@ -84,13 +82,13 @@ class Past(NamedTuple):
 
     measurement: StateSpaceMeasurement
     truth: Any
-    """Truth given to a reference with it; None for other filters."""
+    """Truth at this measurement, for a reference; None for other filters."""
     happened: Array
-    """Whether it is a measurement, not a place before the start, ``(N,)``."""
+    """Whether this entry is a measurement, not an empty one before the start, ``(N,)``."""
 
 
 class Buffered(NamedTuple):
-    """A filter with its last measurements, which are processed again when one of them arrives late."""
+    """State of a filter with its last measurements, which are processed again when a late value arrives."""
 
     now: Any
     """State of the filter after all received measurements."""
@@ -101,7 +99,7 @@ class Buffered(NamedTuple):
 
     @property
     def mean(self) -> Array:
-        """Mean of the filter."""
+        """Mean after all received measurements, ``(n, N)``."""
         mean: Array = self.now.mean
         return mean
 
@@ -113,13 +111,13 @@ class Buffered(NamedTuple):
 
     @property
     def likelihood(self) -> Likelihood:
-        """Likelihood of the last measurement, predicted with all measurements received before it."""
+        """Likelihood of the last measurement, predicted from all measurements received before."""
         likelihood: Likelihood = self.now.likelihood
         return likelihood
 
 
 def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
-    """Return the start of a filter, with an empty buffer where measurements may arrive late."""
+    """Return a filter's initial state, inside an empty :class:`Buffered` where measurements may arrive late."""
     if not task.parameters.late:
         return begun
     own, none = task.definition, 0.0 * begun.mean[0]
@@ -138,12 +136,11 @@ def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
 def _in_order(
     state: Any, measurement: StateSpaceMeasurement, step: Callable[..., Any], truth: Any = None
 ) -> Any:
-    """Update with a measurement. Where a late one arrives with it, update with that first, in its place, and again with
-    those after it.
+    """Return the state after a measurement, with a late one that arrives with it processed in its place.
 
     Args:
         state: state of the filter, or a :class:`Buffered` one.
-        measurement: the received one.
+        measurement: measurement that was received.
         step: function of the filter's state and a :class:`Past` that returns the state after it.
         truth: truth given to the step of a reference.
     """
@@ -165,7 +162,7 @@ def _in_order(
 
 
 class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
-    """The Kalman filter as written, extended where the model is not linear, as an estimator.
+    """The Kalman filter of the user's model, extended where it is not linear, as an estimator.
 
     A late measurement is processed in its place.
 
@@ -180,7 +177,7 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task)
-        self.equations: Equations = task.believed[0]
+        self.equations: Equations = task.filter_equations[0]
         self.factor = process_noise
         self.of_sources, of_sensors = _split(task, noises)
         self.sensor_factors: tuple[Any, dict[str, Any]] = measurement_noise, of_sensors
@@ -194,16 +191,16 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         return self.equations.sensor_noise(mean, measurement, *self.sensor_factors)
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate."""
+        """Return the filter's state at the start of a track, from the initial estimate."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun)
 
-    def update(self, state: Any, given: FilterInput) -> Any:
-        """Predict and update."""
-        return _in_order(state, given.measurement, self.take)
+    def update(self, state: Any, inputs: FilterInput) -> Any:
+        """Predict to a measurement, update with it, and return the state."""
+        return _in_order(state, inputs.measurement, self.take)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
-        """Predict to a measurement and update with it."""
+        """Return the state predicted to a measurement and updated with it."""
         measurement = one.measurement
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         Q = self.process_noise(mean, measurement)
@@ -222,15 +219,16 @@ def _update(
 
 
 class ExtendedSmoother(Extended):
-    """The Kalman filter as written, smoothed with all later measurements (Rauch, Tung and Striebel 1965). A late
-    measurement is smoothed where it belongs.
+    """The Kalman filter of the user's model, smoothed with all later measurements (Rauch, Tung and Striebel 1965).
+
+    A late measurement is smoothed in its place.
 
     Args:
         task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
         lag: number of later measurements that each estimate uses; default: all of them.
-        **noises: as of :class:`Extended`.
+        **noises: factors on sources of Q and on R of sensors, as of :class:`Extended`.
     """
 
     kind = "smoother"
@@ -249,7 +247,7 @@ class ExtendedSmoother(Extended):
     def smooth(
         self, measurements: Sequence[StateSpaceMeasurement], states: Sequence[Any]
     ) -> tuple[Array, Array]:
-        """Smooth the whole track, or with the fixed lag."""
+        """Return means and covariances of the whole track, smoothed with all later measurements or those in the lag."""
         measured, memories = scans.stack_scans(measurements), scans.stack_scans(states)
         if isinstance(memories, Buffered):
             measured = _put_in_order(measured, self.task.parameters.lateness, self.xp)
@@ -260,7 +258,7 @@ class ExtendedSmoother(Extended):
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
 
     def _filter_in_order(self, settled: EstimateState, measured: StateSpaceMeasurement) -> EstimateState:
-        """Return the estimates at the start and at K measurements, with late measurements in their places.
+        """Return the filtered estimates at the start and at K measurements, with late ones in their places.
 
         Args:
             settled: estimates ``lateness`` measurements before the start and before each measurement, at least those at
@@ -288,7 +286,7 @@ class ExtendedSmoother(Extended):
 
 
 def _put_in_order(measured: StateSpaceMeasurement, lateness: int, xp: Any) -> StateSpaceMeasurement:
-    """Return the measurements ``(..., K, N)`` with late values in their places."""
+    """Return measurements ``(..., K, N)`` with late values moved to the measurements to which they belong."""
     plain = measured._replace(values=_zero_missing(measured, xp), late=None, late_available=None)
     assert measured.late is not None
     assert measured.late_available is not None
@@ -314,15 +312,15 @@ class Unscented(Extended):
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task, process_noise, measurement_noise, **noises)
-        usual = task.definition.usual_noise(task.parameters.sampling_interval)
+        usual = task.definition.nominal_process_noise(task.parameters.sampling_interval)
         self.uncertain: Array = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate, with a positive definite covariance."""
+        """Return the state at the initial estimate, with its covariance made positive definite."""
         return super().start(initial._replace(covariance=initial.covariance + self.uncertain))
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
-        """Predict to a measurement and update with it by sigma points."""
+        """Return the state predicted to a measurement and updated with it by sigma points."""
         measurement = one.measurement
         own = self.equations
         motion, points = own.continuous_motion(state.mean, state.covariance, measurement)
@@ -356,28 +354,28 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
         self.bank: MultipleModelBank = MultipleModelBank(task, "evidence", *factors, *_split(task, noises))
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate."""
+        """Return the filter's state at the start of a track, from the initial estimate."""
         return _buffer(self.task, self.bank.start(initial))
 
-    def update(self, state: Any, given: FilterInput) -> Any:
-        """Predict and update, without evidence of an action."""
-        return _in_order(state, given.measurement, self.take)
+    def update(self, state: Any, inputs: FilterInput) -> Any:
+        """Predict to a measurement and update with it, without an action; return the state."""
+        return _in_order(state, inputs.measurement, self.take)
 
     def take(self, state: Mixture, one: Past) -> Mixture:
-        """Predict to a measurement and update with it."""
+        """Return the state predicted to a measurement and updated with it."""
         measurement = one.measurement._replace(values=_zero_missing(one.measurement, self.xp))
         predicted = self.bank.predict(state, measurement)
         return self.bank.act(predicted, measurement, 0.0 * predicted.action)
 
     def records(self, state: Any, measurement: StateSpaceMeasurement) -> dict[str, Array]:
-        """Return the likelihood of the measurement."""
+        """Return the log-likelihood of the last measurement, by name."""
         own = state.now if isinstance(state, Buffered) else state
         return {"log_likelihood": self.bank.records(own, measurement)["log_likelihood"]}
 
 
 class KnownModel:
-    """The Kalman filter, extended where the model is not linear, that is given the true model: functions, Q and R of
-    this episode, and the true hypothesis.
+    """The Kalman filter, extended where the model is not linear, that knows the true model: functions, Q and R of this
+    episode, and the true hypothesis.
     """
 
     kind = "reference"
@@ -389,14 +387,14 @@ class KnownModel:
         self.xp: ModuleType = task.xp
 
     def start(self, initial: Initial, truth: StateSpaceTruth) -> Any:
-        """Start from the initial estimate."""
+        """Return the filter's state at the start of a track, from the initial estimate."""
         begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun, self._model_truth(truth))
 
     def update(
         self, memory: Any, measurement: StateSpaceMeasurement, truth: StateSpaceTruth
     ) -> tuple[Array, Array, Any, Likelihood]:
-        """Predict and update with the model in force."""
+        """Predict and update with the true model; return mean, covariance, memory and likelihood."""
         after = _in_order(memory, measurement, self.take, self._model_truth(truth))
         return after.mean, after.covariance, after, after.likelihood
 
@@ -405,7 +403,7 @@ class KnownModel:
         return truth._replace(state=None, inputs=None, sensors=None, waiting=None)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
-        """Predict to a measurement and update with it."""
+        """Return the state predicted to a measurement and updated with it."""
         (measurement, truth, _), xp, chosen = one, self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.is_switching else world.equations[:1]):
@@ -424,7 +422,7 @@ class KnownModel:
 
 
 def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the factors by the names of the sources of Q, and by those of the sensors.
+    """Return the noise factors in two groups: by source of Q, and by sensor.
 
     Raises:
         ValueError: for a name that is neither.
@@ -440,7 +438,7 @@ def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any],
 
 
 def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
-    """Return the tuned factors: lower limit, value without tuning, upper limit."""
+    """Return the limits of the noise factors that are tuned, by name: lowest, untuned, highest."""
 
     def names(of: Iterable[str], else_all: str) -> list[str]:
         several = [name + NOISE for name in of]
@@ -455,7 +453,7 @@ def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
 
 
 def state_space_baselines(task: type[StateSpace]) -> Baselines:
-    """Return the baselines of a task.
+    """Return the baselines of a user's state-space model.
 
     Args:
         task: class of the task.

@@ -1,4 +1,4 @@
-"""Table of baselines of an environment."""
+"""Tables of an environment's baselines and of their tunable values."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -34,15 +34,19 @@ class Tunable:
     """Whether values may be arrays ``(N,)``, one for each episode: candidates are then tried side by side."""
     beyond: Mapping[str, float] = field(default_factory=dict)
     """How far beyond its limits a value of a file may lie, since the limits of another recording may have been
-    wider."""
+    wider.
+    """
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of the values, without their logarithm; a value without an entry is a pure number."""
     likelihood: bool = False
-    """Whether a search weighs the density of the truth in addition to the cost: a filter with few hypotheses costs
-    least where its covariance is too small."""
+    """Whether a search weighs the density of the truth in addition to the cost: a filter with few hypotheses has its
+    lowest cost where its covariance is too small.
+    """
     anchored: bool = False
-    """Whether it uses a second sensor of the motion, with which it distinguishes lasting errors from motion. Advice
-    fits it to measurements some time apart, and compares it with other filters on these (:mod:`.advice`)."""
+    """Whether it uses a second sensor of the motion, with which it distinguishes lasting errors from motion. The search
+    for the best filter of a log fits it to measurements some time apart, and compares it with other filters on these
+    (:mod:`.advice`).
+    """
 
 
 def tunable(
@@ -73,7 +77,7 @@ def tunable(
 
 
 def without_logarithms(values: Mapping[str, float]) -> dict[str, float]:
-    """Return the values by their names, ``10 ** value`` for those whose names begin with ``log10_``."""
+    """Return values by keyword, with ``10 ** value`` for those whose names begin with ``log10_``."""
     return {
         name.removeprefix("log10_"): 10.0**value if name.startswith("log10_") else value
         for name, value in values.items()
@@ -81,18 +85,18 @@ def without_logarithms(values: Mapping[str, float]) -> dict[str, float]:
 
 
 class Variant(functools.partial[Any]):
-    """A competitor's class with some of its arguments given, and a description of its own.
+    """A competitor's class with some arguments bound, and its own description.
 
     It has the attributes of the class, such as ``control`` and ``kind``.
     """
 
     def __new__(cls, make: Callable[..., Any], description: str = "", /, **arguments: Any) -> "Variant":
-        """Bind arguments of a class.
+        """Return a competitor's class with some arguments bound, as its maker.
 
         Args:
             make: the class.
             description: a sentence for the page of the environment.
-            **arguments: of the class, after the problem.
+            **arguments: arguments of the class after the problem.
         """
         variant = super().__new__(cls, make, **arguments)
         variant.__doc__ = description
@@ -126,7 +130,7 @@ class ConstantMode(Policy):
         self.mode: int = mode if mode >= 0 else len(model.task.modes) + mode
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the mode for every episode."""
+        """Return the constant mode as action of every episode, ``(N,)``."""
         return numpy.full(len(observation), self.mode), None
 
 
@@ -149,7 +153,8 @@ class Baselines:
     """The policy whose score is 0."""
     stronger_paper: str = ""
     """Another reading of the paper's algorithm, of less cost: where it takes part, it replaces the paper's as the base
-    of costs and has score 0."""
+    of costs and has score 0.
+    """
     score_reference: str = ""
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()
@@ -160,15 +165,18 @@ class Baselines:
     """Metric and component that the comparison shows in addition to the cost."""
     measurement_seconds: float = 5e-6
     """Time that a policy takes for one measurement, on one core; slow environments get fewer episodes in the full
-    benchmark."""
+    benchmark.
+    """
     headline_episodes: int = 0
     """Smallest number of episodes of the training distribution in a benchmark with narrow intervals; costs with heavy
-    tails need many."""
+    tails need many.
+    """
     tunable: Mapping[str, Tunable] = field(default_factory=dict)
-    """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
+    """Tunable values of policies and estimators, by name; ``NAME-tuned`` is the tuned one."""
     log_families: "Callable[[Recording | None], Mapping[str, Tunable]] | None" = None
-    """Function of a recording (None: any) that returns the estimators to fit to it, with limits that suit it; default:
-    those of ``tunable``."""
+    """Function of a recording (None: any) that returns the families of estimators to fit to it, with limits that suit
+    it; default: those of ``tunable``.
+    """
     best_constant: str = ""
     """Tunable policy that represents the best constant action in the table of the room for improvement."""
     metrics: "OwnMetrics | None" = None
@@ -176,9 +184,10 @@ class Baselines:
 
     fallback: str = ""
     """Policy or estimator that replaces an agent behind a gate while the agent is not trusted. It is a classical filter
-    that is neither tuned on the training distribution nor given it as a prior, since it acts outside the training
+    that is neither tuned on the training distribution nor uses it as a prior, since it acts outside the training
     distribution: the one of least cost on the validation split; of those within 1 % of the paper's cost the quickest.
-    Empty: the paper's algorithm."""
+    Empty: the paper's algorithm.
+    """
     alarm: Callable[[Any], Alarm] | None = None
     """Class of the alarm that detects faults from observations, for any control; None: :class:`.InnovationAlarm`."""
 
@@ -189,5 +198,5 @@ class Baselines:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names, policies first."""
+        """Names of all baselines, policies first."""
         return (*self.policies, *self.estimators, *self.smoothers, *self.references, *self.bounds)

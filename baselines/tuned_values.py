@@ -11,7 +11,7 @@ from ..envs.contract.parameters import quote_shortened
 from ..envs.engine.catalogue import nearest, short_name
 from ..evaluation.competitors.kinds import Kind
 from ..evaluation.storage.files import whole_file
-from ..evaluation.storage.stored import fits, read_json
+from ..evaluation.storage.stored import has_type, read_json
 from .table import Tunable
 
 FOLDER = Path("tuned")
@@ -22,7 +22,7 @@ PATIENCE = 60.0
 
 @dataclass(frozen=True)
 class Tuned:
-    """Outcome of a search."""
+    """Outcome of a search for tuned values of a policy or estimator."""
 
     environment: str
     policy: str
@@ -30,7 +30,8 @@ class Tuned:
     values: dict[str, float]
     cost: float
     """Geometric mean of the costs of episodes of the validation split; where the search weighs the likelihood, see
-    :mod:`.tuning`, divided by that of the densities."""
+    :mod:`.tuning`, divided by that of the densities.
+    """
     untuned_cost: float
     environment_steps: int
     seed: int
@@ -46,7 +47,7 @@ class TunedPolicy:
     content: str
     """Text that identifies the code and values; competitors with equal text are compiled once."""
     anchored: bool = False
-    """As of :class:`.Tunable`: it uses a second sensor, which only recordings contain."""
+    """Whether it uses a second sensor, which only recordings contain."""
     tunable: Tunable | None = None
     """Declaration of the tuned values, where it is known."""
     values: Mapping[str, float] = field(default_factory=dict)
@@ -59,11 +60,11 @@ class TunedPolicy:
 
     @property
     def kind(self) -> Kind:
-        """Kind of the competitor that it makes."""
+        """Kind of competitor, "policy" or "estimator"."""
         return "policy" if self.control else "estimator"
 
     def __call__(self, problem: Any) -> Any:
-        """Make the policy for a model, or the estimator for a task."""
+        """Return the policy, made for a model, or the estimator, made for a task."""
         return self.make(problem)
 
 
@@ -82,19 +83,17 @@ class TunedValues:
             yield place, read_table(place)
 
     def names(self) -> list[str]:
-        """Return ``NAME-tuned`` of every tunable policy that has stored values."""
+        """Return the name ``NAME-tuned`` of every policy and estimator that has stored values."""
         tables = [table for _, table in self._tables()]
         return [f"{policy}-tuned" for policy in self.tunable if any(policy in table for table in tables)]
 
     def is_improved(self, policy: str) -> bool:
-        """Return whether the stored values of a policy differ from those without tuning: a search stores the latter
-        where it finds no better ones.
-        """
+        """Return whether the stored values of a policy differ from the untuned ones, which a search may also store."""
         start = {name: round_value(value) for name, value in self.tunable[policy].start.items()}
         return self.values(policy)[0] != start
 
     def best_policy(self, control: str | None = None) -> str | None:
-        """Return ``NAME-tuned`` of the policy of least cost on the validation split; None if none was tuned.
+        """Return the name of the tuned policy of least cost on the validation split; None without one.
 
         Args:
             control: only policies of this control; estimators have no control and are excluded.
@@ -110,7 +109,7 @@ class TunedValues:
         return min(found, key=lambda name: found[name], default=None)
 
     def values(self, policy: str) -> tuple[dict[str, float], str]:
-        """Return tuned values and their file.
+        """Return the stored values of a policy by name, and the path of their file.
 
         Raises:
             ValueError: if the policy was never tuned, or its file is broken.
@@ -123,7 +122,7 @@ class TunedValues:
         )
 
     def _check(self, values: Any, policy: str, place: Any) -> dict[str, float]:
-        """Raise ValueError if values are not those of a policy, within the limits of the search."""
+        """Return stored values; raise ValueError unless they are a policy's, within the limits of the search."""
         try:
             return check_values(values, self.tunable[policy])
         except ValueError as error:
@@ -145,7 +144,7 @@ class TunedValues:
 
 
 def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
-    """Validate the values of a policy or estimator that were read from a file.
+    """Return the values of a policy or estimator from a file, validated.
 
     Args:
         values: values from the file.
@@ -158,7 +157,7 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
         ValueError: if they are not a number for each parameter, within its limits.
     """
     limits = tunable.limits
-    if not fits(values, dict[str, float]) or values.keys() != limits.keys():
+    if not has_type(values, dict[str, float]) or values.keys() != limits.keys():
         raise ValueError(
             f"it must give a number for each of {', '.join(limits)}, got {quote_shortened(values)}"
         )
@@ -174,7 +173,7 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
 
 
 def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) -> TunedPolicy:
-    """Return the maker of a policy or estimator with these values.
+    """Return the maker of a policy or estimator with the given tuned values.
 
     Args:
         name: name of environment and policy; the same name means the same code.
@@ -187,12 +186,12 @@ def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) 
 
 
 def round_value(value: float) -> float:
-    """Round a value to six digits, as in stored tuned values."""
+    """Return a value rounded to six significant digits, as tuned values are stored."""
     return float(f"{value:.6g}")
 
 
 def read_table(place: Any) -> dict[str, dict[str, Any]]:
-    """Return the table of tuned policies in a file; empty if there is no file.
+    """Return the entries of a file of tuned values, by policy; empty if there is no file.
 
     Raises:
         ValueError: if it is not such a file.
@@ -201,7 +200,7 @@ def read_table(place: Any) -> dict[str, dict[str, Any]]:
         table = read_json(place)
     except FileNotFoundError:
         return {}
-    if not fits(table, dict[str, dict[str, Any]]):
+    if not has_type(table, dict[str, dict[str, Any]]):
         raise ValueError(f"{place} is not a table of tuned policies: correct or remove it")
     return table
 
@@ -234,5 +233,5 @@ def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
 
 
 def table_path(id: str, folder: Path = FOLDER) -> Path:
-    """Return the file of an environment's tuned values in a folder."""
+    """Return the path of the file of an environment's tuned values in a folder."""
     return folder / f"{short_name(id)}.json"

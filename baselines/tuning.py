@@ -7,8 +7,8 @@ an episode is divided by the density of the truth: with mean cost c and mean log
 
     log c - l / n                                                                                                  (1)
 
-is least, averaged over episodes, for an accurate estimate with an honest covariance. The best candidate replaces the
-untuned values only if it beats them significantly on episodes of the validation split.
+is smallest, averaged over episodes, for an accurate estimate with a consistent covariance. The best candidate replaces
+the untuned values only if it beats them significantly on episodes of the validation split.
 """
 
 import json
@@ -48,7 +48,7 @@ def _report_cost_and_likelihood(model: Model, episode: Episode) -> dict[str, num
 
 
 class Candidate(NamedTuple):
-    """Values of a policy or an estimator over some episodes."""
+    """A policy or an estimator with candidate values, and the episodes that it runs."""
 
     problem: Problem
     scenario: Any
@@ -59,9 +59,7 @@ class Candidate(NamedTuple):
 
 
 def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
-    """Return the cost of every episode for the search, ``(episodes,)``: its mean cost, or with likelihood (1) as a
-    factor.
-    """
+    """Return the cost of every episode for the search, ``(episodes,)``: its mean cost, or (1) with likelihood."""
     keywords, make = candidate.tunable.apply(candidate.values)
     cls, control = candidate.problem.task, candidate.tunable.control
     model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
@@ -85,7 +83,7 @@ def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy
 
 
 def geometric_cost(costs: numpy.ndarray) -> float:
-    """Return the geometric mean of the costs of episodes."""
+    """Return the geometric mean of episodes' costs."""
     return float(numpy.exp(numpy.log(costs).mean()))
 
 
@@ -115,7 +113,7 @@ class Search:
 
 
 class _Generations:
-    """Candidates of a search, and the best of them so far.
+    """Candidates of a search, evaluated within the budget, and the best of them so far.
 
     Args:
         tunable: declaration of the searched values.
@@ -131,7 +129,7 @@ class _Generations:
         self.best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
 
     def cost(self, vector: numpy.ndarray) -> float:
-        """Return the cost of a candidate; infinite when the budget is spent."""
+        """Return the cost of a vector of candidate values; infinite when the search's budget is spent."""
         if self.spent >= self.allowed:
             return math.inf
         values = dict(zip(self.tunable.limits, map(float, vector), strict=True))
@@ -141,7 +139,7 @@ class _Generations:
         return cost
 
     def run(self, population: int, generator: numpy.random.Generator) -> dict[str, float]:
-        """Run generations until the budget is spent; return the best values."""
+        """Run differential evolution from a population until the budget is spent; return the best vector."""
         from scipy.optimize import differential_evolution
 
         limits = list(self.tunable.limits.values())
@@ -162,7 +160,7 @@ class _Generations:
 
 
 def _scenario(problem: Problem, name: str | None) -> Scenario:
-    """Return the scenario of a search.
+    """Return the scenario of a search by its name; None: the default one.
 
     Raises:
         ValueError: if it is held out.
@@ -184,16 +182,17 @@ def tune(
     workers: Workers | None = None,
     store: Store | None = None,
 ) -> Tuned:
-    """Search a policy's values.
+    """Search the values of a policy or estimator on training episodes, and return the best ones.
 
     Args:
         problem: problem of the policy.
-        policy: name of a tunable one.
+        policy: name of a tunable policy or estimator.
         search: options of the search.
-        progress: called with the number of environment steps done.
+        progress: function that is called with the number of environment steps done.
         workers: processes that share the episodes of a candidate; candidates run one after another, since the search
             uses the results of each. Default: this process.
-        store: stores the costs of candidates until the search has ended, so that a second call continues an interrupted
+        store: storage for the costs of candidates until the search has ended, so that a second call continues an
+            interrupted
             search: it evaluates the same candidates. Costs of a user's environment are not stored, since its code may
             have changed. Default: no costs are stored.
 
@@ -246,7 +245,7 @@ def tune(
 
 
 def _search_content(problem: Problem, search: Search, tunable: Tunable, scenario: Scenario) -> list[Any]:
-    """Return everything that determines the cost of a candidate in addition to its values and the code."""
+    """Return what determines a candidate's cost beside values and code, as the key of stored costs."""
     limited = {name: list(limit) for name, limit in tunable.limits.items()}
     how = [search.seed, search.episodes, search.backend, tunable.likelihood]
     return [problem.id, scenario.name, limited, dict(tunable.start), *how]

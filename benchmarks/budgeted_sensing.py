@@ -36,7 +36,7 @@ def interval(values: Any, digits: int = 3) -> str:
 
 
 def episode_rows(scenario: str, competitors: dict[str, Any]) -> list[list[str]]:
-    """Return the costs of all policies in a scenario, over those of the rival on the same noise."""
+    """Return table rows: cost of each policy in a scenario, relative to the rival's on the same noise."""
     dataset = filtergym.evaluate(
         sensing.BudgetedSensing.id, competitors, scenario=scenario, episodes=EPISODES[scenario]
     )
@@ -55,7 +55,7 @@ def episode_rows(scenario: str, competitors: dict[str, Any]) -> list[list[str]]:
 
 
 def spaced_costs(R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
-    """Return the settled mean squared error of a target that is looked at every 1, 2, ... seconds, ``(GAPS, ...)``."""
+    """Return the steady-state mean squared error of a target measured every 1, 2, ... seconds, ``(GAPS, ...)``."""
     found = []
     for gap in range(1, GAPS + 1):
         P, total, seconds = _begun(R), 0.0, 0
@@ -70,7 +70,7 @@ def spaced_costs(R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
 
 
 def relaxed_bound(costs: numpy.ndarray) -> numpy.ndarray:
-    """Return the least mean cost of targets that share one look a second, ``(N,)``: the largest over the multiplier.
+    """Return a lower bound ``(N,)`` on the mean cost of targets that share one measurement a second.
 
     Args:
         costs: costs of each target by the seconds between its looks, ``(GAPS, 4, N)``.
@@ -82,7 +82,7 @@ def relaxed_bound(costs: numpy.ndarray) -> numpy.ndarray:
 
 
 def scheduled_costs(policy: Any, R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean cost of a policy on covariances alone, ``(N,)``."""
+    """Return the mean cost of a policy when only covariances are simulated, ``(N,)``."""
     P, total, waited = _begun(R), 0.0, 0.0 * R
     for second in range(SETTLED + COUNTED):
         P, waited = sensing.later(P, agility), waited + 1.0
@@ -100,7 +100,7 @@ def _begun(R: numpy.ndarray) -> numpy.ndarray:
 
 
 def schedule_rows(scenario: str, count: int = 500) -> list[list[str]]:
-    """Return the costs of policies over the bound, on covariances alone."""
+    """Return table rows: cost of each policy relative to the bound, when only covariances are simulated."""
     parameters = sensing.BudgetedSensing.scenarios[scenario].parameters
     model = make_model(sensing.BudgetedSensing, "beam", backend="numpy", **parameters)
     own, rng = model.task.parameters, numpy.random.default_rng(0)
@@ -119,7 +119,7 @@ def schedule_rows(scenario: str, count: int = 500) -> list[list[str]]:
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the tables of episodes and of covariances."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

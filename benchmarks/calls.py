@@ -54,7 +54,7 @@ Figures = Iterator[tuple[str, float]]
 def seconds_of(
     call: Callable[[], object], count: int, clock: Callable[[], float] = time.process_time
 ) -> float:
-    """Return the seconds of one of ``count`` calls."""
+    """Return the mean seconds of a call, over ``count`` calls."""
     begin = clock()
     for _ in range(count):
         call()
@@ -62,7 +62,7 @@ def seconds_of(
 
 
 def measure_single() -> Figures:
-    """Step and reset single environments, and Gymnasium's own."""
+    """Return the times of ``step`` and ``reset`` of single environments, and of Gymnasium's own."""
     import gymnasium
 
     import filtergym
@@ -89,7 +89,7 @@ def measure_single() -> Figures:
 
 
 def measure_vectors() -> Figures:
-    """Step vectors with one thread and with two, and a wide one."""
+    """Return the times of ``step`` of vector environments, with one thread and with two, and of a wide one."""
     import gymnasium
 
     import filtergym
@@ -117,7 +117,7 @@ def measure_vectors() -> Figures:
 
 
 def measure_live() -> Figures:
-    """Update filters in a loop, and those of filterpy."""
+    """Return the times of ``update`` of running filters, and of filterpy's."""
     import numpy
     from filterpy.kalman import IMMEstimator, KalmanFilter
 
@@ -162,7 +162,7 @@ def measure_live() -> Figures:
 
 
 def child_cost(code: str, folder: str) -> tuple[float, float]:
-    """Return processor seconds and peak MB of a process of this Python that runs some code in a folder."""
+    """Run code in a process of this Python in a folder; return its processor seconds and peak memory, MB."""
     # Not getrusage of children: its peak is the largest of all so far.
     program = (
         code + "\nimport re, time, pathlib\n"
@@ -179,7 +179,7 @@ def child_cost(code: str, folder: str) -> tuple[float, float]:
 
 
 def measure_start() -> Figures:
-    """Make, reset and step in a process of its own, with compiled code in the cache."""
+    """Return the processor times of processes that make, reset and step an environment, with a full code cache."""
     code = "import gymnasium\n{more}env = gymnasium.make({id!r}); env.reset(); env.step(env.action_space.sample())"
     ids = {"CartPole": "CartPole-v1"} | {k: f"filtergym/{v}-v0" for k, v in ENVIRONMENTS.items()}
     for letter, id in ids.items():
@@ -214,7 +214,7 @@ TRACK = "filtergym/ManeuveringTarget-v0"
 
 
 def measure_logs(rows: Sequence[int]) -> Figures:
-    """Judge logs and evaluate episodes, in increasing numbers."""
+    """Return time and memory of ``advise`` and ``evaluate`` over logs and episodes of increasing number."""
     policies = [word for name in COMPETITORS for word in ("--policy", name)]
     log = ["evaluate", TRACK, "--recording", "truth.csv", "--speeds", "0.0001,100000", "--policy"]
     for count in rows:
@@ -252,7 +252,7 @@ def measure(section: str, rows: Sequence[int]) -> Figures:
 
 
 def main() -> None:
-    """Read the command line, measure in processes of their own, and print the table."""
+    """Read the command line, measure in separate processes, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

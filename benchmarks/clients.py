@@ -73,7 +73,7 @@ def random_steps(env: Any) -> Portion:
 
 
 def make_training_portion(model: Any) -> Portion:
-    """Run a model of Stable-Baselines3, which collects steps and learns."""
+    """Return a portion in which a model of Stable-Baselines3 collects steps and learns."""
 
     def portion() -> int:
         model.learn(PORTION * model.n_envs)
@@ -210,7 +210,7 @@ def minari_single(id: str) -> Portion:
     names = iter(range(10**9))
 
     def portion() -> int:
-        """Record two episodes and read them."""
+        """Record two episodes with Minari, read them, and return the number of steps."""
         env = minari.DataCollector(gymnasium.make(id))
         for _ in range(2):
             env.reset()
@@ -262,7 +262,7 @@ CLIENTS: dict[str, tuple[str, str, Callable[[str], Portion]]] = {
 
 
 def install(name: str) -> None:
-    """Make the virtual environment of a client."""
+    """Create the virtual environment of a client and install its packages."""
     folder = ENVIRONMENTS / name
     print(f"installing {name} into {folder.relative_to(ROOT)}", flush=True)
     venv.create(folder)  # without pip: this environment's serves both
@@ -277,13 +277,13 @@ def install(name: str) -> None:
 
 
 def python_of(name: str) -> str:
-    """Return the Python that runs a client: its own, or this one."""
+    """Return the path of the Python that runs a client: of its virtual environment, or this one."""
     own = ENVIRONMENTS / name / "bin" / "python"
     return str(own) if own.exists() else sys.executable
 
 
 def measure(client: str, id: str) -> dict[str, Any]:
-    """Return the steps per second of a client in an environment, or the reason of a failure."""
+    """Return the steps per second of a client in an environment, or the reason of its failure, by name."""
     _, distribution, rollouts = CLIENTS[client]
     try:
         version = importlib.metadata.version(distribution)
@@ -304,7 +304,7 @@ def measure(client: str, id: str) -> dict[str, Any]:
 
 
 def measure_in_client(client: str, id: str) -> dict[str, Any]:
-    """Run :func:`measure` in the client's own Python."""
+    """Return the result of :func:`measure`, run in the client's own Python."""
     command = [python_of(CLIENTS[client][0]), __file__, "--measure", client, "--environment", id]
     try:
         done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LIMIT, cwd=ROOT)
@@ -318,7 +318,7 @@ def measure_in_client(client: str, id: str) -> dict[str, Any]:
 
 
 def table(clients: list[str], ids: list[str]) -> None:
-    """Print the table in Markdown, row by row."""
+    """Measure clients in environments, and print the table in Markdown, row by row."""
     names = [id.partition("/")[2].rpartition("-v")[0] for id in ids]
     print("| steps/s | version |", " | ".join(names), "|")
     print("|---|---|" + "---|" * len(ids))
@@ -340,7 +340,7 @@ def table(clients: list[str], ids: list[str]) -> None:
 
 
 def recipes() -> None:
-    """Print the last line of every recipe's output, and its time."""
+    """Run every recipe, and print the last line of its output and its time."""
     print("| recipe | seconds | prints |\n|---|---|---|")
     for file in sorted(RECIPES.glob("with_*")):
         python = python_of(file.stem.removeprefix("with_"))

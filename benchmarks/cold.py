@@ -58,13 +58,13 @@ class Cost(NamedTuple):
     """Time of a process."""
 
     processor: float
-    """Seconds."""
+    """Processor time, s."""
     wall: float
-    """Seconds."""
+    """Elapsed time, s."""
 
 
 def commands(quick: bool) -> dict[str, list[str]]:
-    """Return the commands by their names in the table."""
+    """Return the words of each measured command, by its name in the table."""
     front_door = [sys.executable, "-m", "filtergym"]
     found = {
         "make and first step, TightlyCoupledNavigation": [
@@ -88,7 +88,7 @@ def commands(quick: bool) -> dict[str, list[str]]:
 
 
 def measure(command: Sequence[str], home: Path) -> Cost:
-    """Run a command with a folder as home.
+    """Run a command with a folder as the user's home, and return its time.
 
     Raises:
         RuntimeError: if it fails.
@@ -112,7 +112,7 @@ def measure(command: Sequence[str], home: Path) -> Cost:
 
 
 def row(name: str, cold: Cost, warm: Cost) -> list[str]:
-    """Return a row of the table."""
+    """Return the table row of a command: times with an empty and with a full cache."""
     seconds = [f"{value:.1f}" for value in (cold.processor, warm.processor)]
     wall = [f"{value:.1f}" for value in (cold.wall, warm.wall)]
     return [name, *seconds, f"{cold.processor / warm.processor:.2f}", *wall]
@@ -135,7 +135,7 @@ def write_record(rows: Sequence[Sequence[str]]) -> None:
 
 
 def main() -> None:
-    """Measure, print and write."""
+    """Measure the commands, print the table, and write the record."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

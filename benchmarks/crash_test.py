@@ -24,7 +24,7 @@ COLUMNS = ["", "passed", "degraded", "failed", "degraded under", "failed under"]
 
 
 def row(name: str, findings: Sequence[Finding]) -> list[str]:
-    """Return the row of the table."""
+    """Return a competitor's row of the table: counts of verdicts, and the alterations that it did not pass."""
     by_verdict = {
         verdict: [one.alteration for one in findings if one.verdict == verdict]
         for verdict in ("passed", "degraded", "failed")
@@ -34,7 +34,7 @@ def row(name: str, findings: Sequence[Finding]) -> list[str]:
 
 
 def main() -> None:
-    """Test all competitors and print the table."""
+    """Run the crash test of all competitors of an environment, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

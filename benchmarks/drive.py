@@ -50,7 +50,7 @@ LEVER = (0.0, -0.05, 0.0)
 DELAY = 0.125
 """Delay of the logger's time tags of the IMU, s; the repository's."""
 RTK_POSITION, RTK_VELOCITY = 0.02, 0.06
-"""Standard deviations of its positions and velocities, of each axis, m and m/s; close to the reported ones."""
+"""Standard deviations of RTK's positions, m, and velocities, m/s, of each axis; close to the reported ones."""
 ALIGNMENT = 30.0
 """Time from the end of the standstill to the first window, s: some turns, after which the heading is known."""
 MEASUREMENTS = 80
@@ -66,7 +66,8 @@ PARAMETERS = {
 }
 """Parameters of the environment. Fixes come as often as RTK, with the environment's default deviation, 1.41 m. The
 levels of the INS errors are the rounded result of :func:`fit_levels`: no constant and no white part is detectable, and
-of the coloured one ``coloured^2 / correlation_time`` is better determined than each."""
+of the coloured one ``coloured^2 / correlation_time`` is better determined than each.
+"""
 
 
 def read_inertial(file: Path) -> Any:
@@ -133,7 +134,7 @@ def read_fixes(file: Path) -> Any:
 
 
 def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
-    """Align the INS at the standstill and aid it by RTK from there.
+    """Return the INS aligned at the standstill and aided by RTK from there.
 
     Args:
         inertial: result of :func:`read_inertial`.
@@ -147,7 +148,7 @@ def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
 
 
 def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
-    """Cut a drive into recordings of the environment.
+    """Return a drive cut into recordings of LooselyCoupledNavigation.
 
     Args:
         inertial: result of :func:`read_inertial`.
@@ -181,10 +182,10 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
 def dataset(
     truth: numpy.ndarray, ins: numpy.ndarray, fix: numpy.ndarray, deviation: float, starts: numpy.ndarray
 ) -> xarray.Dataset:
-    """Return the recordings in the form of files.
+    """Return recordings as a dataset in the format of recordings' files.
 
     Args:
-        truth: positions from the start of each window on, m, ``(episode, 1 + time, axis)``.
+        truth: true positions from the start of each window on, m, ``(episode, 1 + time, axis)``.
         ins: positions by the INS, same shape, m.
         fix: positions by the receiver from the first measurement on, m, ``(episode, time, axis)``.
         deviation: standard deviation of the fixes, m.
@@ -250,10 +251,10 @@ def ins_error_covariance(time: numpy.ndarray, levels: dict[str, float]) -> numpy
 def fit_levels(
     recorded: xarray.Dataset, correlation_time: float | None = None
 ) -> tuple[dict[str, float], float]:
-    """Return the levels of the INS errors under which fixes less INS positions are likeliest, and their log-likelihood
-    for each of them.
+    """Return the maximum-likelihood levels of the INS errors by name, and the log-likelihood of each difference.
 
-    The receiver's noise is included: relevant are the errors that a filter can detect through it.
+    The differences are fixes less INS positions. The receiver's noise is included: relevant are the errors that a
+    filter can detect through it.
 
     Args:
         recorded: result of :func:`recordings`.
@@ -284,7 +285,7 @@ def fit_levels(
 
 
 def report(recorded: xarray.Dataset) -> None:
-    """Print the growth of the INS error, and that of the environment's model."""
+    """Print the growth of the recorded INS error over time, and that of the environment's model."""
     found = abs(errors(recorded))
     time = recorded["seconds"].to_numpy()[0]
     covariance = ins_error_covariance(time, PARAMETERS)
@@ -336,7 +337,7 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
 
 
 def main() -> None:
-    """Write the file from a checkout."""
+    """Read a checkout of the data, and write the recordings and the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

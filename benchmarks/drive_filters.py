@@ -43,7 +43,7 @@ COMPETITORS = (
 
 
 def one_axis(drive: Recording, axis: int) -> Recording:
-    """Return a recording of one axis, as if the vehicle moved along it."""
+    """Return a recording reduced to one axis, as if the vehicle moved along it."""
     if drive.truth is None:
         raise ValueError("the drive needs its truth")
     mean, covariance = drive.initial["mean"], drive.initial["covariance"]
@@ -60,7 +60,7 @@ def one_axis(drive: Recording, axis: int) -> Recording:
 
 
 def main() -> None:
-    """Print the errors of the position, m, with their intervals, lowest first."""
+    """Evaluate filters and agents on the drive, and print position errors, m, with intervals, lowest first."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("drive", type=Path, help="file of recordings that drive.py wrote")
     drive = filtergym.read_recording(parser.parse_args().drive, ID)

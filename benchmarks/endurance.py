@@ -31,7 +31,7 @@ CHECKED_EVERY = 10
 
 
 def actions(space: gymnasium.Space, generator: numpy.random.Generator, size: int) -> numpy.ndarray:
-    """Return the random actions, half of the continuous ones on the edge of the space."""
+    """Return ``size`` random actions, half of the continuous ones on the edge of the space."""
     if isinstance(space, gymnasium.spaces.Discrete):
         return generator.integers(space.n, size=size)
     assert isinstance(space, gymnasium.spaces.Box)
@@ -42,8 +42,8 @@ def actions(space: gymnasium.Space, generator: numpy.random.Generator, size: int
     return numpy.where(on_edge, edge, inside).astype(space.dtype)
 
 
-def lost_covariances(covariance: numpy.ndarray) -> int:
-    """Count the ``(n, n, N)`` covariances that, scaled to correlations, have an eigenvalue below -1e-9."""
+def count_indefinite(covariance: numpy.ndarray) -> int:
+    """Return the number of covariances ``(n, n, N)`` that, scaled to correlations, have an eigenvalue below -1e-9."""
     P = numpy.moveaxis(covariance[:, :, numpy.isfinite(covariance).all((0, 1))], -1, 0)
     sigma = numpy.sqrt(numpy.maximum(numpy.einsum("nii->ni", P), 1e-300))
     correlations = P / sigma[:, :, None] / sigma[:, None, :]
@@ -57,7 +57,7 @@ def lost_covariances(covariance: numpy.ndarray) -> int:
 def endure(
     id: str, control: str, scenario: str, steps: int, size: int, seed: int
 ) -> tuple[int, dict[str, int]]:
-    """Step one combination; return the number of steps, and the numbers of failures by kind."""
+    """Step an environment under random actions; return the number of steps, and counts of failures by kind."""
     env: Any = gymnasium.make_vec(
         id, num_envs=size, control=control, scenario=scenario, decision_interval=1
     ).unwrapped
@@ -72,12 +72,12 @@ def endure(
         finite &= numpy.isfinite(covariance).all((0, 1))
         failed["not finite"] += int((~finite).sum())
         if done // size % CHECKED_EVERY == 0:
-            failed["lost covariances"] += lost_covariances(covariance)
+            failed["lost covariances"] += count_indefinite(covariance)
     return done, failed
 
 
 def main() -> None:
-    """Step all selected combinations and print the table."""
+    """Run the endurance test of all selected environments, controls and scenarios, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--environment", choices=sorted(catalogue()), help="default: all of them")
     parser.add_argument("--steps", type=int, default=1_000_000, help="of each environment")

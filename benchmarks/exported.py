@@ -111,7 +111,7 @@ class Size(NamedTuple):
 
 
 class Compilers(NamedTuple):
-    """Compilers of the files."""
+    """C compilers for the exported files."""
 
     own: str
     cross: list[str]
@@ -119,7 +119,7 @@ class Compilers(NamedTuple):
 
 
 def size_of(file: Path, compilers: Compilers) -> Size:
-    """Return the size of an exported filter, compiled to be small by gcc."""
+    """Return the bytes of an exported filter, compiled by gcc for size."""
     code = _code_bytes(file, [compilers.own, "-fstack-usage"])
     usage = file.with_suffix(".small.su").read_text(encoding="utf-8").splitlines()
     stack = max(int(line.split("\t")[1]) for line in usage)
@@ -139,7 +139,7 @@ def _code_bytes(file: Path, compiler: list[str]) -> int:
 def run_in_c(
     name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compilers: Compilers
 ) -> tuple[float, float, Writer, Size]:
-    """Return the largest difference, in standard deviations, nanoseconds an update, the exporter, and the size."""
+    """Run a filter in C over test vectors; return largest difference in deviations, ns an update, writer, size."""
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
     batch = BATCH.format(
@@ -174,7 +174,7 @@ def run_in_c(
 
 
 def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
-    """Return the nanoseconds an update of the same program in LLVM's code, one of many lanes."""
+    """Return the nanoseconds of an update in LLVM's code of the same program, a lane of many."""
     program = traced.update
     # Input and output must not be the same memory: the state after an update goes elsewhere.
     after = max(STATE, MEASUREMENT, ANSWER, ESTIMATE, SHOWN, 3) + 1
@@ -196,7 +196,7 @@ def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
 
 
 def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
-    """Return the nanoseconds an update of the competitor itself on NumPy's arrays, one track."""
+    """Return the nanoseconds of an update of the competitor in NumPy, for one track."""
     kind = kind_of(maker)
     keywords = getattr(maker, "task_keywords", {})
     plain = make_model(problem.task, control_of(maker, None, problem.task, name), **keywords)
@@ -214,7 +214,7 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
 
 
 def least_time(call: Any, count: int) -> float:
-    """Return the least nanoseconds of a call, over runs of some calls."""
+    """Return the nanoseconds of a call, the least mean over several runs of ``count`` calls."""
     call()
     times = []
     for _ in range(7):
@@ -228,7 +228,7 @@ def least_time(call: Any, count: int) -> float:
 def lines(
     problem: Problem, names: list[str], episodes: int, measurements: int, compilers: Compilers
 ) -> Iterator[dict[str, Any]]:
-    """Yield a line for each competitor."""
+    """Yield the figures of each competitor's export by name, or the reason why it cannot be exported."""
     for name in names:
         maker = find_competitor(problem, name).maker
         line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
@@ -275,7 +275,7 @@ COST = (
 
 
 def summary(found: list[dict[str, Any]]) -> str:
-    """Return two tables of Markdown, a line for each environment: differences; and costs, median and range."""
+    """Return two tables in Markdown, a row for each environment: differences; and costs, median and range."""
     accuracy, cost = ([f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"] for names in (ACCURACY, COST))
     for environment in dict.fromkeys(line["environment"] for line in found):
         own = [line for line in found if line["environment"] == environment]

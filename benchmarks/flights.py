@@ -47,7 +47,7 @@ METRICS = {
     "win_rate": ("wins", 100.0),
     "anees": ("anees", 1.0),
 }
-"""Records in the table, with their columns and units."""
+"""Metrics in the table, with their columns and units."""
 
 
 def main() -> None:
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def sets(smoothing: float) -> dict[str, Flights]:
-    """Return the sets of flights by their names, the largest first."""
+    """Return the sets of flights of the package ``traffic`` by name, the largest first."""
     own: dict[str, list] = {}
     rest: dict[str, list] = {}
     for name, file in traffic_samples().items():

@@ -48,7 +48,7 @@ class Cell(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Ratio as text, in per cent."""
+        """Cost against the paper's with its interval, per cent, as text."""
         return "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100.0 * x for x in self.ratio))
 
 
@@ -69,7 +69,7 @@ def fly(
     split: str,
     cell: tuple[str, str, dict[str, Any]],
 ) -> dict[str, Cell]:
-    """Return the result of each competitor in a cell."""
+    """Run competitors in a scenario or under a stress, and return each one's result by name."""
     name, scenario, keywords = cell
     run = problem.evaluate(makers, scenario, episodes, split=split, **keywords)
     paper, bootstrap = mean_cost(run, problem.baselines.compared_paper), Bootstrap(run.sizes["episode"])
@@ -85,7 +85,7 @@ def fly(
 
 
 def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
-    """Return the paper's algorithm, the gate's fallback, and each agent alone and behind the gate."""
+    """Return the makers of paper's algorithm, gate's fallback, and each agent alone and gated, by name."""
     fallback = problem.baselines.fallback or problem.paper
     first = dict.fromkeys([problem.baselines.compared_paper, fallback])
     makers = {name: problem.competitor(name) for name in first}
@@ -97,7 +97,7 @@ def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
 
 
 def summary(problem: Problem, policy: str, cells: list[Cell]) -> str:
-    """Return a row of the table."""
+    """Return a competitor's row of the table: cells harmed, worst cell and its cost, range of ANEES, lost tracks."""
     worst = max(cells, key=lambda cell: cell.ratio[0])
     anees = [cell.anees for cell in cells]
     outside = sum(not CONSISTENT[0] <= value <= CONSISTENT[1] for value in anees)

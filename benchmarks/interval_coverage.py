@@ -48,7 +48,7 @@ class Pool(NamedTuple):
 
 
 def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> numpy.ndarray:
-    """Return the mean cost of every episode of the validation split, ``(episodes,)``."""
+    """Return a competitor's mean cost of every episode of the validation split, ``(episodes,)``."""
     problem = problem_of(f"filtergym/{environment}-v0")
     split = "validation" if problem.task.scenarios[scenario].training else "test"
     experiment = problem.experiment(scenario, episodes, 1, split)
@@ -62,7 +62,7 @@ def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> 
 
 
 def truths(pool: Pool) -> list[float]:
-    """Return every statistic of all episodes, in the order of ``STATISTICS``."""
+    """Return the true value of every statistic: that of all episodes, in the order of ``STATISTICS``."""
     ratio = pool.own / pool.paper
     return [
         float(numpy.expm1(numpy.log(ratio).mean())),
@@ -72,7 +72,7 @@ def truths(pool: Pool) -> list[float]:
 
 
 def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
-    """Return every statistic of some episodes with its interval, in the order of ``STATISTICS``."""
+    """Return the estimate and interval of every statistic from a sample, in the order of ``STATISTICS``."""
     own, paper = bootstrap.means(numpy.stack([pool.own, pool.paper], axis=1)).T
     return [
         bootstrap.geometric_difference(pool.own, pool.paper),
@@ -82,7 +82,7 @@ def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
 
 
 def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
-    """Return the share of intervals from a number of episodes that contain the truth, for each statistic, as text."""
+    """Return, for each statistic, the share of intervals that contain the truth, as text."""
     generator, bootstrap = numpy.random.default_rng(number), Bootstrap(number)
     true = numpy.array(truths(pool))
     below, above = numpy.zeros(len(true)), numpy.zeros(len(true))

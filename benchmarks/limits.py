@@ -30,7 +30,7 @@ SIGNIFICANT = 3.0
 
 
 class Nearest(NamedTuple):
-    """Comparison of the competitors of a scenario with the reference."""
+    """The competitor of least cost in a scenario, compared with the reference."""
 
     environment: str
     scenario: str
@@ -47,7 +47,7 @@ class Nearest(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Verdict on the reference, as text."""
+        """Verdict, as text, whether the reference is a limit in this scenario."""
         return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
 
 
@@ -60,7 +60,7 @@ def names_without_random(problem: Problem) -> list[str]:
 def episode_costs(
     problem: Problem, scenario: str, names: Sequence[str], episodes: int, seed: int
 ) -> dict[str, numpy.ndarray]:
-    """Return the mean cost of every episode by name, over the same episodes."""
+    """Return the mean cost of every episode, ``(episodes,)``, of each competitor by name."""
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
@@ -76,14 +76,14 @@ def episode_costs(
 def nearest(
     problem: Problem, scenario: str, episodes: int, seed: int = 1, names: Sequence[str] = ()
 ) -> Nearest:
-    """Compare competitors with the reference in a scenario.
+    """Return the competitor of least cost in a scenario, compared with the reference.
 
     Args:
         problem: the environment.
         scenario: name of the scenario.
         episodes: number of episodes of each competitor.
         seed: number of the experiment.
-        names: names of competitors; none: all ranked ones.
+        names: names of competitors; empty: all ranked ones.
     """
     reference = problem.baselines.score_reference
     costs = episode_costs(

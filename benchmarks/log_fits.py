@@ -35,11 +35,11 @@ TRUE = {
 KINDS = "clean", "outliers", "short", "irregular"
 SEARCHED = "acceleration_quiet", "ratio", "leave_quiet", "leave_noisy", "noise_scale"
 SEQUENCES = 100
-"""Number of sequences of modes that are kept from one measurement to the next."""
+"""Number of sequences of modes that remain from one measurement to the next."""
 
 
 def accelerations(family: str, count: int, rng: numpy.random.Generator) -> numpy.ndarray:
-    """Return the size of the acceleration in every interval, m/s^2."""
+    """Return the standard deviation of the acceleration in every interval, m/s^2, for a family of models."""
     true = TRUE[family]
     if family == "constant-velocity":
         return numpy.full(count, true["acceleration"])
@@ -51,7 +51,7 @@ def accelerations(family: str, count: int, rng: numpy.random.Generator) -> numpy
 
 
 def simulated_log(folder: Path, family: str, measurements: int, seed: int) -> Recording:
-    """Write a log, and read it."""
+    """Simulate a log of a family of models, write it to a file, and return the recording read from it."""
     rng, kind = numpy.random.default_rng(seed), KINDS[seed % len(KINDS)]
     count = measurements // 3 if kind == "short" else measurements
     steps = T * (rng.uniform(0.5, 1.5, count) if kind == "irregular" else numpy.ones(count))
@@ -74,9 +74,10 @@ def simulated_log(folder: Path, family: str, measurements: int, seed: int) -> Re
 
 
 def likelihood_of_sequences(recording: Recording, values: dict[str, float]) -> float:
-    """Return the log-likelihood of a log without gaps under ``imm-two``, nats. Each sequence of modes has a Kalman
-    filter; the ``SEQUENCES`` likeliest are kept and none are merged. With a ratio of one it is that of one Kalman
-    filter.
+    """Return the log-likelihood of a log without gaps under the switching model of ``imm-two``, nats.
+
+    Each sequence of modes has a Kalman filter; the ``SEQUENCES`` likeliest stay and none are merged. With a ratio of
+    one it is that of one Kalman filter.
 
     Args:
         recording: recording of one track.

@@ -35,7 +35,7 @@ T, SIGMA, MISSED, SAVED_EVERY = 4.0, 100.0, 0.1, 500
 
 
 def write_log(path: Path, tracks: int, plots: int) -> numpy.ndarray:
-    """Write tracks of a target that wanders, and return the rows: track, time, x, y."""
+    """Write a log of random-walk tracks, and return its rows: track, time, x, y."""
     rng = numpy.random.default_rng(0)
     rows = []
     for track in range(tracks):
@@ -53,7 +53,7 @@ def write_log(path: Path, tracks: int, plots: int) -> numpy.ndarray:
 
 
 def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> tuple[int, int]:
-    """Count updates, and those whose estimate differs from that of the replay in any bit."""
+    """Return the number of updates of a running filter, and of those that differ from the replay in any bit."""
     replayed = filtergym.evaluate(
         ID, name, recording, episodes=len(recording.names), tracks=True, sampling_interval=T
     )
@@ -78,14 +78,14 @@ def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> 
 
 
 def own_update(name: str, backend: str) -> Callable[[float, float, float], object]:
-    """Return an update of a running filter."""
+    """Return a function that updates a running filter of this package with time, x and y."""
     filter = filtergym.online(ID, name, backend=backend)
     filter.start([2e4, 3e4, 0.0, 0.0], numpy.diag([1e4, 1e4, 600.0, 600.0]))
     return lambda seconds, x, y: filter.update(seconds, x=x, y=y)
 
 
 def own_update_of_two() -> Callable[[float, float, float], object]:
-    """Return an update of a Kalman filter of a user's model."""
+    """Return a function that updates the running Kalman filter of a user's model with time, x and y."""
     filtergym.state_space(
         "mine/OfTwo-v0", f=[[1, 1.0], [0, 1]], h=[[1, 0]], Q=[[0.25, 0.5], [0.5, 1.0]], R=[[25.0]],
         mean=[0, 10], covariance=[[100, 0], [0, 25]],
@@ -96,7 +96,7 @@ def own_update_of_two() -> Callable[[float, float, float], object]:
 
 
 def filterpy_update_of_two() -> Callable[[float, float, float], object]:
-    """Return an update of filterpy's Kalman filter of the same model."""
+    """Return a function that updates filterpy's Kalman filter of the same model with time, x and y."""
     from filterpy.kalman import KalmanFilter
 
     one = KalmanFilter(dim_x=2, dim_z=1)
@@ -111,7 +111,7 @@ def filterpy_update_of_two() -> Callable[[float, float, float], object]:
 
 
 def filterpy_update() -> Callable[[float, float, float], object]:
-    """Return an update of filterpy's IMM of two Kalman filters."""
+    """Return a function that updates filterpy's IMM of two Kalman filters with time, x and y."""
     from filterpy.kalman import IMMEstimator, KalmanFilter
 
     filters = []
@@ -136,7 +136,7 @@ def filterpy_update() -> Callable[[float, float, float], object]:
 
 
 def stone_soup_update() -> Callable[[float, float, float], object]:
-    """Return an update of Stone Soup's Kalman filter."""
+    """Return a function that updates Stone Soup's Kalman filter with time, x and y."""
     from datetime import datetime, timedelta
 
     from stonesoup.models.measurement.linear import LinearGaussian
@@ -167,7 +167,7 @@ def stone_soup_update() -> Callable[[float, float, float], object]:
 def latencies(
     cases: Mapping[str, Callable[[float, float, float], object]], updates: int
 ) -> dict[str, numpy.ndarray]:
-    """Return processor seconds of each update of each filter, after a warm-up."""
+    """Return the processor seconds of each update, ``(updates,)``, of each filter by name, after a warm-up."""
     rng = numpy.random.default_rng(1)
     plots = numpy.array([2e4, 3e4]) + SIGMA * rng.standard_normal((updates + ROUND, 2))
     found = {name: numpy.empty(len(plots)) for name in cases}

@@ -42,19 +42,19 @@ NAME = "public_optimised"
 
 
 class Problem(NamedTuple):
-    """Model of the filters."""
+    """A problem of the comparison: model of the filters, prior, and test set."""
 
     name: str
     id: str
     f: numpy.ndarray | int
-    """A matrix, or the order of the series."""
+    """Transition matrix, or the order of KalmanNet's Taylor series."""
     h: numpy.ndarray
     start: float
     """Value of every entry of the initial mean."""
     certainty: float
-    """Value of every variance of its error."""
+    """Value of every variance of the initial mean's error."""
     stored: bool = False
-    """Whether it is judged on KalmanNet's stored set."""
+    """Whether it is evaluated on KalmanNet's stored test set."""
 
 
 F, H = public.F, public.H
@@ -67,14 +67,14 @@ PROBLEMS = (
 
 
 class ExtendedOptimised(okf.OKF):  # type: ignore[misc]
-    """The package's filter for KalmanNet's Taylor series of the attractor, linearised at the estimate."""
+    """OKF's filter for KalmanNet's Taylor series of the Lorenz attractor, linearised at the estimate."""
 
     def __init__(self, order: int, *args: Any, **keywords: Any) -> None:
         super().__init__(*args, **keywords)
         self.order = order
 
     def predict(self) -> None:
-        """Advance a time step: the series, and the derivative of each term by the product rule."""
+        """Predict mean and covariance over a time step by the series and its Jacobian."""
         x = self.x
         zero, one = torch.zeros((), dtype=x.dtype), torch.ones((), dtype=x.dtype)
         A = torch.stack([-10 * one, 10 * one, zero, 28 - x[2], -one, zero, x[1], zero, -8 / 3 * one]).reshape(
@@ -91,7 +91,7 @@ class ExtendedOptimised(okf.OKF):  # type: ignore[misc]
         self.P = F @ self.P @ F.T + okf.OKF.get_SPD(self.Q_D, self.Q_L)
 
     def estimate_noise(self, X: list[numpy.ndarray], Z: list[numpy.ndarray]) -> None:
-        """Start from the covariances of the residuals of the filters' model, as the package does for matrices."""
+        """Set Q and R to the covariances of the model's residuals over tracks X and measurements Z."""
         left = [x[1:] - numpy.stack(public.taylor(x[:-1].T, self.order), axis=1) for x in X]
         noises = (
             numpy.cov(numpy.concatenate(left).T),
@@ -104,7 +104,7 @@ class ExtendedOptimised(okf.OKF):  # type: ignore[misc]
 
 
 def make_filter(problem: Problem, folder: str) -> okf.OKF:
-    """Return the package's filter of a problem, untrained."""
+    """Return OKF's untrained filter for a problem."""
     n = len(problem.h)
     options = {
         "H": torch.tensor(problem.h),
@@ -118,7 +118,7 @@ def make_filter(problem: Problem, folder: str) -> okf.OKF:
 
 
 def estimates_of(model: okf.OKF, values: numpy.ndarray) -> numpy.ndarray:
-    """Return the estimates of the package's filter over tracks, ``(tracks, T, n)``."""
+    """Return the estimates of OKF's filter over tracks of measurements, ``(tracks, T, n)``."""
     found = numpy.empty((*values.shape[:2], model.dim_x))
     with torch.no_grad():
         for track, row in zip(values, found, strict=True):
@@ -131,9 +131,7 @@ def estimates_of(model: okf.OKF, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def optimise(problem: Problem, seed: int) -> dict[str, Any]:
-    """Train the package's filter, and compare it with ours; return Q, R, seconds and the largest difference of their
-    errors.
-    """
+    """Train OKF's filter, and compare it with ours; return Q, R, seconds and largest difference, by name."""
     torch.manual_seed(seed)
     recording = filtergym.record(problem.id, episodes=TRACKS, seed=seed, split="train", horizon=LENGTH)
     assert recording.truth is not None
@@ -153,12 +151,12 @@ def optimise(problem: Problem, seed: int) -> dict[str, Any]:
 
 
 def run_file(folder: Path, problem: Problem, seed: int) -> Path:
-    """Return the path of the result of a training run."""
+    """Return the path of the file with the result of a training run."""
     return folder / f"{problem.id.replace('/', '.')}.{seed}.json"
 
 
 def main() -> None:
-    """Train, judge and write the record."""
+    """Train all filters, evaluate them on the test episodes, and write the record."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -2,7 +2,7 @@
 
 python benchmarks/own_logs.py
 
-The machines and their models are docs/examples/own_logs. A filter that is fitted to one log is judged on ten others.
+The machines and their models are docs/examples/own_logs. A filter that is fitted to one log is evaluated on ten others.
 The limit is our filter with the factors on Q and R of least error on these ten, which are unknown beforehand.
 """
 
@@ -43,8 +43,8 @@ CANDIDATES = 40
 
 
 def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Filter GPS and odometry. Data sheets: GPS 3 m, odometry 0.2 m/s; Q by hand: white acceleration of 2 m/s^2 in a
-    second.
+    """Return filterpy's estimates from GPS and odometry. Data sheets: GPS 3 m, odometry 0.2 m/s; Q by hand: white
+    acceleration of 2 m/s^2 in a second.
     """
     kf, last = KalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([100.0, 100, 25, 25]), []
@@ -63,8 +63,8 @@ def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Filter a level gauge and a stick. Data sheets: gauge 2 cm, stick 1 cm; by hand: a rate that wanders by 0.02 m/h
-    in an hour, 5 cm of drift a day.
+    """Return filterpy's estimates from a level gauge and a stick. Data sheets: gauge 2 cm, stick 1 cm; by hand: a rate
+    that wanders by 0.02 m/h in an hour, 5 cm of drift a day.
     """
     kf, last = KalmanFilter(3, 1), 0.0
     kf.x, kf.P, found = np.array([10.0, 0, 0]), np.diag([0.01, 0.0025, 0.0025]), []
@@ -83,8 +83,8 @@ def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Filter pitch and roll. By hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad since the drone accelerates;
-    innovations wrapped.
+    """Return filterpy's estimates of pitch and roll. By hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad since the
+    drone accelerates; innovations wrapped.
     """
     kf, last = ExtendedKalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([0.01, 0.01, 0.0025, 0.0025]), []
@@ -105,8 +105,8 @@ def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def battery(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Filter the charge of a battery. Data sheets: current 50 mA, voltage 10 mV; Q by hand: a charge that wanders by
-    0.1 % and 1 mV in a minute.
+    """Return filterpy's estimates of a battery's charge. Data sheets: current 50 mA, voltage 10 mV; Q by hand: a charge
+    that wanders by 0.1 % and 1 mV in a minute.
     """
     kf, last = ExtendedKalmanFilter(2, 1), 0.0
     kf.x, kf.P, found = np.array([0.8, 0]), np.diag([0.01, 1e-4]), []
@@ -124,8 +124,8 @@ def battery(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def late_vision(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Filter late camera fixes. Data sheets: camera 2 cm, accelerometer 0.1 m/s^2; a late fix is moved on by the
-    velocity times its delay.
+    """Return filterpy's estimates from late camera fixes. Data sheets: camera 2 cm, accelerometer 0.1 m/s^2; a late fix
+    is moved on by the velocity times its delay.
     """
     kf, dt, late = KalmanFilter(3, 1, 1), 0.01, round(LATE / 0.01)
     kf.x, kf.P, found = np.zeros(3), np.diag([0.01, 0.1, 0.04]), []
@@ -148,7 +148,7 @@ BY_HAND = {one.__name__: one for one in (gps_odometry, level_gauge, pitch_roll, 
 
 
 def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the RMSE of the components that count, of every candidate and episode, ``(C, E)``."""
+    """Return the RMSE of the evaluated components, for every candidate of the factors and episode, ``(C, E)``."""
     episodes = len(recording.rows)
     spans = [Span(number, 0, int(rows)) for number, rows in enumerate(recording.rows)]
     windows = cut_windows(recording, task, spans, 0)
@@ -167,7 +167,7 @@ def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndar
 
 
 def limit(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
-    """Return the factors of the least error."""
+    """Return the factors on Q and R with the least error on a recording, by name."""
     rng, best, width = np.random.default_rng(0), np.zeros(len(names)), 2.0
     for _ in range(3):
         tried = best + width * rng.uniform(-1.0, 1.0, (CANDIDATES, len(names)))
@@ -177,7 +177,7 @@ def limit(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
 
 
 def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[str, float]) -> np.ndarray:
-    """Return the RMSE of each log with fixes that arrive late, ``(E,)``."""
+    """Return our filter's RMSE on each log with late fixes, ``(E,)``."""
     found = []
     for log in logs:
         seen = np.isfinite(log["camera"])
@@ -189,8 +189,8 @@ def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[st
 
 
 def processor_time(name: str, folder: Path) -> float:
-    """Return the processor time of the three commands of the page, which fit, judge and export, s."""
-    machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", used()
+    """Return the processor time of the page's three commands (fit, evaluate, export) for a machine, s."""
+    machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", children_time()
     for words in (
         ["advise", folder / f"{name}.csv", "--environment", machine, "--out", filter],
         [
@@ -209,11 +209,11 @@ def processor_time(name: str, folder: Path) -> float:
         subprocess.run(
             command, cwd=EXAMPLES, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True, capture_output=True
         )
-    return used() - before
+    return children_time() - before
 
 
-def used() -> float:
-    """Return the processor time of the processes that this one has waited for, s."""
+def children_time() -> float:
+    """Return the processor time of all finished child processes, s."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 
@@ -225,7 +225,7 @@ def problem_id(name: str) -> str:
 
 
 def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
-    """Return the columns of each recording of a table."""
+    """Return the columns by name of each recording in a CSV file."""
     table = np.genfromtxt(file, delimiter=",", names=True)
     return [
         {name: table[name][table["recording"] == number] for name in table.dtype.names}
@@ -234,7 +234,7 @@ def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
 
 
 def compare(name: str, folder: Path) -> list[list[str]]:
-    """Return the rows of the table of one machine."""
+    """Run all filters on one machine's logs, and return its rows of the table."""
     module = importlib.import_module(name)
     problem = problem_of(problem_id(name))
     log, judged = (read_recording(folder / f"{name}{part}.csv", problem.id) for part in ("", "_judged"))

@@ -20,7 +20,7 @@ COMPETITORS = (
 )  # fmt: skip
 
 
-def tree(root: int) -> list[int]:
+def process_tree(root: int) -> list[int]:
     """Return the process ids of a process and all its descendants, from /proc."""
     parents = {}
     for folder in Path("/proc").glob("[0-9]*"):
@@ -34,7 +34,7 @@ def tree(root: int) -> list[int]:
     return found
 
 
-def resident(processes: list[int]) -> float:
+def resident_memory(processes: list[int]) -> float:
     """Return the memory of processes together, GiB; shared memory counts once."""
     total = 0
     for process in processes:
@@ -47,13 +47,13 @@ def resident(processes: list[int]) -> float:
 
 
 def filtergym(*words: str) -> tuple[float, float, float]:
-    """Run a command; return its seconds, seconds of processors, and peak memory of all its processes together, GiB."""
+    """Run a ``filtergym`` command; return its seconds, processor seconds, and peak memory of its processes, GiB."""
     began, most = time.monotonic(), 0.0
     command = [sys.executable, "-m", "filtergym", *words]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while process.poll() is None:
-        most = max(most, resident(tree(process.pid)))
+        most = max(most, resident_memory(process_tree(process.pid)))
         time.sleep(0.5)
     if process.returncode:
         raise SystemExit(f"{' '.join(command)} ended with {process.returncode}")
@@ -63,7 +63,7 @@ def filtergym(*words: str) -> tuple[float, float, float]:
 
 
 def results(folder: Path) -> str:
-    """Return all results of a benchmark, without the command, which differs between the runs."""
+    """Return the text of a benchmark's results without its command, which differs between the runs."""
     return (folder / "results.json").read_text(encoding="utf-8").partition("\n")[2]
 
 
@@ -102,8 +102,8 @@ def command_of(process: int) -> str:
         return ""
 
 
-def killing(words: list[str]) -> None:
-    """Run on a cluster of two nodes; after some results kill a worker, then a node with all its processes."""
+def kill_nodes(words: list[str]) -> None:
+    """Run a command on a cluster of two nodes, and kill a worker, then a node, after some results."""
     import ray
     from ray.cluster_utils import Cluster
 
@@ -124,7 +124,7 @@ def killing(words: list[str]) -> None:
                 nonlocal done
                 before, done = done / total, done + measurements
                 if before < 0.2 <= done / total:
-                    own = [id for id in tree(os.getpid()) if "ray::_run_piece" in command_of(id)]
+                    own = [id for id in process_tree(os.getpid()) if "ray::_run_piece" in command_of(id)]
                     os.kill(own[0], signal.SIGKILL)
                     print("killed a worker", flush=True)
                 if before < 0.5 <= done / total:
@@ -154,7 +154,7 @@ def main() -> None:
     if asked.memory:
         memory(asked.memory, asked.jobs)
     elif asked.cluster:
-        killing(asked.words)
+        kill_nodes(asked.words)
     else:
         speed(asked.words or ["--full"], asked.jobs)
 

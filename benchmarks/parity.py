@@ -20,7 +20,7 @@ from filtergym.envs.engine.catalogue import catalogue
 
 
 class Parity(NamedTuple):
-    """Differences in one scenario under one control."""
+    """Largest differences of compiled steps from NumPy's in one scenario under one control."""
 
     environment: str
     control: str
@@ -32,14 +32,14 @@ class Parity(NamedTuple):
 
 
 def parity(id: str, control: str, scenario: str, episodes: int, decisions: int | None = None) -> Parity:
-    """Run episodes on both backends.
+    """Run episodes on both backends with the same actions, and return the largest differences.
 
     Args:
-        id: environment.
+        id: Gymnasium id.
         control: control of the random actions.
-        scenario: name.
+        scenario: name of the scenario.
         episodes: number of episodes, side by side.
-        decisions: decisions of each; default: whole episodes.
+        decisions: number of decisions of each episode; default: whole episodes.
     """
     envs = [
         gymnasium.make_vec(
@@ -72,7 +72,7 @@ def _difference(one: numpy.ndarray, other: numpy.ndarray) -> numpy.ndarray:
 
 
 def all_parities(ids: list[str], episodes: int) -> Iterator[Parity]:
-    """Yield the differences of every control in every scenario."""
+    """Yield the differences between backends of every control in every scenario of some environments."""
     for id in ids:
         for control in catalogue()[id].controls:
             for scenario in catalogue()[id].scenarios:
@@ -80,7 +80,7 @@ def all_parities(ids: list[str], episodes: int) -> Iterator[Parity]:
 
 
 def main() -> None:
-    """Read the command line."""
+    """Read the command line, run all comparisons, and print the table."""
     parser = argparse.ArgumentParser(description="Compiled steps against NumPy.")
     parser.add_argument("--environment", action="append", metavar="ID", help="only this one; may be repeated")
     parser.add_argument("--episodes", type=int, default=64, help="side by side (default 64)")

@@ -1,6 +1,6 @@
 """The peer of ManeuveringTarget's bank: filterpy's IMMEstimator over two 4-state Kalman filters, in a loop.
 
-The nearest equivalent in Python today: one estimator object for each target, stepped one after the other. It does less
+The nearest equivalent in Python: one estimator object for each target, stepped one after the other. It does less
 than an environment step (no truth, no sensor, no observation, no reward, no autoreset).
 """
 
@@ -12,7 +12,7 @@ PEER_OF = "filtergym/ManeuveringTarget-v0"
 
 
 def imm_steps_per_second(steps: int) -> float:
-    """Return the rate of ``predict`` and ``update`` of one estimator, in steps per second of processor time."""
+    """Return how many steps (``predict`` and ``update``) one filterpy IMM does in a second of processor time."""
     from filterpy.kalman import IMMEstimator, KalmanFilter
 
     T = 6.0

@@ -17,12 +17,12 @@ from filtergym.envs.contract.model import Episode, Model
 from filtergym.envs.contract.observation import Array
 from filtergym.envs.engine.catalogue import import_task
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.envs.engine.reward import OWN_REWARDS
+from filtergym.envs.engine.reward import REWARD_FUNCTIONS
 from filtergym.envs.engine.scenario_choice import make_task
 
 
 def jitted_step(id: str, control: str, size: int, **keywords: Any) -> Callable[[], None]:
-    """Return one step of ``size`` episodes under ``jax.jit``, compiled already; it waits for its results.
+    """Return a function that runs one step of ``size`` episodes under ``jax.jit``, compiled beforehand.
 
     Raises:
         ImportError: without JAX.
@@ -59,4 +59,4 @@ def step_episodes(
     """Return episodes at the next measurement, the reward of the action, and the observation."""
     after = model.act(episode, action)
     following = model.measure(after, noise)
-    return following, OWN_REWARDS["cost"](model, after), model.observe(following)
+    return following, REWARD_FUNCTIONS["cost"](model, after), model.observe(following)

@@ -4,12 +4,12 @@
     git clone https://github.com/SongJgit/filternet
     python benchmarks/public_problems.py --kalmannet KalmanNet_TSP --filternet filternet --runs runs/public
 
-It tunes, trains and judges, and writes the records ``public_problems`` and ``public_drives``; agents and tuned values
-of an earlier call in ``--runs`` are used unchanged. No code of these repositories is imported, and only figures of them
-are stored; tensors are read with ``torch.load(weights_only=True)``.
+It tunes, trains and evaluates, and writes the records ``public_problems`` and ``public_drives``; agents and tuned
+values of an earlier call in ``--runs`` are used unchanged. No code of these repositories is imported, and only figures
+of them are stored; tensors are read with ``torch.load(weights_only=True)``.
 
 Tuning and training use simulated episodes of the training split alone (NCLT: the two validation drives). Filters are
-judged on the stored test sets, or on simulated episodes of the test split.
+evaluated on the stored test sets, or on simulated episodes of the test split.
 """
 
 import argparse
@@ -94,12 +94,12 @@ def taylor(x: Any, order: int) -> list[Any]:
 
 
 def _product(x: Any, y: Sequence[Any]) -> list[Any]:
-    """Return ``A(x) y``; with y = x the derivative of the state."""
+    """Return ``A(x) y`` of the Lorenz attractor; with y = x the derivative of the state."""
     return [10.0 * (y[1] - y[0]), 28.0 * y[0] - y[1] - x[2] * y[0], x[1] * y[0] - (8.0 / 3.0) * y[2]]
 
 
 def flow(x: Any, steps: int = 4) -> list[Any]:
-    """Return the state of the attractor after an interval, by Runge and Kutta's method of fourth order."""
+    """Return the Lorenz attractor's state after an interval, by the Runge-Kutta method of fourth order."""
     T, state = INTERVAL / steps, list(x)
 
     def ahead(slope: Sequence[Any], share: float) -> list[Any]:
@@ -116,12 +116,12 @@ def flow(x: Any, steps: int = 4) -> list[Any]:
 
 
 def order_five(x: Any) -> list[Any]:
-    """Return the transition of the generator, and of a filter with full information."""
+    """Return the state after an interval by the series of order five: the simulation's transition."""
     return taylor(x, 5)
 
 
 def order_two(x: Any) -> list[Any]:
-    """Return the transition of a filter with partial information."""
+    """Return the state after an interval by the series of order two: a filter's approximate transition."""
     return taylor(x, 2)
 
 
@@ -150,7 +150,8 @@ DECIMATED: dict[str, Any] = {
     "horizon": 500,
 }
 """r^2 = 1. KalmanNet's world has no process noise; a small one here keeps the reference's covariance definite. The
-filters' Q is KalmanNet's, 0.3873^2."""
+filters' Q is KalmanNet's, 0.3873^2.
+"""
 LorenzDecimated = filtergym.state_space(
     "public/LorenzDecimated-v0",
     **LORENZ,
@@ -167,7 +168,7 @@ WHEEL_SCALE = 1.075
 
 
 def drive(x: Any) -> list[Any]:
-    """Return the state after a second forward along the heading."""
+    """Return the segway's state after a second of motion along its heading."""
     middle = x[3] + 0.5 * x[4]
     return [
         x[0] + x[2] * numpy.cos(middle),
@@ -209,7 +210,7 @@ STARTS = ([2.0, 0.0, 0.0, 0.6], [3.0, 0.0, 2.0, 2.0])
 
 
 class WithNoises(Extended):
-    """The Kalman filter as written with noises of its own.
+    """The Kalman filter with constant Q and R in place of the model's.
 
     Args:
         task: the problem.
@@ -222,16 +223,16 @@ class WithNoises(Extended):
         self.Q, self.R = (task.constant(noise)[:, :, None] for noise in (Q, R))
 
     def process_noise(self, mean: Any, measurement: Any) -> Any:
-        """Return the given Q for any state."""
+        """Return the constant Q for any state and measurement."""
         return self.Q
 
     def sensor_noise(self, mean: Any, measurement: Any) -> Any:
-        """Return the given R for any state."""
+        """Return the constant R for any state and measurement."""
         return self.R
 
 
 def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
-    """Return the maker of a Kalman filter with these noises."""
+    """Return the maker of a Kalman filter with constant Q and R."""
 
     def make(task: Any) -> WithNoises:
         return WithNoises(task, Q, R)
@@ -244,7 +245,7 @@ def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
 
 
 def read_tensors(file: Path) -> Any:
-    """Read a stored set without executing anything."""
+    """Return the tensors of a stored data set, loaded without executing code."""
     import torch
 
     return torch.load(file, weights_only=True, map_location="cpu")
@@ -268,8 +269,9 @@ def stored_linear(folder: Path, id: str) -> Recording:
 
 
 def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]:
-    """Return the drives of filternet's NCLT problem, and the RMSE a coordinate of the receiver alone, whose last
-    position stands where it has no fix.
+    """Return the drives of filternet's NCLT problem, and the RMSE a coordinate of the receiver alone.
+
+    Where the receiver has no fix, its last position is used.
 
     Args:
         folder: folder of the repository.
@@ -319,7 +321,7 @@ def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]
 
 
 class Row(NamedTuple):
-    """A filter on a problem."""
+    """Result of a filter on a problem: mean squared error, ANEES and time."""
 
     problem: str
     name: str
@@ -337,12 +339,12 @@ class Row(NamedTuple):
 
 
 def decibels(values: Any) -> Any:
-    """Return ``10 log10``."""
+    """Return values in decibels, ``10 log10(values)``."""
     return 10.0 * numpy.log10(values)
 
 
 def tune_scales(id: str, name: str, runs: Path) -> Any:
-    """Tune the scales of Q and R of an estimator on training episodes, or read the values stored in ``runs``."""
+    """Return an estimator with scales of Q and R tuned on training episodes, or stored in ``runs``."""
     problem, file = problem_of(id), runs / f"{short_name(id)}.{name}.tuned.json"
     if not file.exists():
         found = tune(problem, name, Search(TUNING_BUDGET, episodes=128))
@@ -375,7 +377,10 @@ def train(id: str, algorithm: str, steps: int, seed: int, runs: Path) -> str:
 def judge(
     problem: str, id: str, competitors: Mapping[str, Any], scenario: Any = None, timed: bool = True
 ) -> list[Row]:
-    """Run filters over the test episodes, or a recording; the runs of a learned one, NAME/SEED, are one row."""
+    """Run filters over the test episodes or a recording, and return a row of results for each.
+
+    Training runs called NAME/SEED share a row.
+    """
     dataset = filtergym.evaluate(id, dict(competitors), scenario, episodes=TEST_EPISODES, timed=timed)
     cost = dataset.cost.mean("time")
     bootstrap = Bootstrap(dataset.sizes["episode"])
@@ -415,7 +420,7 @@ class Problem(NamedTuple):
 
 
 def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: Path) -> dict[str, Any]:
-    """Return the filters of a problem by their names: as written, tuned and trained.
+    """Return the makers of a problem's filters by name: the model's own, tuned and trained.
 
     Args:
         problem: problem of the filters.
@@ -434,9 +439,7 @@ def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: 
 
 
 def tune_drives(recording: Recording) -> dict[str, float]:
-    """Return the factors with the least squared error over the validation drives, by the simplex method from some
-    starts.
-    """
+    """Return the factors on R and Q with the least squared error over the validation drives, by name."""
     from scipy.optimize import minimize
 
     def cost(logarithms: numpy.ndarray) -> float:
@@ -455,7 +458,7 @@ def tune_drives(recording: Recording) -> dict[str, float]:
 
 
 def judge_drives(folder: Path, runs: Path) -> tuple[list[dict[str, Any]], dict[str, float]]:
-    """Return the RMSE a coordinate of every test drive by the receiver alone and by filters, and the tuned factors."""
+    """Return the RMSE a coordinate of every test drive by receiver and filters, and the tuned factors."""
     recording, held = stored_drives(folder, "test")
     file = runs / "drives.tuned.json"
     if not file.exists():
@@ -533,7 +536,7 @@ def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECORDS) -> None:
-    """Write a record of each table, with its figures."""
+    """Write the records ``public_problems`` and ``public_drives`` from all results."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = {
         PROBLEMS: (problem_table, "noise_floor_db", "rows"),
@@ -549,7 +552,7 @@ def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECOR
 
 
 def main() -> None:
-    """Tune, train, judge and write."""
+    """Tune, train and evaluate all filters, and write the records."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

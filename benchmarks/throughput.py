@@ -64,14 +64,14 @@ Record = dict[str, Any]
 
 
 def processor_seconds(call: Callable[[], object]) -> float:
-    """Return the processor time of a call."""
+    """Return the processor time of a call, s."""
     begin = time.process_time()
     call()
     return time.process_time() - begin
 
 
 def median_seconds(call: Callable[[], object], share: float, fewest: int = 3) -> float:
-    """Return the median time of a call over rounds that take ``share`` seconds together."""
+    """Return the median processor time of a call, s, over rounds that take ``share`` seconds together."""
     call()  # compiles; warms caches and clocks
     times: list[float] = []
     while len(times) < fewest or sum(times) < share:
@@ -83,7 +83,7 @@ def median_seconds(call: Callable[[], object], share: float, fewest: int = 3) ->
 
 
 def step_seconds(env: Any, share: float) -> float:
-    """Return the median time of a step, with its share of a reset of all environments."""
+    """Return the median processor time of a step, s, with its share of a reset of all environments."""
     env.action_space.seed(0)
     actions = itertools.cycle([env.action_space.sample() for _ in range(8)])
     length = getattr(env.unwrapped, "last_decision", 500)
@@ -105,7 +105,7 @@ def step_seconds(env: Any, share: float) -> float:
 
 
 def measure_environments(ids: list[str], sizes: list[int], share: float) -> Iterator[Record]:
-    """Measure the steps of environments with default options."""
+    """Yield the measured speed of environments' steps with default options."""
     for id in [*ids, PEER]:
         interval = make_model(catalogue()[id]).task.decision_interval if id in catalogue() else 1
         row: Record = {"environment": id.removeprefix("filtergym/")}
@@ -124,7 +124,7 @@ class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     """A single environment that resets automatically at the end of an episode."""
 
     def step(self, action: Any) -> Any:
-        """Step, and reset where the episode is over."""
+        """Return the result of a step, and reset the environment at the end of the episode."""
         answer = self.env.step(action)
         if answer[2] or answer[3]:
             self.env.reset()
@@ -135,9 +135,7 @@ class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def compiled_costs() -> tuple[float, float]:
-    """Return the seconds of an addition or product, and of an exponential, in compiled programs without other
-    operations.
-    """
+    """Return the seconds of an addition or product, and of an exponential, in compiled code."""
     chains, links, x = 16, 64, numpy.linspace(-1.0, 1.0, 16 * 8).reshape(16, 8)
 
     def arithmetic(x: Any) -> Any:
@@ -166,7 +164,7 @@ def compiled_costs() -> tuple[float, float]:
 
 
 def floor_seconds(model: Any) -> float:
-    """Return the seconds of the arithmetic in the programs of a compiled step of one episode."""
+    """Return the seconds of the arithmetic alone in a compiled step of one episode."""
     parts = model.programs.later
     programs = [parts.update, parts.advance, parts.predict, model.programs.report_program(cost_reward)]
     names = [step.operation for special in programs for step in special.program.steps]
@@ -178,7 +176,7 @@ def floor_seconds(model: Any) -> float:
 
 
 def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Record]:
-    """Measure the step by the compiled backend, by NumPy, by JAX, and by filterpy."""
+    """Yield the measured speed of a step in compiled code, NumPy, JAX and filterpy."""
     try:
         import jax  # noqa: F401
         import peer_jax
@@ -209,7 +207,7 @@ def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Re
 
 
 def measure_evaluations(id: str, episodes: int, share: float) -> Iterator[Record]:
-    """Evaluate competitors one by one, then all together."""
+    """Yield the measured time of evaluations of competitors one by one, then of all together."""
     horizon = make_model(catalogue()[id]).task.horizon
     few = min(episodes, EPISODES)
     for name in COMPETITORS:
@@ -235,9 +233,7 @@ _STEP = (
 
 
 def run_apart(code: str) -> tuple[float, float]:
-    """Return the processor seconds and peak memory in MB of the last of two runs of some code in a process of its
-    own.
-    """
+    """Run code twice in a separate process; return processor seconds and peak memory, MB, of the second run."""
     # Not getrusage: its peak of a process includes the memory of the parent at the start.
     program = (
         "import re, pathlib, time, gymnasium, numpy, filtergym\ndef run():\n    "
@@ -253,7 +249,7 @@ def run_apart(code: str) -> tuple[float, float]:
 
 
 def measure_scaling(id: str) -> Iterator[Record]:
-    """Measure one, two and four times as many episodes, competitors, measurements and environments."""
+    """Yield time and memory with one, two and four times as many episodes, competitors and environments."""
     names = [name for name in COMPETITORS if name != "bptt"][:8]
     usual: Record = {"id": id, "names": names[:2], "episodes": 2000, "horizon": 100}
     kinds: dict[str, Callable[[int], str]] = {
@@ -269,13 +265,13 @@ def measure_scaling(id: str) -> Iterator[Record]:
         yield {**row, "time 4 : 2": found[4][0] / found[2][0], "memory 4 : 2": found[4][1] / found[2][1]}
 
 
-def show(title: str, rows: Iterator[Record], kept: dict[str, list[Record]]) -> None:
+def show(title: str, rows: Iterator[Record], records: dict[str, list[Record]]) -> None:
     """Collect the rows of a section and print them as a Markdown table."""
-    kept[title] = []
+    records[title] = []
     for row in rows:
-        kept[title].append(row)
+        records[title].append(row)
         print(f"  {title}: {next(iter(row.values()))} ...", file=sys.stderr, flush=True)
-    table = pandas.DataFrame(kept[title])
+    table = pandas.DataFrame(records[title])
     texts = [[_cell(value) for value in line] for line in table.to_numpy(dtype=object).tolist()]
     print(f"\n{title}\n\n| {' | '.join(table.columns)} |\n|{'---|' * len(table.columns)}")
     print("\n".join(f"| {' | '.join(line)} |" for line in texts), flush=True)
@@ -288,7 +284,7 @@ def _cell(value: Any) -> str:
 
 
 def main() -> None:
-    """Read the command line."""
+    """Read the command line, measure its sections, and print the tables."""
     sections = ("environments", "steps", "evaluations", "scaling")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -1,8 +1,8 @@
-"""A small compiler for functions of arrays: it traces a function once, simplifies, emits vector code, and caches it.
+"""Small compiler for functions of arrays: it traces a function once and runs it as vectorised machine code.
 
 A function written for NumPy or torch through the array API standard does the same arithmetic for each of N independent
-lanes, the last axis of all its arrays. On small arrays nearly all the time is spent in calls of the array library. A
-run on symbols (:mod:`.namespace`) records the arithmetic of one lane, a straight line without branches
+lanes (entries of the last axis of all its arrays). On small arrays nearly all the time is spent in calls of the array
+library. A run on symbols (:mod:`.namespace`) records the arithmetic of one lane, a straight line without branches
 (:mod:`.program`). It is emitted as LLVM code that computes a block of lanes at a time (:mod:`.emission`). A long
 program is emitted as loops over its array operations (:mod:`.rolling`, :mod:`.loop_emission`). The code is translated
 for the current processor and cached for later processes (:mod:`.native`, :mod:`.cache`). Exponentials and similar

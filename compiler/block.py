@@ -1,4 +1,4 @@
-"""Blocks of lanes that one instruction computes, and their types and constants in LLVM.
+"""Blocks of lanes that one instruction computes, with their LLVM types and constants.
 
 LLVM splits every operation on a block that is wider than a register of the processor. That doubles its time, but the
 code of short programs is faster, because the two halves are independent.
@@ -7,20 +7,20 @@ code of short programs is faster, because the two halves are independent.
 import functools
 
 LANES = 8
-"""Lanes of the widest block; the width of every array is a multiple of it."""
+"""Number of lanes of the widest block; the width of every array is a multiple of it."""
 
 
 class LaneBlock:
-    """A block of adjacent lanes.
+    """Block of adjacent lanes: a vector of numbers in LLVM.
 
     Args:
         lanes: number of lanes, a divisor of ``LANES``.
 
     Attributes:
-        numbers: LLVM's type of a float64 in every lane.
-        truths: LLVM's type of a truth value in every lane.
-        words: LLVM's type of an integer of 64 bits in every lane.
-        addresses: LLVM's type of an address in every lane.
+        numbers: LLVM type of a float64 in every lane.
+        truths: LLVM type of a boolean in every lane.
+        words: LLVM type of a 64-bit integer in every lane.
+        addresses: LLVM type of an address in every lane.
         alignment: alignment of a value in bytes.
     """
 
@@ -35,34 +35,34 @@ class LaneBlock:
         self.true: str = self.constant("true", "i1")
 
     def constant(self, value: str, kind: str = "double") -> str:
-        """Return a constant with the same value in every lane."""
+        """Return the LLVM text of a constant with the same value in every lane."""
         return "<" + ", ".join([f"{kind} {value}"] * self.lanes) + ">"
 
     def repeat(self, one: str, kind: str) -> str:
-        """Return the instruction that repeats the first lane of a value in every lane."""
+        """Return the LLVM instruction that copies the first lane of a value to every lane."""
         return f"shufflevector {kind} {one}, {kind} poison, <{self.lanes} x i32> zeroinitializer"
 
     def intrinsic(self, name: str) -> str:
-        """Return the name of LLVM's intrinsic function of numbers."""
+        """Return the name of an LLVM intrinsic function for this block."""
         return f"@llvm.{name}.v{self.lanes}f64"
 
     @property
     def gather(self) -> str:
-        """Name of LLVM's intrinsic function that reads an address in every lane."""
+        """Name of the LLVM intrinsic that loads a number from the address in each lane."""
         return f"@llvm.masked.gather.v{self.lanes}f64.v{self.lanes}p0"
 
 
 @functools.cache
 def block_for(features: str) -> LaneBlock:
-    """Return the block of one register: eight lanes with AVX-512, four on any other processor.
+    """Return the block that fills one register of a processor: eight lanes with AVX-512, else four.
 
     Args:
-        features: features in LLVM's form, ``+avx2,-avx512f,...``.
+        features: features of the processor in LLVM's form, ``+avx2,-avx512f,...``.
     """
     return block_of(LANES if "+avx512f" in features.split(",") else LANES // 2)
 
 
 @functools.cache
 def block_of(lanes: int) -> LaneBlock:
-    """Return the block with a number of lanes."""
+    """Return the block with this number of lanes."""
     return LaneBlock(lanes)

@@ -1,4 +1,4 @@
-"""A program as text of C99 for one lane, in double or float; the same statements are the body of a kernel of CUDA.
+"""C99 text of a program for one lane, in double or float; the statements also form a CUDA kernel.
 
 Every step is one statement, or, in a loop, every array operation (:mod:`.rolling`). Numbers that pass from one static
 function or loop to the next are stored in a scratch array ``w``. Comparisons with NaN, and the results of ``maximum``,
@@ -28,25 +28,27 @@ from .program import StraightLineProgram
 from .rolling import roll_where_shorter
 
 PART = 200
-"""Most statements of a function."""
+"""Maximal number of statements of a function."""
 INLINED = 8_000
-"""Operations of a program above which CUDA's compiler must not inline its functions: inlined, 23,000 operations compile
-in more than three minutes in place of half a minute, and 9,500 run a quarter slower; 2,700 run twice as fast."""
+"""Number of operations above which CUDA's compiler must not inline the functions of a program. Inlined, 23,000
+operations compile in more than three minutes in place of half a minute, and 9,500 run a quarter slower; 2,700 run
+twice as fast.
+"""
 
 
 class ProgramSource(NamedTuple):
-    """A program as text."""
+    """C text of a program."""
 
     functions: str
-    """Tables and static functions, to be defined before the function."""
+    """Tables and static functions, to be placed before the function."""
     body: list[str]
-    """Statements of the function itself."""
+    """Statements of the function."""
     operations: int
     """Number of computed steps."""
     scratch: int
     """Length of the scratch array."""
     replaced: tuple[float, ...]
-    """Constants beyond the range of the kind of number, which were replaced by the nearest ones."""
+    """Constants beyond the range of the floating-point type, which were replaced by the nearest ones."""
 
 
 _HELPERS = {
@@ -71,7 +73,7 @@ _HELPERS = {
 def helper_functions(
     programs: Sequence[StraightLineProgram], scalar: Scalar = DOUBLE, qualifier: str = "static "
 ) -> str:
-    """Return the functions that statements of these programs call in addition to those of ``math.h``."""
+    """Return the C text of the helper functions that the statements of some programs call, beyond ``math.h``."""
     used = {name for program in programs for name in program.steps.operations}
     words = {
         "real": scalar.name,
@@ -83,7 +85,7 @@ def helper_functions(
 
 
 class _ProgramText:
-    """Statements of a program; values are named by their steps."""
+    """Writer of a program's statements as C text; values are named by their steps."""
 
     def __init__(
         self,
@@ -108,7 +110,7 @@ class _ProgramText:
         return f"v{step}"
 
     def as_number(self, step: int) -> str:
-        """Return an expression for a step's value that is a number, one for true and zero for false."""
+        """Return the C expression of a step's value as a number, one for true and zero for false."""
         value = self.value(step)
         if not self.steps[step].logical:
             return value
@@ -138,7 +140,7 @@ def write_program(
     results: int = 0,
     arrays: Arrays | None = None,
 ) -> ProgramSource:
-    """Write a program as statements, in loops where that is shorter.
+    """Return the C text of a program for one lane, with loops where they are shorter.
 
     A result is written as soon as it is computed, so results must not overwrite inputs.
 
@@ -146,13 +148,13 @@ def write_program(
         program: the program.
         name: name of the function that contains the statements, and prefix of the static functions.
         parameters: parameters of that function and of all static functions.
-        read: function from argument and row to the expression of an input.
-        write: function from argument and row to the destination of a result; ``""``: no destination.
-        scalar: kind of numbers.
+        read: function from argument and row to the C expression of an input.
+        write: function from argument and row to the C expression of a destination; ``""``: no destination.
+        scalar: floating-point type.
         qualifier: qualifier of static functions.
         between: statements after the first results, before any other input is read.
         results: number of these results.
-        arrays: places of the rows of all arguments, for loops; default: no loops.
+        arrays: pointers and offsets of the rows of all arguments, for loops; default: no loops.
     """
     if "product" in program.steps.operations:
         raise ValueError("a product that is a loop cannot be written in C: trace it with Graph(loops=False)")
@@ -201,7 +203,7 @@ def write_program(
 
 
 def _merge_blocks(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
-    """Return the blocks merged up to the length of a function, and the number of them before a pause."""
+    """Return the blocks of statements merged up to the length of a function, and their number before a pause."""
     packed: list[list[str]] = []
     before = 0
     for i, block in enumerate(blocks):
@@ -246,7 +248,9 @@ def _function(name: str, parameters: Sequence[Parameter], body: Sequence[str], q
 def write_lanes(
     program: StraightLineProgram, name: str, lane_first: Sequence[bool], cuda: bool = False
 ) -> str:
-    """Write a program as a function over lanes, in double; for CUDA as a kernel with a thread for each lane.
+    """Return the C text of a function that runs a program over lanes, in double; or a CUDA kernel.
+
+    The kernel has a thread for each lane.
 
     The function takes ``a``, the addresses of the arrays, ``stride``, the distance from row to row of each, and the
     lanes ``first`` to ``last``; the kernel takes ``a``, ``stride`` and the number of lanes.

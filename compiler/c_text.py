@@ -1,4 +1,4 @@
-"""Text of C99: names, numbers, comments, expressions, functions.
+"""C99 text of names, numbers, comments, expressions and functions.
 
 All names and sentences from outside pass through :func:`identifier` and :func:`comment`.
 """
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy
 
 WIDTH = 100
-"""Most characters in a line of a comment."""
+"""Maximal number of characters in a line of a comment."""
 _INFIX = {
     "add": "+",
     "subtract": "-",
@@ -40,19 +40,19 @@ _RESERVED = frozenset(
         "NAN INFINITY FLT_MAX FLT_MIN DBL_MAX sign_of remainder_of place_of",
     )
 )
-"""Names reserved by C, by related languages, or by the text made here."""
+"""Names reserved by C, by related languages, or by the generated text."""
 
 
 @dataclass(frozen=True)
 class Scalar:
-    """A kind of number in C."""
+    """A floating-point type of C."""
 
     name: str
     suffix: str
-    """Suffix of its functions and literals."""
+    """Suffix of functions and literals of this type."""
     dtype: type
     largest: str
-    """Macro of ``float.h``."""
+    """Macro of ``float.h`` for the largest number."""
     smallest: str
 
 
@@ -61,21 +61,21 @@ FLOAT = Scalar("float", "f", numpy.float32, "FLT_MAX", "FLT_MIN")
 
 
 class Parameter(NamedTuple):
-    """A parameter of a function."""
+    """A parameter of a C function."""
 
     type: str
-    """Text before the name."""
+    """C text before the name."""
     name: str
 
 
-def identifier(words: str, taken: Collection[str] = ()) -> str:
-    """Return a name in C for a text: letters, digits and single underscores, and not a reserved name.
+def identifier(text: str, used_names: Collection[str] = ()) -> str:
+    """Return a valid C identifier for a text, different from reserved names and those in use.
 
     Args:
-        words: any text.
-        taken: names that are already in use.
+        text: any text.
+        used_names: names that are already in use.
     """
-    plain = unicodedata.normalize("NFKD", words).encode("ascii", "ignore").decode()
+    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:60] or "x"
     if not name[0].isalpha():
         name = f"n{name}"
@@ -83,13 +83,13 @@ def identifier(words: str, taken: Collection[str] = ()) -> str:
     if name in _RESERVED or re.fullmatch(r"[vrw]\d*", name):
         name += "_"
     unique, number = name, 2
-    while unique in taken:
+    while unique in used_names:
         unique, number = f"{name}_{number}", number + 1
     return unique
 
 
 def plain_words(text: str) -> str:
-    """Return a text that is safe in a comment of C: one line of printable ASCII without begin or end of a comment."""
+    """Return a text as one line of printable ASCII without begin or end of a C comment."""
     ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "replace").decode()
     line = " ".join("".join(c if c.isprintable() else " " for c in ascii_text).split()).replace("\\", "|")
     # No end, no begin, and no trigraph.
@@ -97,7 +97,7 @@ def plain_words(text: str) -> str:
 
 
 def comment(*paragraphs: str, indent: str = "") -> str:
-    """Return a comment of C with a paragraph for each text; leading blanks of a text are preserved.
+    """Return a C comment with a paragraph for each text; leading blanks of a text are preserved.
 
     Args:
         *paragraphs: any texts.
@@ -114,7 +114,7 @@ def comment(*paragraphs: str, indent: str = "") -> str:
 
 
 def literal(value: float, scalar: Scalar = DOUBLE) -> str:
-    """Return a number as a literal of C that has the same bits; for ``float`` the nearest number.
+    """Return a number as a C literal with the same bits; for ``float`` the nearest number.
 
     A number beyond the range of ``float`` becomes its largest or smallest normal number.
     """
@@ -141,7 +141,7 @@ def is_beyond(value: float, scalar: Scalar) -> bool:
 def array_text(
     name: str, values: numpy.ndarray, scalar: Scalar = DOUBLE, qualifier: str = "static const"
 ) -> str:
-    """Return the definition of a constant array, with a line for each row of a matrix."""
+    """Return the C definition of a constant array, with a line for each row of a matrix."""
 
     def braces(part: numpy.ndarray) -> str:
         if part.ndim == 1:
@@ -161,13 +161,13 @@ def expression(
     scalar: Scalar,
     table: tuple[str, int] | None = None,
 ) -> str:
-    """Return the expression of an operation.
+    """Return the C expression of an operation.
 
     Args:
         operation: operation of a step.
-        values: expressions of its arguments.
+        values: C expressions of its arguments.
         known: whether each argument is a constant.
-        scalar: kind of numbers.
+        scalar: floating-point type.
         table: for ``take``, name and length of its table.
     """
     if table is not None:
@@ -192,7 +192,7 @@ def expression(
 
 
 def _extreme(values: Sequence[str], known: Sequence[bool], sign: str) -> str:
-    """Return the expression of the larger or smaller of two numbers, NaN if one of them is."""
+    """Return the C expression of the larger or smaller of two numbers, NaN if one of them is NaN."""
     one, other = values if known[0] or not known[1] else values[::-1]
     # A constant is never NaN, see Graph.
     unordered = "" if any(known) else f" || {one} != {one}"
@@ -200,7 +200,7 @@ def _extreme(values: Sequence[str], known: Sequence[bool], sign: str) -> str:
 
 
 def function_text(returns: str, name: str, parameters: Sequence[Parameter], body: Sequence[str]) -> str:
-    """Return the definition of a function, with unused parameters marked."""
+    """Return the C definition of a function; unused parameters are cast to void."""
     listed = ", ".join(_declare(parameter) for parameter in parameters)
     words = set(re.findall(r"\w+", "\n".join(body)))
     unused = [f"(void){parameter.name};" for parameter in parameters if parameter.name not in words]

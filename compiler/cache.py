@@ -1,4 +1,4 @@
-"""Cache of compiled code in the user's cache folder, by content.
+"""Cache of compiled machine code in the user's cache folder, by content.
 
 An entry is written to a temporary file and moved into place, begins with its own checksum, and is ignored if it is
 invalid. The size of the folder is limited: the least recently used entries are removed first. If the operating system
@@ -19,17 +19,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 LIMIT = 256 * 2**20
-"""Largest size of the folder in bytes."""
+"""Maximal size of the folder in bytes."""
 SLACK = 2**23
-"""Bytes that a process writes between two checks of the folder's size; the first check is at its first write."""
+"""Number of bytes that a process writes between two checks of the folder's size; the first check is at its first
+write.
+"""
 SUFFIX = ".code"
-"""Suffix of entries; other files in the folder are not touched."""
+"""Suffix of entries; other files in the folder are ignored."""
 SWITCH = "FILTERGYM_COMPILER_CACHE"
-"""Environment variable: a folder to use in place of the default one, or ``off``."""
+"""Environment variable with a folder to use in place of the default one, or ``off``."""
 
 
 def folder() -> Path | None:
-    """Return the folder of the entries; None if the cache is off."""
+    """Return the path of the cache folder; None if the cache is off."""
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off":
         return None
@@ -41,7 +43,7 @@ def folder() -> Path | None:
 
 
 def key(*texts: str) -> str:
-    """Return the name of an entry made from some texts."""
+    """Return the name of an entry: a SHA-256 digest of some texts."""
     digest = hashlib.sha256()
     for text in texts:
         digest.update(f"{len(text)}:{text}".encode())
@@ -49,7 +51,7 @@ def key(*texts: str) -> str:
 
 
 def load(name: str) -> bytes | None:
-    """Return an entry; None if it is missing or invalid."""
+    """Return the machine code of an entry; None if it is missing or invalid."""
     place = folder()
     if place is None:
         return None
@@ -65,13 +67,13 @@ def load(name: str) -> bytes | None:
 
 
 def contains(name: str) -> bool:
-    """Return whether an entry exists, valid or not."""
+    """Return whether an entry's file exists, valid or not."""
     place = folder()
     return place is not None and (place / f"{name}{SUFFIX}").exists()
 
 
 def store(name: str, code: bytes) -> None:
-    """Write an entry, if possible."""
+    """Write machine code as an entry; errors of the operating system are ignored."""
     place = folder()
     if place is None:
         return
@@ -98,11 +100,11 @@ def store(name: str, code: bytes) -> None:
 
 
 class _Untrusted(Exception):  # noqa: N818  (the reason why an entry is not used, not a user's error)
-    """A file that another user can have written."""
+    """Error for a file or folder that another user can have written."""
 
 
 _REPORTED_FOLDERS: set[Path] = set()
-"""Folders with a warning that they are not used."""
+"""Folders for which a warning was issued that they are not used."""
 
 
 def _explain(place: Path, reason: _Untrusted) -> None:
@@ -117,7 +119,7 @@ def _explain(place: Path, reason: _Untrusted) -> None:
 
 
 def _read(place: Path, name: str) -> bytes:
-    """Read an entry and renew its time of use.
+    """Return the content of an entry and update its time of use.
 
     Raises:
         _Untrusted: if another user can have written it.
@@ -137,7 +139,7 @@ def _read(place: Path, name: str) -> bytes:
 
 @contextlib.contextmanager
 def _open_folder(place: Path) -> Iterator[int | None]:
-    """Open the folder, so that entries are opened in the checked folder; None on systems without owners."""
+    """Yield the handle of the checked folder, so that entries are opened inside it; None on Windows."""
     if not hasattr(os, "getuid"):  # Windows: a user's own folders are not writable for others
         yield None
         return
@@ -149,7 +151,7 @@ def _open_folder(place: Path) -> Iterator[int | None]:
 
 @contextlib.contextmanager
 def _open(path: str | Path, flags: int, within: int | None) -> Iterator[int]:
-    """Open a file or a folder, but not a link.
+    """Yield the handle of a file or folder opened for reading; links are refused.
 
     Raises:
         _Untrusted: if another user can have written it.
@@ -176,7 +178,7 @@ _UNCHECKED: dict[Path, int] = {}
 
 
 def _bound(place: Path) -> None:
-    """Remove the oldest entries until the folder is small enough."""
+    """Remove the least recently used entries until the folder is small enough."""
     entries = [(path, path.stat()) for path in place.glob(f"*{SUFFIX}")]
     total = sum(found.st_size for _, found in entries)
     for path, found in sorted(entries, key=lambda entry: entry[1].st_mtime):

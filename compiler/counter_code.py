@@ -1,4 +1,4 @@
-"""Random numbers by counter as code: the algorithm of :mod:`.counter_numbers` as text of LLVM.
+"""LLVM code that computes the counter-based random numbers of :mod:`.counter_numbers`.
 
 A :class:`Value` represents a number in the text. The functions of :mod:`.counter_numbers` run on such values as on
 arrays, and write their text. :func:`bind_numbers` returns compiled code.
@@ -19,12 +19,12 @@ _LLVM = {"*": "mul", "+": "add", "-": "sub", "&": "and", "|": "or", "^": "xor", 
 
 
 class Value:
-    """A number in the text: a whole number of 64 bits (``whole``), or a float64.
+    """A value in LLVM text, a 64-bit integer (``whole``) or a float64, whose operators write instructions.
 
     Args:
-        text: text to which its operations are written.
-        name: name in the text.
-        whole: whether it is a whole number.
+        text: text to which the operators append.
+        name: name of the value in the text.
+        whole: whether it is an integer.
     """
 
     def __init__(self, text: "_VectorText", name: str, whole: bool) -> None:
@@ -65,7 +65,7 @@ class Value:
 
 
 class _VectorText:
-    """Vector code for a block of lanes, and the :class:`~.counter_numbers.Machine` of its values.
+    """LLVM instructions for a block of lanes, with the operations of :class:`~.counter_numbers.Machine`.
 
     Args:
         prefix: prefix of new names.
@@ -95,7 +95,7 @@ class _VectorText:
         return self.block.constant(f"0x{numpy.float64(value).view('u8'):016X}")
 
     def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
-        """Write an operation and return the name of its result."""
+        """Append an instruction and return the name of its result."""
         if whole:
             return self.new(f"{_LLVM[operator]} {self.block.words} {one}, {other}")
         return self.new(f"f{_LLVM.get(operator, 'div')} {self.block.numbers} {one}, {other}")
@@ -132,7 +132,7 @@ Make = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
-    """Write the code of two numbers from key, episode, measurement and pair; return their names."""
+    """Append the code of two random numbers from key, episode, measurement and pair; return their names."""
     one, other = make(text, *pair_of_bits(*(text.word(name) for name in names)))
     return one.name, other.name
 
@@ -140,7 +140,7 @@ def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str])
 def _loop(
     block: LaneBlock, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
 ) -> list[str]:
-    """Return the loop over the pairs of a kind, from the block ``before`` to the block ``done_KIND``."""
+    """Return the LLVM lines of the loop over pairs of random numbers, from the block ``before`` to ``done_KIND``."""
     text = _VectorText(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [
@@ -173,13 +173,13 @@ def _loop(
 
 @functools.cache
 def llvm_text(block: LaneBlock) -> str:
-    """Return the text of ``@program(table, first, last)``, which makes the numbers of the next measurement of lanes.
+    """Return the LLVM text of ``@program(table, first, last)``, which computes the next measurement's random numbers.
 
     The table contains an unused entry, then address and stride of identities, of measurements and of the rows, then the
     number of normal rows and that of uniform rows.
 
     Args:
-        block: lanes that are computed at a time.
+        block: block of lanes that are computed together.
     """
     entries = (
         *(("identities", "ptr", 1), ("apart", "i64", 2), ("measurements", "ptr", 3)),
@@ -225,9 +225,9 @@ def llvm_text(block: LaneBlock) -> str:
 
 
 def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarray, normals: int) -> Call:
-    """Return a compiled call that advances to the next measurement and makes its numbers.
+    """Return a compiled call that advances ``t`` by one and writes the random numbers of that measurement.
 
-    Every run adds one to ``t`` and then writes the numbers of :func:`~.counter_numbers.numbers` with the same bits. So
+    The numbers have the same bits as those of :func:`~.counter_numbers.numbers`. So
     an episode begins with ``t = -1``: the first run makes the numbers of its start, the next those of its first
     measurement.
 

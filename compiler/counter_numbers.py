@@ -1,7 +1,7 @@
-"""Random numbers by counter: every number is a function of its name, and the same bits on every machine.
+"""Counter-based random numbers: each is a function of episode, measurement and index, with the same bits everywhere.
 
-**Names.** Episode ``(key, episode)``, two whole numbers of 64 bits; measurement ``t``; pair ``p``. No number depends on
-earlier draws, so numbers may be made in any order, anywhere, and repeatedly.
+**Names.** Episode ``(key, episode)``, two 64-bit integers; measurement ``t``; pair ``p``. No number depends on earlier
+draws, so numbers can be computed in any order, on any machine, and repeatedly.
 
 **Bits.** Philox4x32-10 makes four words of 32 bits of the counter ``(p, t, episode low, episode high)`` under the key
 ``(key low, key high)``. Ten times, with ``M`` and ``W`` of the paper::
@@ -49,17 +49,17 @@ MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 LOW = 0xFFFFFFFF
 UNIFORM_PAIRS = 1 << 31
-"""First pair of uniform numbers."""
+"""Number of the first pair of uniform numbers."""
 ONE = 0x3FF0000000000000
-"""Bits of 1."""
+"""Bits of the float64 1."""
 ROOT_HALF = 0x3FE6A09E667F3BCD
-"""Bits of sqrt(1/2)."""
+"""Bits of the float64 sqrt(1/2)."""
 FRACTION = 0x000FFFFFFFFFFFFF
-"""Bits of a float64 below its exponent."""
+"""Bit mask of the fraction of a float64."""
 RAISED = 1024
 """Offset that makes exponents nonnegative."""
 POWER_52 = 0x4330000000000000
-"""Bits of 2^52, whose unit in the last place is 1."""
+"""Bits of the float64 2^52, whose unit in the last place is 1."""
 LOG_2 = float.fromhex("0x1.62e42fefa39efp-1")
 P = tuple(
     map(
@@ -106,23 +106,23 @@ C = tuple(
 
 
 class Machine(Protocol):
-    """Operations beyond the operands' own operators."""
+    """Protocol of the operations on numbers and bits that are no Python operators."""
 
     def bits(self, number: Any) -> Any:
-        """Return the bits of a float64 as a whole number."""
+        """Return the bits of a float64 as a 64-bit integer."""
 
     def number(self, bits: Any) -> Any:
         """Return the float64 with these bits."""
 
     def sqrt(self, number: Any) -> Any:
-        """Return the square root."""
+        """Return the square root of a float64."""
 
     def choose(self, condition: Any, one: Any, other: Any) -> Any:
-        """Return one number where a whole number is not zero, else the other."""
+        """Return ``one`` where an integer is not zero, else ``other``."""
 
 
 def philox(counter: tuple[Any, Any, Any, Any], key: tuple[Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """Return four words of Philox4x32-10; words are whole numbers of 64 bits below 2^32."""
+    """Return the four words of Philox4x32-10; words are 64-bit integers below 2^32."""
     (c0, c1, c2, c3), (k0, k1) = counter, key
     for number in range(ROUNDS):
         if number > 0:
@@ -133,13 +133,13 @@ def philox(counter: tuple[Any, Any, Any, Any], key: tuple[Any, Any]) -> tuple[An
 
 
 def pair_of_bits(key: Any, episode: Any, t: Any, pair: Any) -> tuple[Any, Any]:
-    """Return the two numbers of 64 bits of an episode, a measurement and a pair."""
+    """Return the two 64-bit random integers of an episode, a measurement and a pair."""
     c0, c1, c2, c3 = philox((pair, t, episode & LOW, episode >> 32), (key & LOW, key >> 32))
     return (c0 << 32) | c1, (c2 << 32) | c3
 
 
 def uniform(machine: Machine, bits: Any) -> Any:
-    """Return the uniform number of the upper 52 of 64 bits."""
+    """Return a uniform number in (0, 1) from the upper 52 of 64 random bits."""
     return machine.number((bits >> 12) | ONE) - (1.0 - 2.0**-53)
 
 
@@ -162,7 +162,7 @@ def logarithm(machine: Machine, u: Any) -> Any:
 
 
 def normal_pair(machine: Machine, first: Any, second: Any) -> tuple[Any, Any]:
-    """Return two normal numbers from two numbers of 64 bits."""
+    """Return two standard normal numbers from two 64-bit random integers (Box and Muller)."""
     r = machine.sqrt(logarithm(machine, uniform(machine, first)) * -2.0)
     x = uniform(machine, second) - 0.5
     y = x * x
@@ -173,12 +173,12 @@ def normal_pair(machine: Machine, first: Any, second: Any) -> tuple[Any, Any]:
 
 
 def uniform_pair(machine: Machine, first: Any, second: Any) -> tuple[Any, Any]:
-    """Return two uniform numbers from two numbers of 64 bits."""
+    """Return two uniform numbers in (0, 1) from two 64-bit random integers."""
     return uniform(machine, first), uniform(machine, second)
 
 
 class _Arrays:
-    """Arrays of NumPy, uint64 and float64."""
+    """Operations on NumPy arrays of uint64 and float64."""
 
     def bits(self, number: numpy.ndarray) -> numpy.ndarray:
         return number.view(numpy.uint64)
@@ -197,8 +197,9 @@ ARRAYS = _Arrays()
 
 
 def numbers(identities: numpy.ndarray, t: numpy.ndarray, normals: int, uniforms: int) -> numpy.ndarray:
-    """Return the random numbers of episodes at measurements: ``normals`` standard normal ones, then ``uniforms``
-    uniform ones.
+    """Return the random numbers of N episodes at measurements, ``(..., normals + uniforms, N)``.
+
+    ``normals`` standard normal numbers come first, then ``uniforms`` uniform ones.
 
     Args:
         identities: identities of the episodes, ``(2, N)`` uint64.
@@ -206,8 +207,6 @@ def numbers(identities: numpy.ndarray, t: numpy.ndarray, normals: int, uniforms:
         normals: number of normal numbers.
         uniforms: number of uniform numbers.
 
-    Returns:
-        ``(..., normals + uniforms, N)``.
     """
     key, episode = identities
     t = numpy.asarray(t).astype(numpy.uint64)[..., None, :]

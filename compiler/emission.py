@@ -1,4 +1,4 @@
-"""A program as text of LLVM: vector code for blocks of lanes.
+"""LLVM text of a program: vector code for blocks of lanes.
 
 The entry ``@program(table, first, last)`` iterates over the blocks between two lanes and calls ``@part0``, ``@part1``,
 ... for each block. A long straight line is cut into parts, because LLVM's time grows faster than the length of a
@@ -20,22 +20,22 @@ from .program import BAND, FUNCTIONS, OPERATIONS, StraightLineProgram
 from .rolling import roll_where_shorter
 
 LONG = 5000
-"""Steps from which on loops take LLVM half the time of a straight line; for shorter programs the times are equal."""
+"""Number of steps from which on loops take LLVM half the time of a straight line; below it the times are equal."""
 
 
 class _Places(NamedTuple):
-    """Places in the scratch array."""
+    """Indices in the scratch array."""
 
     slots: dict[int, int]
-    """Places of steps that cross a cut."""
+    """Index for each step that crosses a cut."""
     products: dict[int, int]
-    """Places of the results of products."""
+    """Index for the results of each product."""
     vector: int
-    """Place of the vector of a product."""
+    """Index for the vector of a product."""
 
 
 class _Part(Instructions):
-    """Text of one part; values are named by their steps."""
+    """LLVM text of one part of a program; values are named by their steps."""
 
     def __init__(
         self, program: StraightLineProgram, lane_first: Sequence[bool], places: "_Places", block: LaneBlock
@@ -45,7 +45,7 @@ class _Part(Instructions):
         self.known: set[int] = set()
 
     def value(self, step: int) -> str:
-        """Return the name of a step's value; free steps, and values in the scratch array, are read at first use."""
+        """Return the name of a step's value; inputs, constants and scratch values are loaded at first use."""
         operation, arguments, logical = self.steps[step]
         name = f"%v{step}"
         if step not in self.known:
@@ -81,7 +81,7 @@ class _Part(Instructions):
         self.operate(step.operation, values, step.logical, known, f"%v{index}")
 
     def _product(self, index: int) -> None:
-        """Store the vector in the scratch array, and call the loop that writes the product."""
+        """Append code that stores the vector in the scratch array and calls the loop of the product."""
         table, rows, *vector = self.steps[index].arguments
         for place, step in enumerate(vector):
             value = self.value(step)
@@ -115,18 +115,18 @@ def emit(
     part: int,
     loops: bool = False,
 ) -> str:
-    """Return the text of a program.
+    """Return the LLVM text of a program.
 
     Args:
         program: the program.
         lane_first: for every argument whether its layout is lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
         library: library of the functions; no function takes more lanes than the block has.
-        block: lanes that are computed at a time.
-        part: statements of a part: computed steps and stored results.
+        block: block of lanes that are computed together.
+        part: number of statements of a part: computed steps and stored results.
         loops: whether a long program is computed in loops where they are shorter.
 
     Raises:
-        KeyError: for a function that the library lacks.
+        KeyError: for a function that is not in the library.
     """
     text = [*_declarations(program, library, block)]
     rolled = roll_where_shorter(program) if loops and len(program.steps) >= LONG else None
@@ -146,7 +146,7 @@ def emit(
 def _parts(
     program: StraightLineProgram, lane_first: Sequence[bool], block: LaneBlock, size: int
 ) -> tuple[list[list[str]], int]:
-    """Return the functions of a straight line, and the length of their scratch array."""
+    """Return the LLVM functions of a straight line, and the length of their scratch array."""
     parts, _ = cut_parts(program, size)
     slots = scratch_slots(program, parts)
     places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
@@ -185,19 +185,19 @@ def _entry(block: LaneBlock, parts: int, slots: int) -> Iterator[str]:
 
 
 def product_symbol(block: LaneBlock) -> str:
-    """Return the name of the function that programs call for the product of a matrix."""
+    """Return the name of the function that multiplies a constant matrix with a vector."""
     return f"filtergym_product_{block.lanes}"
 
 
 @functools.cache
 def product_text(block: LaneBlock) -> str:
-    """Return the text of ``@program(matrix, vector, result, columns, bands)``, a product of a matrix and a vector.
+    """Return the LLVM text of ``@program(matrix, vector, result, columns, bands)``, a matrix-vector product.
 
     The matrix contains constants, the vector lane values. The rows of a band are computed in parallel; each row's terms
     are added in order. The code is separate and always optimised, as programs spend most of their time in it.
 
     Args:
-        block: lanes of the vector.
+        block: block of lanes of the vector.
     """
     return "\n".join(_product_lines(block))
 
@@ -245,7 +245,7 @@ def _product_lines(block: LaneBlock) -> Iterator[str]:
 
 
 def _declarations(program: StraightLineProgram, library: Library, block: LaneBlock) -> Iterator[str]:
-    """Yield the declarations of intrinsics, and the functions of a block made from those of the library."""
+    """Yield LLVM declarations of intrinsics, and functions of a block that call those of the library."""
     used = program.steps.operations
     if "product" in used:
         yield f"declare void @{product_symbol(block)}(ptr, ptr, ptr, i64, i64)"
@@ -261,7 +261,7 @@ def _declarations(program: StraightLineProgram, library: Library, block: LaneBlo
 
 
 def _block_function(block: LaneBlock, name: str, symbol: str, lanes: int) -> Iterator[str]:
-    """Yield the function of a block made from one of the library, which takes ``lanes`` lanes."""
+    """Yield the LLVM lines of a function of a block that calls a library function of ``lanes`` lanes."""
     width, numbers = block.lanes, block.numbers
     kind = "double" if lanes == 1 else f"<{lanes} x double>"
     operands = ("%a", "%b") if name in BINARY else ("%a",)

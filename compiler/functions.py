@@ -18,27 +18,27 @@ from .program import Graph, ProgramResult, StraightLineProgram, program
 
 DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
 UNCOUNTED = 65_536
-"""Lanes between two checks for optimised code; a check at every call would take a tenth of a short step."""
+"""Number of lanes between two checks for optimised code; a check at every call would take a tenth of a short step."""
 FEWEST = 512
-"""Fewest lanes per thread."""
+"""Minimal number of lanes of a thread."""
 
 
 class Leaf(NamedTuple):
-    """Shape and type of an array in a structure."""
+    """Shape and type of one array in a nested structure."""
 
     shape: tuple[int, ...]
-    """Shape without the last axis, the lanes."""
+    """Shape without the last axis, that of the lanes."""
     kind: str
     """Kind of the dtype: ``f``, ``i`` or ``b``."""
 
     @property
     def rows(self) -> int:
-        """Number of entries of one lane."""
+        """Number of entries of the array for one lane."""
         return math.prod(self.shape)
 
 
 def leaves(part: Any) -> list[Any]:
-    """Return the arrays of nested tuples and dictionaries, in order; None contains no array."""
+    """Return a list of the arrays in nested tuples and dictionaries, in order; None contains no array."""
     if part is None:
         return []
     if isinstance(part, dict):
@@ -49,7 +49,7 @@ def leaves(part: Any) -> list[Any]:
 
 
 def map_arrays(function: Callable[[Any], Any], part: Any) -> Any:
-    """Return the nested tuples and dictionaries with a function applied to every array."""
+    """Return nested tuples and dictionaries with a function applied to every array; None stays None."""
     if part is None:
         return None
     if isinstance(part, dict):
@@ -68,14 +68,14 @@ def _leaf(array: Any) -> Leaf:
 
 
 class Specialised:
-    """A function traced for arguments of one structure.
+    """A function traced for arguments of one structure, and its program.
 
     Args:
         function: function of nested tuples of arrays.
         graph: graph of the constants that the function refers to.
         parts: arguments, or others of the same structure.
-        turned: write the last array of the result lane by lane, ``(N, rows)``.
-        given_turned: read the first argument lane by lane, ``(N, rows)``.
+        turned: whether the last array of the result has layout ``(N, rows)``, lane by lane.
+        given_turned: whether the first argument has layout ``(N, rows)``, lane by lane.
         unchanged: outputs that may be replaced by an unchanged input: all of them (None), or those with a number below
             this one, by the input of the same number.
 
@@ -132,13 +132,13 @@ class Specialised:
         self.code: Code | None = None
 
     def compile(self, library: Library | None = None) -> Code:
-        """Return the code of the program."""
+        """Return the machine code of the program, compiled at the first call."""
         if self.code is None:
             self.code = native(self.program, self.lane_first, library)
         return self.code
 
     def bound(self, inputs: Sequence[numpy.ndarray], outputs: Sequence[numpy.ndarray]) -> "Call":
-        """Return a call of the function on fixed arrays, ``(rows, N)`` or ``(..., N)``."""
+        """Return a call of the function on fixed input and output arrays, ``(rows, N)`` or ``(..., N)``."""
         arrays = [*inputs, *outputs]
         table = [address_of(self.program.constants)]
         for array, lane_first in zip(arrays, self.lane_first, strict=True):
@@ -146,7 +146,7 @@ class Specialised:
         return Call(self.compile(), numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
 
     def call(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
-        """Run on inputs of some width; return new outputs, None where an input replaces one."""
+        """Run the function on input arrays of one width; return new output arrays, None where an input replaces one."""
         table = [address_of(self.program.constants)]
         for array in arrays:
             table += [address_of(array), _stride(array)]
@@ -172,7 +172,7 @@ class Specialised:
         return outputs
 
     def example(self) -> Any:
-        """Return a result of arrays of zeros, for tracing a function of it."""
+        """Return a result with arrays of zeros, as an example of its structure for tracing."""
         return map_arrays(
             lambda place: numpy.zeros(
                 (*self.outputs[place].shape, LANES), dtype=DTYPES[self.outputs[place].kind]
@@ -182,7 +182,7 @@ class Specialised:
 
 
 class Call:
-    """A function bound to its arrays.
+    """Machine code bound to fixed arrays.
 
     Args:
         code: code of the function.
@@ -191,7 +191,7 @@ class Call:
         constants: constants whose address is entry 0 of the table.
 
     Attributes:
-        native: the current code, see :meth:`expect`; None: not made yet.
+        native: the current machine code, see :meth:`expect`; None before the first run.
     """
 
     def __init__(
@@ -205,21 +205,21 @@ class Call:
         self.address: int = address_of(table)
 
     def expect(self, lanes: int, in_sequence: bool = False) -> Native:
-        """Return the code for a run over some lanes in all, see :meth:`.native.Code.expect`."""
+        """Return the machine code for a run over some lanes in all, see :meth:`.native.Code.expect`."""
         self.native = self._code.expect(lanes, in_sequence)
         return self.native
 
     def replace(self, place: int, array: numpy.ndarray) -> None:
-        """Replace an array by another one of the same shape."""
+        """Bind another array of the same shape as argument number ``place``."""
         self.arrays[place] = array
         self.table[1 + 2 * place : 3 + 2 * place] = address_of(array), _stride(array)
 
     def copy(self) -> "Call":
-        """Return the same call with a table of its own."""
+        """Return the same call with its own table."""
         return Call(self._code, self.table.copy(), list(self.arrays), self._constants)
 
     def __call__(self, first: int, last: int) -> None:
-        """Run over the lanes from ``first`` to before ``last``."""
+        """Run the code over the lanes from ``first`` to before ``last``."""
         self._uncounted += last - first
         native = self.native
         if native is None or self._uncounted > UNCOUNTED:
@@ -231,14 +231,16 @@ class Call:
 def run_over(
     call: Callable[[int, int], None], width: int, threads: int, fewest: int = FEWEST, grain: int = LANES
 ) -> None:
-    """Run over all lanes with some threads; the results do not depend on their number.
+    """Call a function of a range of lanes on all lanes, divided between some threads.
+
+    The results do not depend on the number of threads.
 
     Args:
         call: function of the first lane and the end of the lanes.
         width: number of lanes.
         threads: number of threads, including this one.
-        fewest: fewest lanes per thread.
-        grain: lanes that are not divided between threads.
+        fewest: minimal number of lanes of a thread.
+        grain: number of adjacent lanes that are not divided between threads.
     """
     threads = min(threads, width // fewest)
     if threads <= 1:
@@ -254,12 +256,12 @@ def run_over(
 
 @functools.cache
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Return the threads of a process; a forked process has its own."""
+    """Return the pool of threads of a process; a forked process has its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix="lanes")
 
 
 def round_up_lanes(count: int) -> int:
-    """Return the next multiple of ``LANES``."""
+    """Return the number of lanes rounded up to a multiple of ``LANES``."""
     return -(-count // LANES) * LANES
 
 
@@ -273,12 +275,12 @@ def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
 
 
 def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
-    """Return uninitialised arrays for a program's inputs or outputs."""
+    """Return a list of uninitialised arrays for a program's inputs or outputs."""
     return [empty_lanes(leaf.shape, width) for leaf in arrays]
 
 
 def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
-    """Return copies of arrays in their own types, in the structure of a template of their numbers."""
+    """Return copies of arrays in their own types, in the structure of a template of their indices."""
 
     def copied(i: int) -> numpy.ndarray:
         return memory[i].astype(DTYPES[kinds[i]], order="C")
@@ -301,7 +303,7 @@ class CompiledFunction:
     Args:
         function: function of nested tuples of arrays ``(..., N)``, which returns such tuples.
         graph: graph of the constants that the function refers to.
-        turned: write the last array of the result lane by lane, ``(N, rows)``.
+        turned: whether the last array of the result has layout ``(N, rows)``, lane by lane.
         unchanged: outputs that may be replaced by an unchanged input, see :class:`Specialised`.
 
     Raises:
@@ -318,7 +320,7 @@ class CompiledFunction:
         self._specialised: dict[Any, Specialised] = {}
 
     def specialise(self, *parts: Any) -> Specialised:
-        """Return the function for arguments of this structure."""
+        """Return the function traced for arguments of this structure."""
         key = tuple(_structure(part) for part in parts)
         if key not in self._specialised:
             self._specialised[key] = Specialised(
@@ -327,7 +329,7 @@ class CompiledFunction:
         return self._specialised[key]
 
     def __call__(self, *parts: Any, threads: int = 1) -> Any:
-        """Run on arrays of one width; return new arrays, or the given ones where unchanged.
+        """Return the function's result for arrays of one width, as new arrays, or inputs where unchanged.
 
         Args:
             *parts: nested tuples of arrays ``(..., N)``.
@@ -353,7 +355,7 @@ class CompiledFunction:
 
 
 def _structure(part: Any) -> Any:
-    """Return the structure of an argument; arguments with equal structure share one program."""
+    """Return the structure of an argument, as a key; arguments with equal keys share one program."""
     if isinstance(part, tuple):
         return type(part), *(_structure(item) for item in part)
     if isinstance(part, dict):
@@ -362,7 +364,7 @@ def _structure(part: Any) -> Any:
 
 
 def _ready(array: Any, width: int) -> numpy.ndarray:
-    """Return the array in the layout of the code: float64, contiguous rows, a multiple of eight lanes."""
+    """Return an array in the layout of the code: float64, contiguous rows, a multiple of eight lanes."""
     if array.__class__ is not numpy.ndarray or array.dtype != numpy.float64:
         array = numpy.asarray(array, dtype=numpy.float64)
     if array.shape[-1] != width:
@@ -378,17 +380,17 @@ def _ready(array: Any, width: int) -> numpy.ndarray:
 
 
 def address_of(array: numpy.ndarray) -> int:
-    """Return the address of an array's data."""
+    """Return the memory address of an array's data."""
     return int(array.__array_interface__["data"][0])
 
 
 def _stride(array: numpy.ndarray) -> int:
-    """Return the distance from one row to the next, in numbers."""
+    """Return the distance from one row to the next, as a number of entries."""
     # An axis of one row may have any stride.
     apart = [stride for length, stride in zip(array.shape[:-1], array.strides, strict=False) if length > 1]
     return apart[-1] // array.itemsize if apart else 0
 
 
 def _lane_stride(array: numpy.ndarray) -> int:
-    """Return the distance from one lane to the next in a layout lane by lane, in numbers."""
+    """Return the distance from one lane to the next for layout lane by lane, as a number of entries."""
     return array.strides[0] // array.itemsize

@@ -1,7 +1,7 @@
-"""Gradients of expressions, by reverse mode.
+"""Gradients of traced expressions, by reverse-mode differentiation.
 
-Where a derivative is not unique it is that of torch: the maximum of two equal numbers gives half to each, a number
-exactly on a constant limit receives all of it, an index of a table none.
+Where a derivative is not unique it is that of torch: half for each of two equal numbers in a maximum, all for a number
+exactly on a constant limit, none for an index of a table.
 """
 
 import math
@@ -13,7 +13,7 @@ from .namespace import Traced
 from .program import LOGICAL, Graph
 
 FLAT = frozenset((*LOGICAL, "sign", "floor", "ceil", "trunc", "rint", "number", "take", "input", "constant"))
-"""Operations without a gradient."""
+"""Operations with a gradient of zero."""
 
 
 def _of_the_larger(a: Any, one: Any, other: Any) -> tuple[Any, Any]:
@@ -68,18 +68,22 @@ RULES: dict[str, Callable[..., tuple[Any, ...]]] = {
     "acosh": lambda a, y, x: (a / xp.sqrt(x * x - 1.0),),
     "atanh": lambda a, y, x: (a / (1.0 - x * x),),
 }
-"""Adjoints of the arguments of ``y`` from its adjoint ``a``; None: no gradient."""
+"""Functions from the adjoint ``a`` of ``y``, ``y`` and its arguments to the adjoints of the arguments; None: no
+gradient.
+"""
 
 
 def pullback(
     graph: Graph, outputs: Sequence[Traced], adjoints: Sequence[Traced], inputs: Sequence[Traced]
 ) -> list[Traced]:
-    """Return the gradients of ``sum(adjoint * output)`` with respect to some arrays; the graph must be open.
+    """Return the gradients of ``sum(adjoint * output)`` with respect to some arrays, by reverse mode.
+
+    The graph must be open (:func:`.namespace.tracing`).
 
     Args:
         graph: graph of the arrays.
-        outputs: functions of the inputs.
-        adjoints: one for each output, of its shape.
+        outputs: arrays that are functions of the inputs.
+        adjoints: weights of the outputs, an array of the same shape for each.
         inputs: arrays of any shapes.
 
     Returns:

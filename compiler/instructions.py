@@ -1,4 +1,4 @@
-"""Instructions of LLVM for a block of lanes: operations, reads and writes."""
+"""LLVM instructions for a block of lanes: operations, loads and stores."""
 
 from collections.abc import Iterator, Sequence
 
@@ -10,19 +10,19 @@ _COMPARE |= {"equal": "oeq", "not_equal": "une"}
 INTRINSIC = {name: name for name in ("sqrt", "floor", "ceil", "trunc", "rint", "maximum", "minimum")}
 INTRINSIC["absolute"] = "fabs"
 HEADER = "ptr noalias readonly %table, ptr noalias %scratch, i64 %lane"
-"""Parameters of a part: addresses of arguments, the scratch array, and the first lane of the block."""
+"""LLVM parameters of a part: addresses of arguments, the scratch array, and the first lane of the block."""
 
 
 class Instructions:
-    """Text of a part.
+    """Writer of LLVM instructions of one part.
 
     Args:
         lane_first: for every argument whether its layout is lane by lane.
-        block: lanes that are computed at a time.
-        head: lines for the addresses of arguments; default: the lines of their first use.
+        block: block of lanes that are computed together.
+        head: list to which loads of arguments' addresses are appended; default: ``lines``.
 
     Attributes:
-        lines: the text.
+        lines: lines of the text.
     """
 
     def __init__(self, lane_first: Sequence[bool], block: LaneBlock, head: list[str] | None = None) -> None:
@@ -38,7 +38,7 @@ class Instructions:
         self.constants: str = self._entry("ptr", 0)
 
     def new(self, expression: str, name: str | None = None, lines: list[str] | None = None) -> str:
-        """Write an instruction and return the name of its value."""
+        """Append an instruction and return the name of its value."""
         if name is None:
             self._names += 1
             name = f"%t{self._names}"
@@ -48,7 +48,7 @@ class Instructions:
     # --- arguments
 
     def argument(self, argument: int) -> tuple[str, str]:
-        """Return the address and stride of an argument."""
+        """Return the names of an argument's address and stride, loaded at first use."""
         if argument not in self._arguments:
             self._arguments[argument] = (
                 self._entry("ptr", 1 + 2 * argument),
@@ -61,7 +61,7 @@ class Instructions:
         return self.new(f"load {kind}, ptr {address}, !invariant.load !0", lines=self.head)
 
     def place(self, argument: int, row: int | str) -> str:
-        """Return the address of the block's numbers in a row of an argument."""
+        """Return the name of the address of the block's numbers in a row of an argument."""
         address, stride = self.argument(argument)
         if argument not in self._first_rows:
             self._first_rows[argument] = self.new(
@@ -71,7 +71,7 @@ class Instructions:
         return self.new(f"getelementptr double, ptr {self._first_rows[argument]}, i64 {start}")
 
     def read(self, argument: int, row: int | str, name: str | None = None) -> str:
-        """Write the code that reads a row of an argument; return the name of the value."""
+        """Append the load of a row of an argument; return the name of the value."""
         if not self.lane_first[argument]:
             return self.new(f"load {self.numbers}, ptr {self.place(argument, row)}, align 8", name)
         value = "poison"
@@ -82,7 +82,7 @@ class Instructions:
         return value
 
     def write(self, argument: int, row: int | str, value: str) -> None:
-        """Write the code that stores a value in a row of an argument."""
+        """Append the store of a value to a row of an argument."""
         if not self.lane_first[argument]:
             self.lines.append(f"store {self.numbers} {value}, ptr {self.place(argument, row)}, align 8")
             return
@@ -91,7 +91,7 @@ class Instructions:
             self.lines.append(f"store double {number}, ptr {address}, align 8")
 
     def _lane_places(self, argument: int, row: int | str) -> Iterator[str]:
-        """Yield the addresses of the block's numbers in an argument with layout lane by lane."""
+        """Yield the names of the addresses of the block's numbers in an argument with layout lane by lane."""
         start, stride = self.argument(argument)
         first = self.new(f"mul i64 %lane, {stride}")
         first = self.new(f"add i64 {first}, {row}")
@@ -101,7 +101,7 @@ class Instructions:
             yield self.new(f"getelementptr double, ptr {start}, i64 {offset}")
 
     def constant(self, address: str, name: str | None = None) -> str:
-        """Return the value of a constant in every lane."""
+        """Append the load of a constant into every lane; return the name of the value."""
         value = self.new(f"load double, ptr {address}, !invariant.load !0")
         one = self.new(f"insertelement {self.numbers} poison, double {value}, i32 0")
         return self.new(self.block.repeat(one, self.numbers), name)
@@ -109,38 +109,38 @@ class Instructions:
     # --- operations
 
     def as_number(self, truth: str, name: str | None = None) -> str:
-        """Return the value of one where a truth value is true, else zero."""
+        """Append the conversion of a boolean to one or zero; return the name of the value."""
         return self.choice(truth, self.block.one, self.block.zero, name=name)
 
     def as_truth(self, number: str, name: str | None = None) -> str:
-        """Return the truth value of a number: whether it is not zero."""
+        """Append the comparison of a number with zero; return the name of the boolean."""
         return self.compare("une", number, self.block.zero, name)
 
     def choice(
         self, condition: str, one: str, other: str, kind: str | None = None, name: str | None = None
     ) -> str:
-        """Return the value of a choice between two values in each lane."""
+        """Append the choice between two values in each lane; return the name of the value."""
         kind = kind or self.numbers
         return self.new(f"select {self.truths} {condition}, {kind} {one}, {kind} {other}", name)
 
     def compare(self, how: str, one: str, other: str, name: str | None = None) -> str:
-        """Return the truth value of a comparison in each lane."""
+        """Append a comparison in each lane; return the name of the boolean."""
         return self.new(f"fcmp {how} {self.numbers} {one}, {other}", name)
 
     def call(self, function: str, *values: str, name: str | None = None) -> str:
-        """Return the value of a call of a function of numbers."""
+        """Append a call of a function of numbers; return the name of the value."""
         listed = ", ".join(f"{self.numbers} {value}" for value in values)
         return self.new(f"call {self.numbers} {function}({listed})", name)
 
     def operate(
         self, operation: str, values: Sequence[str], logical: bool, known: Sequence[bool], name: str
     ) -> None:
-        """Write the code of an operation.
+        """Append the instructions of an operation.
 
         Args:
             operation: operation of a step, except ``take`` and ``product``.
             values: names of its arguments.
-            logical: whether its result is a truth value.
+            logical: whether its result is a boolean.
             known: whether each argument is a constant.
             name: name of the result.
         """
@@ -177,7 +177,7 @@ class Instructions:
             self.call(callee, a, *rest, name=name)
 
     def _remainder(self, a: str, b: str, name: str) -> None:
-        """Write the remainder with the sign of the divisor, rounded once if the quotient is below ``2^53``."""
+        """Append the remainder with the sign of the divisor, rounded once if the quotient is below ``2^53``."""
         quotient = self.new(f"fdiv {self.numbers} {a}, {b}")
         whole = self.call(self.block.intrinsic("floor"), quotient)
         minus = self.new(f"fneg {self.numbers} {whole}")
@@ -188,7 +188,7 @@ class Instructions:
         self.choice(opposite, above, rest, name=name)
 
     def take(self, start: int, length: int, place: str, name: str) -> None:
-        """Write the code that reads a table of constants from the index ``start`` on."""
+        """Append the lookup in a table of constants that begins at the index ``start``."""
         size, last = self.block.constant(f"{length}.0"), self.block.constant(f"{length - 1}.0")
         from_end = self.new(f"fadd {self.numbers} {place}, {size}")
         place = self.choice(self.compare("olt", place, self.block.zero), from_end, place)

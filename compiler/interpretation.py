@@ -1,4 +1,4 @@
-"""Interpreter of programs in NumPy, in any precision: slow, and the reference for other languages."""
+"""NumPy interpreter of programs, in any precision: slow, and the reference for code in other languages."""
 
 import functools
 import operator
@@ -13,7 +13,7 @@ _COMPUTE: dict[str, Callable[..., Any]] = {**OPERATIONS, **FUNCTIONS, "where": n
 
 
 def first_steps(program: StraightLineProgram, results: int) -> int:
-    """Return the number of steps after which the first results are known."""
+    """Return the number of steps after which a program's first results are computed."""
     return 1 + max((result.node for result in program.results[:results]), default=-1)
 
 
@@ -24,7 +24,7 @@ def interpret(
     between: Callable[[Sequence[numpy.ndarray]], None] | None = None,
     results: int = 0,
 ) -> list[numpy.ndarray]:
-    """Compute the results of a program for N lanes.
+    """Return the results of a program for N lanes, computed with NumPy.
 
     Args:
         program: the program.
@@ -76,7 +76,7 @@ def in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
 
 
 def _places(index: Any, length: int) -> numpy.ndarray:
-    """Return indices in a table: negative ones count from the end, others are clipped to the range, NaN is zero."""
+    """Return valid indices into a table: negative ones count from the end, others are clipped, NaN is zero."""
     index = numpy.asarray(index, dtype=float)
     index = numpy.where(index < 0.0, index + length, index)
     inside = numpy.where(index > 0.0, numpy.minimum(index, length - 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""Libraries of exponentials and other functions, for several lanes at a time or one by one.
+"""Libraries of elementary functions such as exp and sin, for one or several lanes per call.
 
 On Linux glibc has vector functions, with errors up to four units in the last place. Where they are missing, the scalar
 functions of the C library replace them, which every platform has.
@@ -14,26 +14,26 @@ from .program import FUNCTIONS
 
 BINARY = frozenset(("atan2", "pow", "hypot"))
 VARIANTS = {"avx512f": ("e", 8), "avx2": ("d", 4), "sse4.1": ("b", 2), "neon": ("n", 2)}
-"""Glibc's letter for the vectors of an instruction set, and their number of float64."""
+"""Letter in glibc's symbols for the vectors of an instruction set, and their number of float64."""
 ROUNDING = ("floor", "ceil", "trunc", "rint", "fma")
-"""Functions that LLVM calls from the C library where the processor has no instruction."""
+"""Functions that LLVM calls from the C library if the processor has no instruction for them."""
 
 
 class LibraryFunction(NamedTuple):
-    """Function of a library."""
+    """Symbol, number of lanes and address of a library function."""
 
     symbol: str
     lanes: int
-    """Numbers per call."""
+    """Number of float64 per call."""
     address: int
 
 
 class Library(NamedTuple):
-    """A library with its functions."""
+    """Name and functions of a library."""
 
     name: str
     functions: dict[str, LibraryFunction]
-    """Functions by the names of :data:`~.program.FUNCTIONS` and of ``ROUNDING``."""
+    """Functions by their names in :data:`~.program.FUNCTIONS` and ``ROUNDING``."""
 
 
 def _address(library: ctypes.CDLL, symbol: str) -> int | None:
@@ -65,10 +65,10 @@ def portable_library() -> Library:
 
 @functools.cache
 def fastest_library(features: str) -> Library:
-    """Return the fastest library for a processor.
+    """Return the fastest functions for a processor: vector functions of glibc if it has them.
 
     Args:
-        features: features in LLVM's form, ``+avx2,-avx512f,...``.
+        features: features of the processor in LLVM's form, ``+avx2,-avx512f,...``.
     """
     there = features.split(",")
     vectors = _open("libmvec.so.1")

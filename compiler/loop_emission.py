@@ -1,7 +1,7 @@
-"""Loops of a program as text of LLVM: a function for each, whose turns compute the members of its statements.
+"""LLVM text of the loops of a program: one function for each loop.
 
-The place of a member's number depends on the turn: its distance from the first is a multiple of the turn's number, or
-an entry of a table.
+The location of a member's number depends on the turn: its distance from the first is a multiple of the turn's number,
+or an entry of a table.
 """
 
 from collections.abc import Sequence
@@ -12,18 +12,18 @@ from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Statement, common_
 
 
 class DistanceTables:
-    """Tables of irregular distances between members, as constants of the text."""
+    """LLVM constants with the irregular distances between members."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[int, ...], int] = {}
 
     def find(self, distances: tuple[int, ...]) -> tuple[str, str]:
-        """Return the name of a table, and the type of its entries."""
+        """Return the name of the table with these distances, and the LLVM type of its entries."""
         number = self._found.setdefault(distances, len(self._found))
         return f"@places{number}", _kind(distances)
 
     def text(self) -> list[str]:
-        """Return the definitions."""
+        """Return the LLVM lines that define the tables."""
         return [
             f"@places{number} = internal constant [{len(distances)} x {kind}] ["
             + ", ".join([f"{kind} {distance}" for distance in distances])
@@ -38,12 +38,12 @@ def _kind(distances: Sequence[int]) -> str:
 
 
 class LoopText(Instructions):
-    """Text of a loop.
+    """Writer of the LLVM text of one loop.
 
     Args:
         loop: the loop.
         lane_first: for every argument whether its layout is lane by lane.
-        block: lanes that are computed at a time.
+        block: block of lanes that are computed together.
         tables: tables of all loops.
     """
 
@@ -60,7 +60,7 @@ class LoopText(Instructions):
             self._compute(statement)
 
     def text(self, number: int) -> list[str]:
-        """Return the function ``@partN``."""
+        """Return the LLVM lines of the loop as a function ``@partN``."""
         lines = [f"define internal void @part{number}({HEADER}) {{", "entry:", *self.head]
         if self.loop.turns == 1:
             return [*lines, *self.lines, "ret void", "}"]
@@ -127,7 +127,7 @@ class LoopText(Instructions):
         return first if way is None else way if first == 0 else self.new(f"add i64 {way}, {first}")
 
     def _way(self, places: tuple[int, ...]) -> tuple[int, str | None]:
-        """Return the first place, and the name of the turn's distance from it; None: zero."""
+        """Return a base location, and the name of the LLVM value of a turn's distance from it; None: zero."""
         step = common_difference(places)
         if step == 0:
             return places[0], None

@@ -1,4 +1,4 @@
-"""Arrays of expressions, and the functions of the array API standard on them.
+"""Traced arrays (arrays of expressions) and the functions of the array API standard on them.
 
 A :class:`Traced` replaces an array: shapes, indices and broadcasting are those of NumPy, which moves the numbers of the
 expressions, and arithmetic makes new expressions in the :class:`~.program.Graph` that :func:`tracing` has opened. All
@@ -26,12 +26,12 @@ _OPEN: ContextVar[Graph] = ContextVar("graph")
 
 
 class NotTraceable(TypeError):  # noqa: N818  (not an error in the function)
-    """A function that cannot be expressed as a straight line of arithmetic."""
+    """Error for a function that cannot be expressed as a straight line of arithmetic."""
 
 
 @contextmanager
 def tracing(graph: Graph) -> Iterator[Graph]:
-    """Make arithmetic inside create expressions of a graph; other threads wait.
+    """Open a graph inside the context: arithmetic on traced arrays adds expressions to it; other threads wait.
 
     Raises:
         NotTraceable: in place of any exception inside, as functions may fail on symbols in any way.
@@ -51,7 +51,7 @@ def tracing(graph: Graph) -> Iterator[Graph]:
 
 
 def _plain_value(array: Any, use: str) -> Any:
-    """Return the plain value that the open graph has for an expression, see :meth:`.Graph.settle`."""
+    """Return the number that the open graph has for an expression, see :meth:`.Graph.settle`; None: it has none."""
     graph = _OPEN.get(None)
     return None if graph is None or array.nodes.size != 1 else graph.settle(array.nodes.item(), use)
 
@@ -94,11 +94,11 @@ def _refuse_entry(self: Any, *_: Any) -> Any:
 
 
 class Traced:
-    """Array of expressions.
+    """Array of expressions of a graph.
 
     Attributes:
-        nodes: the expressions, as numbers in the open graph.
-        dtype: type of the array that they replace.
+        nodes: indices of the expressions in the open graph.
+        dtype: type of the array that is traced.
     """
 
     __slots__ = ("dtype", "nodes")
@@ -117,7 +117,7 @@ class Traced:
         self.dtype: numpy.dtype = numpy.dtype(dtype)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
-        """Return an array of objects, for which NumPy's own arithmetic makes expressions, too."""
+        """Return a NumPy array of objects, for which NumPy's own arithmetic creates expressions."""
         from . import numpy_functions  # noqa: F401  (adds the methods that NumPy calls)
 
         objects = numpy.empty(self.shape, dtype=object)
@@ -191,62 +191,62 @@ class Traced:
         return matmul(other, self)
 
     def sum(self, axis: int | None = None) -> "Traced":
-        """Return the sum along an axis, or of all."""
+        """Return the sum along an axis, or of all entries."""
         return sum(self, axis=axis)
 
     def min(self, axis: int | None = None) -> "Traced":
-        """Return the smallest entry along an axis, or of all."""
+        """Return the smallest entry along an axis, or of all entries."""
         return min(self, axis=axis)
 
     def max(self, axis: int | None = None) -> "Traced":
-        """Return the largest entry along an axis, or of all."""
+        """Return the largest entry along an axis, or of all entries."""
         return max(self, axis=axis)
 
     def any(self, axis: int | None = None) -> "Traced":
-        """Return whether any entry along an axis is true."""
+        """Return whether any entry is true, along an axis or of all."""
         return any(self, axis=axis)
 
     def all(self, axis: int | None = None) -> "Traced":
-        """Return whether all entries along an axis are true."""
+        """Return whether all entries are true, along an axis or of all."""
         return all(self, axis=axis)
 
     def mean(self, axis: int | None = None) -> "Traced":
-        """Return the mean along an axis, or of all."""
+        """Return the mean along an axis, or of all entries."""
         from .numpy_functions import mean
 
         return mean(self, axis)
 
     def item(self) -> "Traced":
-        """Return the only entry."""
+        """Return the only entry, as an array without axes."""
         return self.reshape(())
 
     def dot(self, other: Any) -> "Traced":
-        """Return the product with a vector or a matrix."""
+        """Return the matrix product with a vector or a matrix."""
         return matmul(self, other)
 
     def ravel(self) -> "Traced":
-        """Return all entries in a row."""
+        """Return all entries as a vector."""
         return self.reshape(-1)
 
     def reshape(self, *shape: Any) -> "Traced":
-        """Return the same entries in another shape."""
+        """Return the same entries with another shape."""
         return Traced(self.nodes.reshape(*shape), self.dtype)
 
     def conjugate(self) -> "Traced":
-        """Return the array itself, which is real."""
+        """Return the array itself, since it is real."""
         return self
 
     def astype(self, dtype: Any) -> "Traced":
-        """Return the entries as another type."""
+        """Return the entries converted to another type."""
         return astype(self, dtype)
 
     def copy(self) -> "Traced":
-        """Return the array itself, which is immutable."""
+        """Return the array itself, since it is immutable."""
         return self
 
 
 def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None) -> Traced:
-    """Return an array of constants as a traced array, or a traced array unchanged."""
+    """Return numbers or an array as a traced array of constants; a traced array is returned unchanged."""
     if isinstance(values, Traced):
         return values if dtype is None else astype(values, dtype)
     if isinstance(values, list | tuple) and builtins.any(isinstance(value, Traced) for value in values):
@@ -284,7 +284,7 @@ def _numbers(array: Traced) -> Traced:
 
 
 def _join(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
-    """Return the arrays as traced arrays of one kind, numbers or truth values, and NumPy's common type."""
+    """Return arrays as traced arrays of one kind, numbers or booleans, and NumPy's common type."""
     if builtins.all(isinstance(array, Traced) and array.dtype == float64 for array in arrays):
         return list(arrays), float64
     found = [asarray(array) for array in arrays]
@@ -365,35 +365,35 @@ Traced.__hash__ = None  # type: ignore[assignment]
 
 
 def square(x: Any) -> Traced:
-    """Return the square."""
+    """Return the square of each entry."""
     return multiply(x, x)
 
 
 def isnan(x: Any) -> Traced:
-    """Return whether an entry is NaN."""
+    """Return a boolean array: whether each entry is NaN."""
     return not_equal(x, x)
 
 
 def isfinite(x: Any) -> Traced:
-    """Return whether an entry is finite."""
+    """Return a boolean array: whether each entry is finite."""
     return less_equal(abs(x), float(numpy.finfo(float64).max))
 
 
 def where(condition: Any, one: Any, other: Any) -> Traced:
-    """Choose between two arrays by a condition."""
+    """Return entries of ``one`` where a condition is true, else of ``other``."""
     arrays, dtype = _join([one, other])
     return _elementwise("where", [astype(condition, bool), *arrays], dtype)
 
 
 def clip(x: Any, min: Any = None, max: Any = None) -> Traced:
-    """Limit the entries to an interval."""
+    """Return the entries limited to an interval."""
     if min is not None:
         x = maximum(x, min)
     return asarray(x) if max is None else minimum(x, max)
 
 
 def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
-    """Convert to another type; a conversion to integers truncates."""
+    """Return the entries converted to another type; conversion to integers truncates."""
     x, dtype = asarray(x), numpy.dtype(dtype)
     if dtype.kind not in "fiub":
         raise NotTraceable(f"arrays of {dtype} cannot be traced")
@@ -407,7 +407,7 @@ def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
 
 
 def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
-    """Return NumPy's function that moves the entries of one array, for traced arrays."""
+    """Return the traced form of a NumPy function that rearranges the entries of one array."""
 
     @functools.wraps(move)
     def function(x: Any, *arguments: Any, **keywords: Any) -> Traced:
@@ -418,7 +418,7 @@ def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
 
 
 def _gatherer(gather: Callable[..., Any]) -> Callable[..., Traced]:
-    """Return NumPy's function that joins several arrays, for traced arrays."""
+    """Return the traced form of a NumPy function that joins several arrays."""
 
     @functools.wraps(gather)
     def function(arrays: Any, *, axis: int | None = 0) -> Traced:
@@ -439,7 +439,7 @@ concat, stack = _gatherer(numpy.concat), _gatherer(numpy.stack)
 
 
 def _maker(make: Callable[..., Any]) -> Callable[..., Traced]:
-    """Return NumPy's function that makes an array of constants, for traced arrays."""
+    """Return the traced form of a NumPy function that creates an array of constants."""
 
     @functools.wraps(make)
     def function(*arguments: Any, dtype: Any = None, device: Any = None) -> Traced:
@@ -452,12 +452,12 @@ zeros, ones, eye, arange = (_maker(make) for make in (numpy.zeros, numpy.ones, n
 
 
 def full(shape: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
-    """Return an array of one value, which may depend on inputs."""
+    """Return an array filled with one value, which may be traced."""
     return broadcast_to(asarray(value, dtype), shape)
 
 
 def full_like(x: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
-    """Return an array of one value with the shape of another."""
+    """Return an array filled with one value, with the shape of another array."""
     x = asarray(x)
     return full(x.shape, value, dtype=dtype or x.dtype)
 
@@ -466,22 +466,22 @@ zeros_like, ones_like = functools.partial(full_like, value=0), functools.partial
 
 
 def tril(x: Any, /, *, k: int = 0) -> Traced:
-    """Return the lower triangle, with zeros above it."""
+    """Return the lower triangle of matrices, with zeros above it."""
     x = asarray(x)
     return where(numpy.tril(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
 
 
 def triu(x: Any, /, *, k: int = 0) -> Traced:
-    """Return the upper triangle, with zeros below it."""
+    """Return the upper triangle of matrices, with zeros below it."""
     x = asarray(x)
     return where(numpy.triu(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
 
 
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
-    """Return the entries at indices along an axis.
+    """Return the entries at indices along an axis; indices may be traced.
 
-    Indices that depend on inputs read a table of constants, or select among expressions one by one. A large table of
-    constants should be an array of NumPy, whose numbers do not become expressions.
+    Traced indices read a table of constants, or select among expressions one by one. A large table of constants should
+    be a NumPy array, whose numbers do not become expressions.
     """
     indices = asarray(indices)
     if indices.dtype == bool:
@@ -504,7 +504,7 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
 
 
 def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) -> numpy.ndarray:
-    """Return the entries of each row ``(R, choices)`` at the indices, ``(R, places)``."""
+    """Return the expressions in each row ``(R, choices)`` at the indices, ``(R, places)``."""
     chosen = numpy.empty((len(rows), len(places)), dtype=numpy.int64)
     open_rows, open_places = [], []
     graph.begin_group()
@@ -551,7 +551,7 @@ any, all = _reduction(logical_or), _reduction(logical_and)
 
 
 def sort(x: Any, /, *, axis: int = -1) -> Traced:
-    """Sort by comparing neighbours."""
+    """Return the entries sorted along an axis, by a sorting network of minima and maxima."""
     rows = list(moveaxis(x, axis, 0))
     for end in range(len(rows) - 1, 0, -1):
         for i in range(end):
@@ -560,11 +560,11 @@ def sort(x: Any, /, *, axis: int = -1) -> Traced:
 
 
 LARGE = 256
-"""Nonzero constants of a matrix from which on its product becomes a loop; fewer are a short straight line."""
+"""Minimal number of nonzero constants of a matrix for a product as a loop; for fewer it is a straight line."""
 
 
 def _is_loop(matrix: Any) -> builtins.bool:
-    """Return whether the product with a matrix is a loop: many constants, few of them zero."""
+    """Return whether the product with a matrix becomes a loop: many constants, few of them zero."""
     if not isinstance(matrix, numpy.ndarray) or matrix.ndim != 2 or not _OPEN.get().loops:
         return False
     count = int(numpy.count_nonzero(matrix))
@@ -572,7 +572,7 @@ def _is_loop(matrix: Any) -> builtins.bool:
 
 
 def matmul(a: Any, b: Any, /) -> Traced:
-    """Return the product of matrices; terms are added in order, and terms with a constant zero are omitted.
+    """Return the matrix product, with terms added in order and those with a constant zero left out.
 
     Where the graph allows loops, the product with a large matrix of constants is a loop.
     """

@@ -1,4 +1,4 @@
-"""Machine code of programs for the current processor."""
+"""Compilation of programs to machine code for the current processor, with a cache."""
 
 import contextvars
 import ctypes
@@ -21,14 +21,14 @@ from .library import Library, fastest_library
 from .program import LOCK, StraightLineProgram
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
-"""Whether programs can be compiled here."""
+"""Whether programs can be compiled: llvmlite is installed."""
 _ENGINES: list[Any] = []
-"""Engines that own the code; they are never freed, as the code may be called at any time."""
+"""LLVM engines that own the machine code; they are never freed, since the code may be called at any time."""
 
 
 @functools.cache
 def llvm() -> ModuleType:
-    """Return the binding of llvmlite, ready for this processor.
+    """Return the module ``llvmlite.binding``, initialised for this processor.
 
     Raises:
         ImportError: without llvmlite.
@@ -41,8 +41,9 @@ def llvm() -> ModuleType:
 
 
 PROCESSOR = "FILTERGYM_COMPILER_PROCESSOR"
-"""Environment variable: an older processor to whose instructions the code is limited, as ``NAME,+FEATURE,...``; see
-:func:`processor`."""
+"""Environment variable with an older processor to whose instructions the code is limited, as ``NAME,+FEATURE,...``,
+see :func:`processor`.
+"""
 
 
 def processor() -> tuple[str, str]:
@@ -66,7 +67,7 @@ def processor() -> tuple[str, str]:
 
 @functools.cache
 def _host() -> tuple[str, str]:
-    """Return name and features of this processor, from a cache as LLVM detects them at every call."""
+    """Return name and features of the current processor, cached since LLVM detects them at every call."""
     return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
 
 
@@ -76,20 +77,20 @@ def _target(level: int = 1) -> Any:
 
 
 class Setting(NamedTuple):
-    """Settings of code generation; the results have the same bits in every setting."""
+    """Settings of code generation; results have the same bits in every setting."""
 
     lanes: int
-    """Lanes of a block."""
+    """Number of lanes of a block."""
     part: int
-    """Statements of a part."""
+    """Number of statements of a part."""
     level: int
-    """Level of LLVM's optimisation of code."""
+    """LLVM's optimisation level."""
     loops: bool = False
     """Whether a long program is computed in loops."""
 
 
 def quick_setting(features: str, has_products: bool) -> Setting:
-    """Return the setting with the shortest compilation: no optimisation, loops, blocks of one register.
+    """Return the code generation setting with the shortest compilation: no optimisation, loops, small blocks.
 
     With products of matrices the blocks are those of the fastest code, as a product takes twice as long in half of a
     block.
@@ -104,18 +105,21 @@ def quick_setting(features: str, has_products: bool) -> Setting:
 OPTIMISED = Setting(LANES, 200, 1)
 """The setting with the fastest code; where a register has four lanes, a block is two registers."""
 HOT = 2_000_000
-"""Lanes after which optimisation is worth its time: three to five times that of the quick setting, for code that takes
-up to a third less. Both times are proportional to the program's length, so this number does not depend on it."""
+"""Number of lanes after which optimisation is worth its time: three to five times that of the quick setting, for code
+that takes up to a third less. Both times are proportional to the program's length, so this number does not depend on
+it.
+"""
 IN_LOOPS = 10
 """Divisor of :data:`HOT` where the quick code is loops, which take 1.4 to 2.2 times as long: by then they have lost
 about the time in which a straight line is compiled, so neither choice loses more than that."""
 LONG, LONGEST = 20_000, 100_000
-"""Steps of a program from which on optimisation saves no time, as its numbers exceed the nearest caches; and from which
-on a straight line saves none either, as its code exceeds them."""
+"""Numbers of steps from which on optimisation saves no time, since the numbers exceed the nearest caches; and from
+which on a straight line saves none either, since its code exceeds them.
+"""
 
 
 def better_setting(quick: Setting, steps: int, in_loops: bool) -> Setting | None:
-    """Return the setting of the fastest code; None: the quick setting.
+    """Return the code generation setting with the fastest code; None if that is the quick one.
 
     Args:
         quick: the quick setting.
@@ -128,28 +132,27 @@ def better_setting(quick: Setting, steps: int, in_loops: bool) -> Setting | None
 
 
 Native = Callable[[int, int, int], None]
-"""Code of a program; arguments: address of the table of arguments, first lane, end of the lanes."""
+"""Machine code of a program, a function of the address of the table of arguments, the first lane and the end of the
+lanes.
+"""
 NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-"""Signature of :data:`Native` for ctypes."""
+"""ctypes signature of :data:`Native`."""
 PRODUCT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, ctypes.c_int64)
-"""Signature of the product of a matrix, see :func:`~.emission.product_text`."""
+"""ctypes signature of the matrix-vector product, see :func:`~.emission.product_text`."""
 
 
 def address_of_code(code: Any) -> int:
-    """Return the address of a native function."""
+    """Return the memory address of a native function."""
     return ctypes.cast(code, ctypes.c_void_p).value or 0
 
 
 _EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=False)
-"""Whether programs are optimised at once."""
+"""Whether programs are optimised at once, in the present context."""
 
 
 @contextmanager
 def optimised_code() -> Iterator[None]:
-    """Optimise programs that run inside in a :class:`~.sequence.CallSequence` at once.
-
-    Measured times then depend neither on the cache nor on the duration of earlier runs.
-    """
+    """Optimise programs in a :class:`~.sequence.CallSequence` at once in the context, for reproducible times."""
     token = _EAGER.set(True)
     try:
         yield
@@ -158,14 +161,14 @@ def optimised_code() -> Iterator[None]:
 
 
 class Code:
-    """Code of a program, made before its first run.
+    """Machine code of a program, compiled before its first run and optimised after many lanes.
 
     A program is first compiled quickly, and optimised once it has run over many lanes, where that saves time.
 
     Args:
-        make: makes the code.
-        optimise: makes optimised code; None: there is none.
-        hot: lanes after which it is made.
+        make: function that compiles the code quickly.
+        optimise: function that compiles optimised code; None: there is none.
+        hot: number of lanes after which the code is optimised.
     """
 
     def __init__(
@@ -175,10 +178,10 @@ class Code:
         self._run: Native | None = None
 
     def expect(self, lanes: int, in_sequence: bool = False) -> Native:
-        """Return the code for a run over some lanes, optimised where that has become worth its time.
+        """Return the machine code for a run over some lanes, optimised if that has become worth its time.
 
         Args:
-            lanes: number of lanes, in all steps.
+            lanes: number of lanes of the run, summed over its steps.
             in_sequence: whether many steps are one native call, to which :func:`optimised_code` applies.
         """
         self._lanes += lanes
@@ -233,12 +236,14 @@ def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Li
 
 
 def native_text(text: str, signature: Any = NATIVE, level: int = 1) -> Any:
-    """Return code of a text that calls no library function, so that its results are the same on every processor.
+    """Return a native function compiled from an LLVM text without library functions.
+
+    Its results are the same on every processor.
 
     Args:
-        text: text of LLVM with an entry ``@program``.
-        signature: signature of the entry in ctypes; default: that of :data:`Native`, ``(table, first, last)``.
-        level: level of LLVM's optimisation of code.
+        text: LLVM text with a function ``@program``.
+        signature: ctypes signature of the function; default: that of :data:`Native`, ``(table, first, last)``.
+        level: LLVM's optimisation level.
 
     Raises:
         ImportError: without llvmlite.
@@ -255,7 +260,7 @@ def _key(*texts: str) -> str:
 
 
 def _text_of(program: StraightLineProgram) -> str:
-    """Return a text that is unique for steps and results and independent of constants; faster than emission."""
+    """Return a text that identifies steps and results of a program, independent of constants; faster than emission."""
     steps, results = program.steps, numpy.array(program.results, dtype=numpy.int64)
     columns = (steps.kinds, steps.begins, steps.arguments, steps.logical, results)
     return " ".join(steps.names) + hashlib.sha256(b"".join(map(numpy.ndarray.tobytes, columns))).hexdigest()
@@ -263,12 +268,12 @@ def _text_of(program: StraightLineProgram) -> str:
 
 @functools.cache
 def _own_text() -> str:
-    """Return the source text of this compiler, on which the code of a program depends."""
+    """Return the source text of this compiler, on which the machine code depends."""
     return "".join(path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py")))
 
 
 def _load(key: str, write: Callable[[], str], signature: Any, level: int = 1) -> Any:
-    """Load the code of a text, from the cache or after translation."""
+    """Return the native function for a key, from the cache or compiled from the text that ``write`` returns."""
     binding = llvm()
     code = cache.load(key)
     if code is None:
@@ -283,6 +288,6 @@ def _load(key: str, write: Callable[[], str], signature: Any, level: int = 1) ->
 
 
 _CODES: dict[str, Code] = {}
-"""Code of programs that this process has loaded, by the key of the quick code."""
+"""Codes of the programs that this process has loaded, by the key of the quick code."""
 _TEXTS: dict[str, Any] = {}
-"""Code of texts, by its key."""
+"""Native functions of LLVM texts, by key."""

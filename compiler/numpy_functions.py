@@ -1,4 +1,4 @@
-"""NumPy's own functions on traced arrays, so that functions written with NumPy can be traced, too.
+"""NumPy functions on traced arrays, so that functions written with NumPy can be traced.
 
 NumPy dispatches its functions to the arrays of a call (protocols ``__array_ufunc__`` and ``__array_function__``).
 Functions of the array API standard are computed by :mod:`.namespace`, others here. NumPy computes the remaining
@@ -16,7 +16,7 @@ from .namespace import NotTraceable, Traced
 
 
 def log_add_exp(one: Any, other: Any) -> Traced:
-    """Return the logarithm of the sum of two exponentials, without overflow."""
+    """Return the logarithm of the sum of two exponentials, ``numpy.logaddexp``, without overflow."""
     larger = namespace.maximum(one, other)
     apart = namespace.abs(namespace.subtract(one, other))
     # The difference of two equal infinities is NaN.
@@ -25,7 +25,7 @@ def log_add_exp(one: Any, other: Any) -> Traced:
 
 
 def arg_max(x: Any, axis: int) -> Traced:
-    """Return the index of the largest entry along an axis, the first of several."""
+    """Return the index of the first largest entry along an axis, ``numpy.argmax``."""
     rows = namespace.moveaxis(x, axis, 0)
     place: Any = namespace.zeros_like(rows[0], dtype=namespace.float64)
     largest: Any = rows[0]
@@ -37,46 +37,46 @@ def arg_max(x: Any, axis: int) -> Traced:
 
 
 def mean(x: Any, axis: Any = None) -> Traced:
-    """Return the mean along an axis, or of all."""
+    """Return the mean along an axis, or of all entries."""
     axes = range(x.ndim) if axis is None else axis if isinstance(axis, tuple) else (axis,)
     return namespace.divide(namespace.sum(x, axis=axis), float(numpy.prod([x.shape[i] for i in axes])))
 
 
 def replace_not_finite(x: Any) -> Traced:
-    """Replace NaN by zero, and infinities by the largest number with the same sign."""
+    """Return the array with NaN replaced by zero and infinities by the largest numbers, ``numpy.nan_to_num``."""
     largest = float(numpy.finfo(float).max)
     return namespace.clip(namespace.where(namespace.isnan(x), 0.0, x), -largest, largest)
 
 
 def copy_array(x: Any, order: str = "K") -> Traced:
-    """Return the array itself, which is immutable."""
+    """Return the array itself, since it is immutable."""
     return namespace.asarray(x)
 
 
 def full_like(x: Any, value: Any, dtype: Any = None) -> Traced:
-    """Return an array of one value with the shape of another."""
+    """Return an array filled with one value, with the shape of another array."""
     return namespace.full_like(x, value, dtype=dtype)
 
 
 def concatenate(arrays: Sequence[Any], axis: int | None = 0) -> Traced:
-    """Join arrays along an axis."""
+    """Return arrays joined along an axis."""
     return namespace.concat(list(arrays), axis=axis)
 
 
 def stack(arrays: Sequence[Any], axis: int = 0) -> Traced:
-    """Join arrays along a new axis."""
+    """Return arrays joined along a new axis."""
     return namespace.stack(list(arrays), axis=axis)
 
 
 def split(x: Any, sections: int, axis: int = 0) -> list[Traced]:
-    """Cut an array into equal parts."""
+    """Return a list of the equal parts of an array along an axis."""
     return [Traced(part, x.dtype) for part in numpy.split(x.nodes, sections, axis)]
 
 
 def interpolate(
     x: Any, places: Any, values: Any, left: Any = None, right: Any = None, period: None = None
 ) -> Traced:
-    """Interpolate linearly between increasing places, with the end values outside."""
+    """Return linear interpolations between increasing points, ``numpy.interp``."""
     if period is not None:
         raise _refusal(numpy.interp, {"period": period})
     places = numpy.asarray(places, dtype=float)
@@ -91,20 +91,20 @@ def interpolate(
 
 
 def norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Traced:
-    """Return the Euclidean norm along an axis, or of all."""
+    """Return the Euclidean norm along an axis, or of all entries."""
     if ord not in (None, 2) or (ord == 2 and x.ndim > 1 and not isinstance(axis, int)):
         raise _refusal(numpy.linalg.norm, {"ord": ord})
     return namespace.sqrt(namespace.sum(namespace.square(x), axis=axis, keepdims=keepdims))
 
 
 def dot(one: Any, other: Any) -> Traced:
-    """Return the product of vectors, matrices or numbers."""
+    """Return the product of vectors, matrices or numbers, ``numpy.dot``."""
     one, other = namespace.asarray(one), namespace.asarray(other)
     return namespace.matmul(one, other) if one.ndim and other.ndim else namespace.multiply(one, other)
 
 
 def select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) -> Traced:
-    """Choose by the first condition that is true."""
+    """Return for each entry the choice of the first true condition, ``numpy.select``."""
     found = default
     for condition, choice in reversed([*zip(conditions, choices, strict=True)]):
         found = namespace.where(condition, choice, found)
@@ -112,12 +112,12 @@ def select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) 
 
 
 def cube_root(x: Any) -> Traced:
-    """Return the real cube root, also for negative numbers."""
+    """Return the real cube root, also of negative numbers, ``numpy.cbrt``."""
     return namespace.multiply(namespace.sign(x), namespace.pow(namespace.abs(x), 1.0 / 3.0))
 
 
 def remainder_of_dividend(one: Any, other: Any) -> Traced:
-    """Return the remainder with the sign of the dividend."""
+    """Return the remainder with the sign of the dividend, ``numpy.fmod``."""
     size = namespace.remainder(namespace.abs(one), namespace.abs(other))
     return namespace.multiply(namespace.where(namespace.less(one, 0.0), -1.0, 1.0), size)
 
@@ -190,7 +190,7 @@ UFUNCS: Mapping[Any, Callable[..., Any]] = {
     **dict.fromkeys((numpy.degrees, numpy.rad2deg), lambda x: namespace.multiply(x, 180.0 / numpy.pi)),
     **dict.fromkeys((numpy.radians, numpy.deg2rad), lambda x: namespace.multiply(x, numpy.pi / 180.0)),
 }
-"""Elementwise functions by NumPy's objects."""
+"""Traced form of each elementwise NumPy function."""
 REDUCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.add: namespace.sum,
     numpy.multiply: namespace.prod,
@@ -200,7 +200,7 @@ REDUCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.logical_or: namespace.any,
     numpy.logaddexp: namespace._reduction(log_add_exp),
 }
-"""Implementations of ``function.reduce`` by NumPy's objects."""
+"""Traced form of ``reduce`` of each elementwise NumPy function."""
 FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
     **{
         getattr(numpy, name): getattr(namespace, name)
@@ -243,18 +243,18 @@ FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.linalg.norm: norm,
     numpy.dot: dot,
 }
-"""Functions of arrays by NumPy's objects."""
+"""Traced form of NumPy functions of arrays."""
 INVERSES = (numpy.linalg.inv, numpy.linalg.solve, numpy.linalg.det, numpy.linalg.pinv, numpy.linalg.lstsq)
-"""Functions whose pivots depend on numbers."""
+"""NumPy functions that cannot be traced, since their pivots depend on numbers."""
 OTHERWISE = "write it with arithmetic, numpy.sum and numpy.where"
-"""Advice for all other functions."""
+"""Advice in the error for all other functions."""
 for _function, _own in UFUNCS.items():
     if not hasattr(Traced, _function.__name__):  # NumPy calls it on entries of arrays of objects
         setattr(Traced, _function.__name__, _own)
 
 
 def call_ufunc(function: Any, method: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> Traced:
-    """Compute an elementwise function, or its reduction along an axis.
+    """Return the result of an elementwise NumPy function on traced arrays, or of its reduction along an axis.
 
     Raises:
         NotTraceable: for a function that cannot be traced.
@@ -270,7 +270,7 @@ def call_ufunc(function: Any, method: str, arguments: Sequence[Any], keywords: M
 
 
 def call_function(function: Any, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> Traced:
-    """Compute a function of arrays.
+    """Return the result of a NumPy function of traced arrays.
 
     Raises:
         NotTraceable: for a function that cannot be traced.
@@ -284,7 +284,7 @@ def call_function(function: Any, arguments: Sequence[Any], keywords: Mapping[str
 
 
 def _on_objects(function: Any, arguments: Any, keywords: Mapping[str, Any]) -> Any:
-    """Compute a function with NumPy on arrays of objects, whose arithmetic makes expressions."""
+    """Return the result of a NumPy function on arrays of objects, whose arithmetic creates expressions."""
 
     def objects(given: Any) -> Any:
         if isinstance(given, list | tuple):

@@ -1,4 +1,4 @@
-"""Division of a long straight line into parts, because compilers' time grows faster than a function's length.
+"""Division of a long straight-line program into parts, since compile time grows faster than a function's length.
 
 Values that cross a cut are stored in a scratch array; inputs and constants are read again in every part.
 """
@@ -8,21 +8,18 @@ import heapq
 from .program import BAND, ProgramResult, StraightLineProgram
 
 FREE = ("input", "constant", "entry")
-"""Steps that every part reads again instead of using the scratch array."""
+"""Operations of steps that every part loads again instead of using the scratch array."""
 Statement = int | ProgramResult
-"""A statement of a compiler's input: a computed step, or a stored result."""
+"""A statement of generated code: the index of a computed step, or a stored result."""
 
 
 def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[list[list[Statement]], int]:
-    """Return the statements of each part: all steps except free ones, and every result right after its step.
+    """Return the statements of each part of a program (at least one part), and the number of parts before a pause.
 
     Args:
         program: the program.
-        size: statements of a part.
+        size: number of statements of a part.
         pause: a step at which a new part begins.
-
-    Returns:
-        Parts, at least one, and the number of parts before the pause.
     """
     results: dict[int, list[Statement]] = {}
     for result in program.results:
@@ -38,11 +35,11 @@ def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[
 
 
 def scratch_slots(program: StraightLineProgram, parts: list[list[Statement]]) -> dict[int, int]:
-    """Return the place in the scratch array of every step that crosses a cut; places are reused.
+    """Return the index in the scratch array of every step that is used in a later part; indices are reused.
 
     Args:
         program: the program.
-        parts: parts of :func:`cut_parts`.
+        parts: parts from :func:`cut_parts`.
     """
     steps = program.steps.all()
     part_of = {step: i for i, part in enumerate(parts) for step in part if isinstance(step, int)}
@@ -65,11 +62,11 @@ def scratch_slots(program: StraightLineProgram, parts: list[list[Statement]]) ->
 
 
 def product_places(program: StraightLineProgram, first: int) -> tuple[dict[int, int], int]:
-    """Return the places of all products' results in the scratch array, and that of a vector after them.
+    """Return the indices of all products' results in the scratch array, and that of a vector after them.
 
     Args:
         program: the program.
-        first: first place after the slots.
+        first: first index after the slots.
     """
     places = {}
     for index, (operation, arguments, _) in enumerate(program.steps):

@@ -1,7 +1,8 @@
-"""Expressions of one lane, each stored once, and the straight-line program that computes some of them.
+"""Graph of the expressions of one lane, and the straight-line program that computes some of them.
 
-An expression is a number: its index in the :class:`Graph`. Equal expressions share one number (common subexpressions),
-expressions of constants are computed at once (constant folding), and a program contains only what its results need.
+An expression is identified by its index in the :class:`Graph`. Equal expressions share one index (common
+subexpressions), expressions of constants are computed at once (constant folding), and a program contains only what its
+results need.
 """
 
 import functools
@@ -32,7 +33,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "where": lambda truth, one, other: one if truth else other,
     "number": lambda truth: numpy.float64(truth),
 }
-"""NumPy's function for each operation; ``number`` is 1 for true and 0 for false."""
+"""NumPy function of each operation; ``number`` is 1 for true and 0 for false."""
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "exp": numpy.exp,
     "expm1": numpy.expm1,
@@ -57,35 +58,36 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "pow": numpy.power,
     "hypot": numpy.hypot,
 }
-"""NumPy's function for each library function, by its name in C."""
+"""NumPy function of each library function, by its name in C."""
 LOCK = threading.RLock()
-"""Lock of the thread that traces or compiles."""
+"""Lock held while a thread traces or compiles."""
 if hasattr(os, "register_at_fork"):
     # A child has none of the other threads, and would wait forever for a lock of one of them.
     os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release)
 _COMPUTE = OPERATIONS | FUNCTIONS
 _CONSTANTS: "weakref.WeakValueDictionary[tuple[bytes, ...], numpy.ndarray]" = weakref.WeakValueDictionary()
-"""Constants of programs with tables, by scalars and digests; programs of many competitors share one log."""
+"""Cache of the constants of programs with tables, by scalars and digests; programs of many competitors share one log.
+"""
 _EXACT = frozenset(("add", "subtract", "multiply", "divide", "negative", "absolute", "sqrt"))
-"""Operations whose results in NumPy have the same bits for arrays as for numbers, on every processor."""
+"""Operations whose NumPy results have the same bits for arrays as for numbers, on every processor."""
 FEW = 16
-"""Members of an array operation below which it is faster to make them one by one."""
+"""Number of members of an array operation below which it is faster to add them one by one."""
 BAND = 8
-"""Rows of a matrix of constants that a loop sums in parallel."""
+"""Number of rows of a matrix of constants that a loop sums in parallel."""
 OTHERS = {"take": 1, "product": 2, "entry": 1}
-"""Number of leading arguments of these expressions that are not expressions."""
+"""Number of leading arguments of an expression that are no expressions, by operation."""
 BEFORE = {"input": 2, "constant": 1, "take": 2, "product": 2, "entry": 1}
-"""Number of leading arguments of a step that are not steps."""
+"""Number of leading arguments of a step that are no steps, by operation."""
 
 
 def unband(table: numpy.ndarray, rows: int, columns: int) -> numpy.ndarray:
-    """Return the matrix ``(rows, columns)`` of the table of a product."""
+    """Return the matrix ``(rows, columns)`` of a product, from its table in the order of the loop."""
     return table.reshape(-1, columns, BAND).swapaxes(1, 2).reshape(-1, columns)[:rows]
 
 
 @contextmanager
 def without_collection() -> Iterator[None]:
-    """Disable garbage collection inside.
+    """Disable garbage collection inside the context, and hold the compiler's lock.
 
     None of a hundred thousand new expressions is garbage, and repeated searches would take a third of the time.
     """
@@ -100,7 +102,7 @@ def without_collection() -> Iterator[None]:
 
 
 class Graph:
-    """Expressions of one lane.
+    """Expressions of one lane, each stored once.
 
     ``input`` (argument, row) reads an input of the program; ``constant`` has a value; ``take`` (table, index) reads a
     table of constants; ``product`` (table, rows, *vector) multiplies a matrix of constants with a vector, and ``entry``
@@ -108,11 +110,12 @@ class Graph:
 
     Attributes:
         operations: name of every expression's operation.
-        arguments: arguments of every expression: expressions; numbers of an input; first the table of ``take``.
+        arguments: arguments of every expression: indices of expressions; for an input argument and row; first the table
+            for ``take``.
         values: value of every constant, None for other expressions.
-        groups: number of the array operation that made each expression; expressions of one are independent.
+        groups: number of the array operation that created each expression; expressions of one are independent.
         tables: tables of ``take`` and ``product``, ``(length,)`` each.
-        loops: whether products with large matrices of constants stay whole, for code with loops.
+        loops: whether products with large matrices of constants are loops.
         callers: functions that called each array operation, by its number; None: not recorded.
     """
 
@@ -144,7 +147,7 @@ class Graph:
         return found
 
     def settle(self, node: int, use: str) -> Any:
-        """Return the plain value of an expression; None: it has none.
+        """Return the plain number of an expression; None, unless a subclass knows one.
 
         Args:
             node: the expression.
@@ -153,23 +156,23 @@ class Graph:
         return None
 
     def begin_group(self) -> None:
-        """Begin a new array operation."""
+        """Begin a new array operation: later expressions belong to it."""
         self.group += 1
         if self.callers is not None:
             self.callers[self.group] = _callers()
 
     def input(self, argument: int, row: int) -> int:
-        """Return the number in a row of an argument."""
+        """Return the expression that reads a row of an argument."""
         return self._intern(("input", argument, row), "input", (argument, row), None, False)
 
     def constant(self, value: Any) -> int:
-        """Return the expression of a known number or truth value."""
+        """Return the expression of a constant number or boolean."""
         if isinstance(value, bool | numpy.bool_):
             return self._intern(("constant", bool(value)), "constant", (), bool(value), True)
         return self.constants(numpy.array([value], dtype=numpy.float64))[0]
 
     def constants(self, values: numpy.ndarray) -> list[int]:
-        """Return the expressions of known numbers, float64 ``(n,)``."""
+        """Return the expressions of constant numbers, float64 ``(n,)``, as a list."""
         found, made = self._found, []
         # By bits, as -0.0 differs from 0.0, and NaN equals itself.
         for bits, value in zip(values.view(numpy.int64).tolist(), values.tolist(), strict=True):
@@ -180,7 +183,7 @@ class Graph:
         return made
 
     def take(self, table: numpy.ndarray, index: int) -> int:
-        """Return the entry of a table; a negative index counts from the end, one outside is clipped to the range."""
+        """Return the expression of a table's entry; negative indices count from the end, others are clipped."""
         known = self.values[index]
         if known is not None:
             return self.constant(table[int(known)])
@@ -190,7 +193,7 @@ class Graph:
         return self._intern(("take", place, index), "take", (place, index), None, False)
 
     def product(self, matrix: numpy.ndarray, vector: Sequence[int]) -> list[int]:
-        """Return the entries of the product of a matrix ``(rows, columns)`` with a vector, summed in order of columns.
+        """Return the expressions of the entries of a matrix-vector product, summed in the order of columns.
 
         The table contains the matrix in the order of the loop: bands of ``BAND`` rows, the last one padded with zeros,
         and in each band the columns one after the other.
@@ -207,7 +210,7 @@ class Graph:
         ]
 
     def matrix(self, product: int) -> numpy.ndarray:
-        """Return the matrix of a product, ``(rows, columns)``."""
+        """Return the matrix of a product expression, ``(rows, columns)``."""
         table, rows, *vector = self.arguments[product]
         return unband(self.tables[table], rows, len(vector))
 
@@ -221,7 +224,7 @@ class Graph:
         return int(self._found[key])
 
     def node(self, name: str, *arguments: int) -> int:
-        """Return the expression of an operation on other expressions."""
+        """Return the expression of an operation on other expressions, simplified if possible."""
         known = self.values
         values = [known[argument] for argument in arguments]
         if None not in values:
@@ -236,14 +239,12 @@ class Graph:
         return self._intern(key, name, arguments, None, logical)
 
     def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Return the expressions of an array operation: the results of :meth:`node`, in a fraction of the time.
+        """Return the expressions of an array operation, ``(n,)``, as :meth:`node` does, but faster.
 
         Args:
             name: name of the operation.
             columns: for each argument the expressions of all members, ``(n,)``.
 
-        Returns:
-            ``(n,)``.
         """
         if len(columns[0]) < FEW:
             rows = zip(*(column.tolist() for column in columns), strict=True)
@@ -292,7 +293,7 @@ class Graph:
         return name in ("negative", "logical_and", "logical_or")
 
     def _count(self) -> None:
-        """Copy the values of new expressions into arrays."""
+        """Copy the constant values of new expressions into arrays."""
         first, count = self._counted, len(self.values)
         if count > len(self._numbers):
             for each in ("_numbers", "_known"):
@@ -305,7 +306,7 @@ class Graph:
         self._counted = count
 
     def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Return the expressions of members that have no simpler form."""
+        """Return the expressions of array elements that have no simpler form; add the new ones."""
         ordered = (numpy.minimum(*columns), numpy.maximum(*columns)) if name in COMMUTATIVE else columns
         keys = list(zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False))
         count = len(self.operations)
@@ -329,7 +330,7 @@ class Graph:
         return made
 
     def _simpler(self, name: str, arguments: tuple[int, ...], values: list[Any]) -> int | None:
-        """Return an equivalent simpler expression, for finite numbers; None: there is none."""
+        """Return a simpler expression that is equal for finite numbers; None if there is none."""
         if name in ("logical_and", "logical_or"):
             for known, other in ((0, 1), (1, 0)):
                 if values[known] is not None:
@@ -366,10 +367,7 @@ class Graph:
         return a if y == 1.0 else None
 
     def live(self, wanted: Iterable[int]) -> list[int]:
-        """Return all expressions that the wanted ones depend on, each after its own parts and as late as possible.
-
-        A sum of products is thus complete before the next begins, and its terms need no storage.
-        """
+        """Return the expressions needed to compute the wanted ones, in topological order, each as late as possible."""
         seen = bytearray(len(self.operations))
         order: list[int] = []
         operations, arguments, finish = self.operations, self.arguments, order.append
@@ -391,13 +389,13 @@ class Graph:
         return order
 
     def parts(self, node: int) -> tuple[int, ...]:
-        """Return the expressions that one directly depends on."""
+        """Return the expressions on which an expression directly depends."""
         name = self.operations[node]
         return () if name == "input" else self.arguments[node][OTHERS.get(name, 0) :]
 
 
 def _callers() -> str:
-    """Return the nearest function on the stack outside this package, and the nearest one in another file."""
+    """Return the names of the nearest functions on the stack outside this package, in two different files, as text."""
     found: dict[str, str] = {}
     frame: types.FrameType | None = sys._getframe(2)
     while frame is not None and len(found) < 2:
@@ -410,12 +408,12 @@ def _callers() -> str:
 
 @functools.cache
 def _stem_outside(path: str) -> str | None:
-    """Return the name of a file without its ending; None for a file of this package."""
+    """Return the name of a source file without its ending; None for a file of this package."""
     return None if Path(path).parent == Path(__file__).parent else Path(path).stem
 
 
 class ProgramResult(NamedTuple):
-    """Destination of an expression: a row of an argument."""
+    """Destination of a computed value: a row of an argument."""
 
     argument: int
     row: int
@@ -427,27 +425,28 @@ class ProgramStep(NamedTuple):
 
     operation: str
     arguments: tuple[int, ...]
-    """Earlier steps. For ``input``: argument and row; for ``constant``: its index in ``constants``; for ``take``: the
-    index of its table in ``constants``, its length and a step; for ``product``: the index of its table, its number of
-    rows and the steps of the vector; for ``entry``: a row and the step of the product."""
+    """Indices of earlier steps. For ``input``: argument and row; for ``constant``: its index in ``constants``; for
+    ``take``: the index of its table in ``constants``, its length and a step; for ``product``: the index of its table,
+    its number of rows and the steps of the vector; for ``entry``: a row and the step of the product.
+    """
 
     @property
     def parts(self) -> tuple[int, ...]:
-        """Steps that it directly depends on."""
+        """Indices of the steps on which it directly depends."""
         return self.arguments[BEFORE.get(self.operation, 0) :]
 
     logical: bool
 
 
 class ProgramSteps(Sequence[ProgramStep]):
-    """Steps of a program as columns of numbers; a :class:`ProgramStep` is made on access.
+    """Steps of a program as arrays; a :class:`ProgramStep` is made on access.
 
     Args:
         names: names of the operations.
-        kinds: index in ``names`` of each step, ``(n,)``.
+        kinds: index in ``names`` of each step's operation, ``(n,)``.
         begins: offset of each step's arguments in ``arguments``, ``(n + 1,)``.
         arguments: arguments of all :class:`ProgramStep`, one after the other.
-        logical: whether each step is a truth value, ``(n,)``.
+        logical: whether each step is a boolean, ``(n,)``.
     """
 
     def __init__(
@@ -467,15 +466,15 @@ class ProgramSteps(Sequence[ProgramStep]):
 
     @functools.cached_property
     def operations(self) -> frozenset[str]:
-        """Operations that occur."""
+        """Names of the operations that occur."""
         return frozenset([self.names[int(kind)] for kind in numpy.unique(self.kinds)])
 
     def which(self, *operations: str) -> numpy.ndarray:
-        """Return for each step whether it is one of the operations, ``(n,)``."""
+        """Return a boolean mask ``(n,)`` of the steps with one of the operations."""
         return numpy.isin(self.kinds, [kind for kind, name in enumerate(self.names) if name in operations])
 
     def named(self, operation: str) -> list[ProgramStep]:
-        """Return the steps of an operation."""
+        """Return a list of the steps with one operation."""
         return [self[index] for index in numpy.flatnonzero(self.which(operation)).tolist()]
 
     def __len__(self) -> int:
@@ -501,7 +500,7 @@ class ProgramSteps(Sequence[ProgramStep]):
         return iter(self.all())
 
     def all(self) -> list[ProgramStep]:
-        """Return all steps, from a cache after the first call."""
+        """Return a list of all steps, cached after the first call."""
         if self._made is None:
             numbers, names = self.arguments.tolist(), self.names
             given = [tuple(numbers[begin:end]) for begin, end in itertools.pairwise(self.begins.tolist())]
@@ -514,26 +513,27 @@ class ProgramSteps(Sequence[ProgramStep]):
 
 
 class StraightLineProgram(NamedTuple):
-    """Straight-line program for some expressions of a graph.
+    """Straight-line program that computes some expressions of a graph.
 
     Constants are separate from the steps, so that programs that differ only in numbers have the same code.
     """
 
     steps: ProgramSteps
     constants: numpy.ndarray
-    """Scalars, then the tables one after the other, ``(n,)``."""
+    """Constants of the steps, then the tables one after the other, ``(n,)``."""
     results: list[ProgramResult]
-    """Results; ``node`` is the index of a step."""
+    """Destinations of the results; ``node`` is the index of a step."""
     origins: numpy.ndarray
-    """For each step the number of the array operation that made it, and a number that increases from member to
-    member, ``(n, 2)``."""
+    """For each step the number of the array operation that created it, and a number that increases from member to
+    member, ``(n, 2)``.
+    """
     callers: Mapping[int, str] = types.MappingProxyType({})
-    """Functions that called an array operation, where the graph recorded them."""
+    """Functions that called each array operation, if the graph recorded them."""
 
 
 @without_collection()
 def program(graph: Graph, wanted: Sequence[ProgramResult]) -> StraightLineProgram:
-    """Return the program for some expressions of a graph."""
+    """Return the straight-line program that computes some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
     operations = list(map(graph.operations.__getitem__, order))
     given = list(map(graph.arguments.__getitem__, order))

@@ -1,4 +1,4 @@
-"""Loops over the members of array operations, recovered from a straight-line program.
+"""Conversion of a straight-line program to loops over the members of its array operations.
 
 A trace consists of scalars, each with the number of the array operation that made it
 (:attr:`.StraightLineProgram.origins`). Members of one operation are independent: they become one :class:`Statement`.
@@ -19,30 +19,31 @@ from .parts import FREE
 from .program import StraightLineProgram, without_collection
 
 LEAST = 3
-"""Fewest members of a statement; members of smaller operations are separate statements."""
+"""Minimal number of members of a statement; members of smaller operations are separate statements."""
 MOST = 100
-"""Most statements of a loop."""
+"""Maximal number of statements of a loop."""
 SHORTER = 1.5
 """Length of the code of a statement in a loop with its tables, in statements of a straight line."""
 SCRATCH, CONSTANTS, TURN, COMPUTED = -1, -2, -3, -4
-"""Values in place of an argument: the scratch array, the constants, the result of a statement in the same turn of the
-same loop, and any computed value."""
+"""Codes in place of the number of an argument: the scratch array, the constants, the result of a statement in the same
+turn of the same loop, and any computed value.
+"""
 
 
 class Operand(NamedTuple):
-    """Places that the members of a statement read or write."""
+    """Locations that the members of a statement read or write."""
 
     array: int
-    """An argument, or one of ``SCRATCH``, ``CONSTANTS``, ``TURN``."""
+    """Number of an argument, or one of ``SCRATCH``, ``CONSTANTS``, ``TURN``."""
     places: tuple[int, ...]
     """For every member a row of the argument, or an index in the scratch array or in the constants; for ``TURN`` only
     the number of the statement."""
     logical: bool = False
-    """Whether it is a truth value, stored as one or zero."""
+    """Whether it is a boolean, stored as one or zero."""
 
 
 class Statement(NamedTuple):
-    """One operation for several members."""
+    """One operation for all members of a loop."""
 
     number: int
     operation: str
@@ -52,20 +53,20 @@ class Statement(NamedTuple):
     table: tuple[int, int]
     """For ``take``: the index of its table in the constants, and its length."""
     kept: tuple[Operand, ...]
-    """Places where its members are stored for later loops and results."""
+    """Locations where its members are stored for later loops and results."""
     origin: int
-    """Number of its array operation; that of no operation for a copy."""
+    """Number of its array operation; a negative one for a copy."""
 
 
 class Loop(NamedTuple):
-    """Statements of one loop."""
+    """Statements of one loop, and its number of turns."""
 
     turns: int
     body: list[Statement]
 
 
 class Rolled(NamedTuple):
-    """A program as loops."""
+    """A program as a list of loops."""
 
     loops: list[Loop]
     before: int
@@ -75,18 +76,18 @@ class Rolled(NamedTuple):
 
 
 class _Read(NamedTuple):
-    """Source of a whole operand."""
+    """Source of an operand."""
 
     source: int | None
-    """The argument, or the constants; None: the scratch array, or the turn."""
+    """Number of the argument, or ``CONSTANTS``; None: the scratch array, or the same turn."""
     turn: int | None
-    """The statement whose members it equals, one by one; None: there is none."""
+    """Number of the statement whose members it equals, one by one; None: there is none."""
     statements: set[int]
-    """Statements whose members it contains."""
+    """Numbers of the statements whose members it contains."""
 
 
 class _Draft:
-    """A statement before places are assigned: members and operands are steps."""
+    """A statement before its locations are assigned: members and operands are steps."""
 
     def __init__(
         self,
@@ -107,7 +108,7 @@ class _Draft:
 
 
 class _Roller:
-    """State of :func:`roll`."""
+    """Algorithm of :func:`roll`, with its data."""
 
     def __init__(self, program: StraightLineProgram, results: int) -> None:
         self.program, self.steps = program, program.steps
@@ -135,7 +136,7 @@ class _Roller:
             draft.reads = [next(reads) for _ in draft.columns]
 
     def _read_steps(self) -> None:
-        """Copy the parts of steps into arrays, operation by operation."""
+        """Copy the arguments of steps into arrays, operation by operation."""
         steps = self.steps
         self.tables = numpy.zeros(len(steps), dtype=numpy.int64)
         for kind, name in enumerate(steps.names):
@@ -160,7 +161,7 @@ class _Roller:
     # --- statements
 
     def _group_steps(self) -> Iterator[numpy.ndarray]:
-        """Yield the steps of one array operation with one form, in the order of that operation."""
+        """Yield the steps of each array operation that have one form, in the order of its members."""
         parts = self.parts
         computed = numpy.flatnonzero(self.source == COMPUTED)
         if not len(computed):
@@ -191,7 +192,7 @@ class _Roller:
                 yield steps[start:end]
 
     def _levels(self) -> numpy.ndarray:
-        """Return the depth of each step among those of its array operation."""
+        """Return the depth of each step in the dependencies among those of its array operation."""
         inside = (self.parts >= 0) & (self.group[self.parts] == self.group[:, None])
         inside &= self.source[self.parts] == COMPUTED
         levels = numpy.zeros(len(self.steps), dtype=numpy.int64)
@@ -200,7 +201,7 @@ class _Roller:
         return levels
 
     def _compute(self, groups: Sequence[numpy.ndarray]) -> None:
-        """Add the statements of steps that have one form."""
+        """Add the statements of groups of steps that have one form."""
         heads = numpy.array([members[0] for members in groups], dtype=numpy.int64)
         kinds, logical, number = (
             column[heads].tolist() for column in (self.steps.kinds, self.logical, self.group)
@@ -241,7 +242,7 @@ class _Roller:
         self._add(draft)
 
     def _sources(self, columns: Sequence[numpy.ndarray]) -> list[int | None]:
-        """Return for each operand the argument or the constants that contain all of it; None: the scratch array."""
+        """Return for each operand the argument or constants that contain all of it; None: the scratch array."""
         steps, starts, lengths = _join_columns(columns)
         sources = self.source[steps]
         own = sources[starts]
@@ -252,7 +253,7 @@ class _Roller:
         ]
 
     def _copy_mixed_operands(self) -> None:
-        """Copy inputs and constants that share an operand with other values to the scratch array, once."""
+        """Add copies to the scratch array of inputs and constants that share an operand with other values."""
         for late in (False, True):
             columns = [column for draft in self.drafts if draft.late == late for column in draft.columns]
             pairs = zip(columns, self._sources(columns), strict=True)
@@ -287,7 +288,7 @@ class _Roller:
                 yield _Read(None, number[i] if of_all[i] else None, statements)
 
     def _needs(self, draft: _Draft) -> dict[int, bool]:
-        """Return the statements whose members a draft reads, and whether the same turn of a loop suffices."""
+        """Return the statements whose members a draft reads, and whether the same turn of a loop suffices for each."""
         needs: dict[int, bool] = {}
         for _, turn, statements in draft.reads:
             for number in statements:
@@ -295,7 +296,7 @@ class _Roller:
         return needs
 
     def schedule(self) -> list[list[int]]:
-        """Assign every statement to a loop of equal count, as early as its operands allow."""
+        """Return the statements of each loop; loops have statements of equal count, as early as operands allow."""
         drafts = self.drafts
         waits = [0] * len(drafts)
         users: list[list[tuple[int, bool]]] = [[] for _ in drafts]
@@ -336,7 +337,7 @@ class _Roller:
     # --- places
 
     def finish(self) -> Rolled:
-        """Return the loops with the places of all values that pass between them."""
+        """Return the loops, with the locations of all values that pass between them."""
         loops = self.schedule()
         drafts = self.drafts
         turns: dict[tuple[int, int], int] = {}
@@ -379,7 +380,7 @@ class _Roller:
         return Rolled(made, before, scratch)
 
     def _slots(self, kept: Iterable[int], last: dict[int, int]) -> tuple[dict[int, int], int]:
-        """Return the place of every kept statement's first member in the scratch array, and the length of that array.
+        """Return the first index in the scratch array of every stored statement, and the array's length.
 
         Results of one array operation are adjacent, and are stored as long as any of them is needed.
         """
@@ -407,7 +408,7 @@ class _Roller:
 
 
 def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
-    """Return the columns one after the other, and the start and length of each."""
+    """Return the columns as one array, and the start and length of each."""
     lengths = numpy.array([len(column) for column in columns], dtype=numpy.int64)
     steps = numpy.concatenate([*columns, numpy.zeros(0, dtype=numpy.int64)])
     return steps, numpy.cumsum(lengths) - lengths, lengths
@@ -415,7 +416,7 @@ def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, nump
 
 @without_collection()
 def roll(program: StraightLineProgram, results: int = 0) -> Rolled:
-    """Return a program as loops.
+    """Return a program as loops over the members of its array operations.
 
     Args:
         program: program with origins, and without products that are loops.
@@ -425,7 +426,7 @@ def roll(program: StraightLineProgram, results: int = 0) -> Rolled:
 
 
 def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled | None:
-    """Return a program as loops where that makes less code; None: it stays a straight line.
+    """Return a program as loops if that makes less code; None if a straight line is shorter.
 
     Args:
         program: program with origins.
@@ -440,7 +441,7 @@ def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled
 
 
 def common_difference(places: Sequence[int]) -> int | None:
-    """Return the distance from each place to the next if it is constant, else None."""
+    """Return the difference between successive numbers if it is constant, else None."""
     count, first = len(places), places[0]
     step = places[1] - first if count > 1 else 0
     regular = range(first, first + step * count, step) if step else (first,) * count

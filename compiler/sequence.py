@@ -1,4 +1,4 @@
-"""Sequences of native calls over many steps, without a return to Python in between.
+"""Native calls over many time steps in one call, without a return to Python in between.
 
 A step is a list of calls, each a function and its table of addresses. Two memories alternate between steps: one step
 writes what the next one reads. So there are two lists, for even and odd steps. Some entries of the tables advance with
@@ -20,11 +20,13 @@ from .functions import UNCOUNTED, Call, address_of, empty_lanes, run_over
 from .native import Native, address_of_code, native_text
 
 TILE = 64
-"""Lanes of a tile: enough that a call costs little compared with its arithmetic, few enough for the cache. Programs of
-300 to 80,000 operations all run within a tenth of the time of their fastest tile, from 32 to 512 lanes."""
+"""Number of lanes of a tile: large enough that a call costs little compared with its arithmetic, small enough for the
+cache. Programs of 300 to 80,000 operations all run within a tenth of the time of their fastest tile, from 32 to 512
+lanes.
+"""
 
 TRIES = 12
-"""Runs in which one thread and several are compared."""
+"""Number of runs in which the times of one thread and of several are compared."""
 
 TEXT = """
 define void @program(ptr %given, i64 %first, i64 %last) {
@@ -151,7 +153,7 @@ exit:
   ret void
 }
 """
-"""The driver as text of LLVM; :class:`CallSequence` makes its argument."""
+"""LLVM text of the function that makes the calls; :class:`CallSequence` makes its argument."""
 
 
 @functools.cache
@@ -161,7 +163,7 @@ def _driver() -> Native:
 
 
 class Moving(NamedTuple):
-    """An entry of a call's table that advances with every step."""
+    """An entry of a call's table of addresses that advances with every step."""
 
     call: Call
     entry: int
@@ -170,19 +172,19 @@ class Moving(NamedTuple):
 
 
 def moving_array(call: Call, place: int, arrays: numpy.ndarray) -> Moving:
-    """Make an argument of a call the next of several arrays at every step.
+    """Return a moving entry with which an argument of a call is the next of several arrays at every step.
 
     Args:
         call: the call; its argument is set to the first array.
         place: number of the argument.
-        arrays: ``(steps, ..., N)``.
+        arrays: arrays of all steps, ``(steps, ..., N)``.
     """
     call.replace(place, arrays[0])
     return Moving(call, 1 + 2 * place, arrays.strides[0])
 
 
 class CallSequence:
-    """Calls over one or many steps as one native call.
+    """Calls over one or many time steps, run as one native call.
 
     Args:
         even: calls of an even step, in order.
@@ -191,7 +193,7 @@ class CallSequence:
         steps: number of steps; the first is even.
         passing: arrays ``(..., tile)`` of these calls: call, number of the array of the first tile, and distance in
             bytes to that of the next tile. Zero: all tiles share the array, and its content is lost when a tile ends.
-        tile: lanes that pass through all steps together.
+        tile: number of lanes that pass through all steps together.
     """
 
     def __init__(
@@ -238,14 +240,14 @@ class CallSequence:
         )
 
     def expect(self, lanes: int, in_sequence: bool = False) -> None:
-        """Select the code of every call for a run over some lanes in all, see :meth:`.functions.Call.expect`."""
+        """Select the machine code of every call for a run over some lanes, see :meth:`.functions.Call.expect`."""
         natives = [call.expect(lanes, in_sequence) for call in self._calls]
         if natives != self._natives:
             self._natives, self._tries, self._seconds = natives, 0, [math.inf, math.inf]
             self._codes[:] = list(map(address_of_code, natives))
 
     def run(self, width: int, threads: int = 1) -> None:
-        """Run over all lanes, with several threads where that was measured to be faster."""
+        """Run all steps over all lanes, with several threads if that was measured to be faster."""
         count = self._count
         count[0] += width * self._form[1]
         if count[0] > UNCOUNTED:
@@ -277,12 +279,12 @@ class CallSequence:
         self._count = other._count
 
     def run_once(self, width: int, threads: int = 1) -> None:
-        """Run over all lanes once, with optimised code at once where the number of steps is worth it."""
+        """Run all steps over all lanes once, with optimised code if the number of steps is worth it."""
         self.expect(self._form[1] * width // 2, in_sequence=True)
         self.run(width, threads)
 
     def _run_share(self, first: int, last: int) -> None:
-        """Run over the lanes from ``first`` to before ``last`` with own tables and passing arrays."""
+        """Run all steps over the lanes from ``first`` to before ``last``, with this thread's own tables and arrays."""
         share = self._shares.get((first, last))
         if share is None:
             share = self._shares[first, last] = self._make_share()
@@ -298,7 +300,7 @@ class CallSequence:
         ends = self._tables + 8 * numpy.array([len(table) for table in tables])
 
         def moved(entries: numpy.ndarray) -> tuple[numpy.ndarray, list[int]]:
-            """Return the same entries in these tables, and the numbers of their tables."""
+            """Return the addresses of the same entries in these tables, and the numbers of their tables."""
             owners = [int(numpy.flatnonzero((e >= self._tables) & (e < ends))[0]) for e in entries]
             return addresses[owners] + entries - self._tables[owners], owners
 
@@ -315,7 +317,7 @@ class CallSequence:
 
 
 class _Share(NamedTuple):
-    """Tables and arrays of one thread."""
+    """Tables and arrays of one thread, for its part of the lanes."""
 
     tables: list[numpy.ndarray]
     addresses: numpy.ndarray

@@ -1,4 +1,4 @@
-"""Functions of a vector with their exact Jacobians, for every kind of array.
+"""Functions of a vector with exact Jacobians, for arrays of any namespace.
 
 A user's function in NumPy is traced once, on a vector of symbols, and its Jacobian is derived by reverse mode, one row
 for each entry of the result (:mod:`.gradients`). Both are straight lines of arithmetic on one lane, which can be
@@ -24,23 +24,23 @@ _OPERATORS: dict[str, Callable[..., Any]] = {
     "divide": operator.truediv,
     "negative": operator.neg,
 }
-"""Operations that accept numbers of Python as well as arrays."""
+"""Operations that accept Python numbers as well as arrays."""
 _NAMES = {"absolute": "abs", "rint": "round"}
-"""Operations with other names in the array API standard."""
+"""Names in the array API standard of operations that have another name here."""
 
 
 class VectorFunction:
-    """A function from n numbers to m numbers, and its Jacobian.
+    """A function of a vector, and its Jacobian by reverse-mode differentiation.
 
     Args:
-        function: takes an array ``(n + g,)`` and returns a sequence or an array of m numbers; or a matrix ``(m, n)``.
-        size: n; 0 for a function without a derivative.
+        function: function from an array ``(n + g,)`` to a sequence or an array of m numbers; or a matrix ``(m, n)``.
+        size: number n of inputs with a derivative; 0 for a function without a derivative.
         given: number g of further arguments after these n numbers, without a derivative; default: 0.
 
     Attributes:
-        size: m.
-        inputs: n.
-        given: g.
+        size: number m of outputs.
+        inputs: number n of inputs with a derivative.
+        given: number g of further inputs.
         matrix: the Jacobian if it is constant and g is 0, ``(m, n)``; else None.
         offset: value at zero if the Jacobian is constant and g is 0, ``(m,)``; else None.
 
@@ -79,10 +79,7 @@ class VectorFunction:
 
     @functools.cached_property
     def linear(self) -> numpy.ndarray:
-        """Whether each entry of the Jacobian is constant, ``(m, n)``, tested at random states of four magnitudes.
-
-        Entries of a wrapped angle are, too: the derivative of ``arctan2(sin(a), cos(a))`` is one.
-        """
+        """Mask of the constant entries of the Jacobian, ``(m, n)``, from random states of four magnitudes."""
         rng, count = numpy.random.default_rng(0), 8
         x = rng.normal(size=(self.inputs, 4 * count)) * numpy.repeat(10.0 ** numpy.arange(4), count)
         given = numpy.repeat(rng.uniform(0.1, 1.0, (self.given, 1)), 4 * count, axis=1)
@@ -93,7 +90,7 @@ class VectorFunction:
 
     @property
     def reads(self) -> tuple[frozenset[int], ...]:
-        """For every number of the value the indices of the inputs that it depends on."""
+        """Indices of the inputs on which each output depends."""
         found: list[frozenset[int]] = []
         for name, arguments, _ in self._value.steps:
             if name == "input":
@@ -104,26 +101,22 @@ class VectorFunction:
         return tuple(found[result.node] for result in self._value.results)
 
     def value(self, x: Any, xp: Any) -> Any:
-        """Return the value at N vectors.
+        """Return the function's values at N vectors, ``(m, N)``.
 
         Args:
-            x: ``(n + g, N)``.
+            x: vectors, ``(n + g, N)``.
             xp: array namespace of x.
 
-        Returns:
-            ``(m, N)``.
         """
         return xp.stack(_compute(self._value, x, xp))
 
     def jacobian(self, x: Any, xp: Any) -> Any:
-        """Return the Jacobian at N vectors with respect to the first n numbers of x.
+        """Return the Jacobians at N vectors with respect to the first n inputs, ``(m, n, N)``.
 
         Args:
-            x: ``(n + g, N)``.
+            x: vectors, ``(n + g, N)``.
             xp: array namespace of x.
 
-        Returns:
-            ``(m, n, N)``.
         """
         entries, n = _compute(self._jacobian, x, xp), self.inputs
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
@@ -134,7 +127,7 @@ def _program(graph: Graph, nodes: Sequence[int]) -> StraightLineProgram:
 
 
 def _compute(program: StraightLineProgram, x: Any, xp: Any) -> list[Any]:
-    """Return the results of a program on lanes ``(n, N)``, each ``(N,)``."""
+    """Return the results of a program on an array of lanes ``(n, N)``, as a list of arrays ``(N,)``."""
     values: list[Any] = []
 
     def array(place: int) -> Any:

@@ -23,7 +23,7 @@ from . import __version__
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
 from .compiler.program import without_collection
-from .envs.contract.failures import own_line
+from .envs.contract.failures import user_code_line
 from .envs.engine.catalogue import modules_from
 
 Commands = Mapping[str, Callable[..., None] | str]
@@ -92,26 +92,28 @@ class Program(typer.core.TyperGroup):
     """Whether the commands are only listed, each with its first sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of the commands, in their order."""
+        """Return the names of the commands, in the order of the help."""
         return [name for commands in self.groups.values() for name in commands]
 
     def get_command(self, ctx: Any, name: str) -> Any:
-        """Return the command of a name; None where there is none."""
+        """Return the click command called ``name``; None if there is none of that name."""
         for group, commands in self.groups.items():
             if name in commands:
                 return (
-                    _listed(name, commands[name], group) if self.listing else _command(name, commands[name])
+                    _help_command(name, commands[name], group)
+                    if self.listing
+                    else _command(name, commands[name])
                 )
         return None
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help of the program, with the names of its commands."""
+        """Write the help of the program, with the name and first sentence of each command."""
         self.listing = True
         super().format_help(ctx, formatter)
         self.listing = False
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Complete the name of a command."""
+        """Return the shell's completions of a command's name."""
         self.listing = True
         found = super().shell_complete(ctx, incomplete)
         self.listing = False
@@ -119,7 +121,7 @@ class Program(typer.core.TyperGroup):
 
 
 def import_command(command: Callable[..., None] | str) -> Callable[..., None]:
-    """Return the function of a command."""
+    """Return the function of a command, imported first if it is given as ``module:function``."""
     if not isinstance(command, str):
         return command
     module, _, name = command.partition(":")
@@ -140,13 +142,13 @@ def _command(name: str, command: Callable[..., None] | str) -> Any:
 
 @functools.cache
 def _docstrings(module: str) -> dict[str, str | None]:
-    """Return the docstrings of a module of commands, by the names of its functions, without an import."""
+    """Return the docstring of each function of a module in ``commands``, by its name, without importing the module."""
     text = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
     return {n.name: ast.get_docstring(n) for n in ast.parse(text).body if isinstance(n, ast.FunctionDef)}
 
 
-def _listed(name: str, command: Callable[..., None] | str, group: str) -> Any:
-    """Return a command that has its help only, read from the text of its module."""
+def _help_command(name: str, command: Callable[..., None] | str, group: str) -> Any:
+    """Return a click command with the help text only, read from the source without importing the module."""
     if isinstance(command, str):
         module, _, function = command.partition(":")
         words = _docstrings(module)[function]
@@ -156,7 +158,7 @@ def _listed(name: str, command: Callable[..., None] | str, group: str) -> Any:
 
 
 def program_of(groups: Mapping[str, Commands]) -> Any:
-    """Return commands as one program with grouped help; called with arguments, it ends in SystemExit."""
+    """Return the click program of several commands, with grouped help; a call of it ends in SystemExit."""
     app = typer.Typer(
         cls=type("Program", (Program,), {"groups": groups}),
         callback=_general,
@@ -170,7 +172,7 @@ def program_of(groups: Mapping[str, Commands]) -> Any:
 
 @functools.cache
 def application() -> Any:
-    """Return the commands of ``filtergym``."""
+    """Return the click program ``filtergym``, with all its commands."""
     return program_of(GROUPS)
 
 
@@ -194,15 +196,18 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
             raise
         text, code = f"Error: {error}", 2
         if isinstance(error, MemoryError):
-            text = f"Error: not enough memory, ask for less at once: {error}"
+            text = f"Error: not enough memory, run less at once: {error}"
         elif not isinstance(error, ValueError | OSError | ImportError | gymnasium.error.Error):
-            text, code = f"Error: unexpected {type(error).__name__}: {error}{own_line(error)}; {REPORT}", 1
+            text, code = (
+                f"Error: unexpected {type(error).__name__}: {error}{user_code_line(error)}; {REPORT}",
+                1,
+            )
         _print_error(text, "red")
         sys.exit(code)
 
 
 def _end(number: int, _: Any) -> None:
-    """Exit as after an error, so that unfinished files are removed."""
+    """Exit with code 128 + ``number`` of the signal, as after an error, so that unfinished files are removed."""
     sys.exit(128 + number)
 
 

@@ -38,7 +38,7 @@ READERS: Sequence[str] = ("envs.logs.reading:RECORDINGS", "envs.logs.reading:FLI
 
 
 def load(place: str, package: str | None = PACKAGE) -> Any:
-    """Import the object at ``module:name`` of a package.
+    """Return the object ``module:name`` of a package, imported if necessary.
 
     Raises:
         ValueError: if this installation lacks the module.

@@ -39,7 +39,7 @@ def evaluate(
     trust: bool = False,
     **keywords: Any,
 ) -> xarray.Dataset:
-    """Run policies, estimators, references and bounds over the same episodes.
+    """Run policies, estimators, references and bounds over the same episodes, and return costs and errors.
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
@@ -83,7 +83,7 @@ def record(
     backend: str = "auto",
     **keywords: Any,
 ) -> Recording:
-    """Record the measurements of simulated episodes, and the truth.
+    """Simulate episodes, and return their measurements and truth as a recording.
 
     They are the episodes of an evaluation with the same scenario, seed and split. Replayed on the same backend,
     observations, estimates and costs are the same, bit for bit.
@@ -110,12 +110,12 @@ def record(
 def requests_of(
     problem: Problem, experiment: Experiment, competitors: Sequence[Competitor], curves: bool = True
 ) -> list[EvaluationRequest]:
-    """Return the requests of an evaluation, one for each competitor.
+    """Return the :class:`.EvaluationRequest` of each competitor in an experiment.
 
     Args:
         problem: problem of the competitors.
-        experiment: as :meth:`.baselines.problem.Problem.experiment` makes it.
-        competitors: those that take part.
+        experiment: experiment from :meth:`.baselines.problem.Problem.experiment`.
+        competitors: competitors that take part.
         curves: whether figures will be drawn.
     """
     paper = problem.paper_among({one.name: one.maker for one in competitors})
@@ -136,7 +136,7 @@ def make_policy(
     trust: bool = False,
     **keywords: Any,
 ) -> SteppingPolicy:
-    """Make a policy to step an environment with: the paper's, a tuned one, an agent, or one of your own.
+    """Return a policy that acts in an environment: the paper's, a tuned one, an agent, or one of your own.
 
     It has Stable-Baselines3's ``predict(observation, state, episode_start, deterministic)``, for one observation as for
     a batch, and acts in a loop of your own as in an evaluation.
@@ -176,11 +176,11 @@ def make_policy(
 
 
 def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bool = False) -> SteppingPolicy:
-    """Make a policy for the environment of an experiment, and that environment's model.
+    """Return a policy that acts in the environment of an experiment; its model is that environment's.
 
     Args:
         problem: problem of the policy.
-        policy: name, path, object or class; errors are those of :func:`make_policy`.
+        policy: name, path, object or class; errors as of :func:`make_policy`.
         experiment: experiment that gives the environment its control, scenario and parameters.
         trust: whether to load a model's zip, which can execute code.
     """
@@ -192,7 +192,7 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
 
 
 def _named_policy(problem: Problem, policy: Any, trust: bool) -> tuple[str, Any]:
-    """Return the name of a policy in errors, and its maker.
+    """Return the name of a policy for error messages, and its maker.
 
     Raises:
         ValueError: for a competitor that does not act.
@@ -216,7 +216,7 @@ def _stepping(
 
 
 def _model_of(env: Any) -> Any:
-    """Return the model of an environment.
+    """Return the model inside a Gymnasium environment of this package.
 
     Raises:
         ValueError: if the environment is none of filtergym, or computes in torch.
@@ -242,7 +242,7 @@ def _model_of(env: Any) -> Any:
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:
-    """Return every metric of every policy with its interval, the metrics of the environment included.
+    """Return a record of every metric of every policy, with its interval, the environment's metrics included.
 
     Args:
         dataset: from :func:`evaluate`; see :func:`.evaluation.running.metrics.tidy_records`.

@@ -31,7 +31,7 @@ def online(
     trust: bool = False,
     **keywords: Any,
 ) -> OnlineFilter:
-    """Make a filter that runs in a loop of your own: a policy in its bank, an estimator, an agent, or one of yours.
+    """Return a filter that runs in a loop of your own: a policy in its bank, an estimator, an agent, or yours.
 
     Call its ``start`` once, then ``update`` with every measurement.
 

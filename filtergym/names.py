@@ -1,4 +1,4 @@
-"""Names of competitors: the one place where a name becomes a competitor."""
+"""Search for competitors by name: shipped ones, files, folders, and classes of a user."""
 
 import os
 import re
@@ -11,15 +11,15 @@ from .baselines.problem import Problem, import_problem
 from .envs.contract.parameters import quote_shortened
 from .envs.engine.catalogue import import_user_module, nearest
 from .evaluation.competitors.kinds import Competitor, CompetitorFiles, check_competitor
-from .evaluation.running.supervision import running
+from .evaluation.running.supervision import report_running
 from .extensions import PREFIXES, SOURCES, load, load_present
 
 MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-"""``module:Class`` of a user."""
+"""Pattern of a name ``module:Class`` of a user's competitor."""
 
 
 def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
-    """Return the maker of a policy, estimator, reference or bound.
+    """Return the maker (class or function) of the policy, estimator, reference or bound of a name.
 
     Args:
         env: environment id.
@@ -38,7 +38,7 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
 
 
 def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> Competitor:
-    """Return the competitor of a name in a problem; names and errors as of :func:`competitor`."""
+    """Return the competitor of a name for an environment; names and errors as of :func:`competitor`."""
     if isinstance(name, Path):
         found = _find_in_files(problem, str(name.absolute()), trust)
         if found is None:
@@ -65,7 +65,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
             if os.path.isfile(f"{name}{ending}"):
                 raise ValueError(f"unknown policy {name!r}: write the whole file name, {name}{ending}")
         raise nearest("policy", name, shipped_names(problem))
-    with running(name):
+    with report_running(name):
         holder = import_user_module(module, f"cannot load policy {name!r}")
     if not hasattr(holder, attribute):
         raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")
@@ -77,7 +77,7 @@ def _sources() -> Iterator[CompetitorFiles]:
 
 
 def _find_in_files(problem: Problem, name: str, trust: bool) -> Competitor | None:
-    """Return the competitor of a file or folder of that name, or of a shipped one; None where there is none."""
+    """Return the competitor in a file or folder of that name, or a shipped agent; None if there is none."""
     found = (source.find(name, problem, trust, partial(_find_shipped, problem)) for source in _sources())
     return next((one for one in found if one is not None), None)
 
@@ -90,7 +90,7 @@ def _find_shipped(problem: Problem, name: str, what: str) -> Competitor:
 
 
 def file_endings() -> list[str]:
-    """Return the endings of files that contain competitors."""
+    """Return the endings of files that contain competitors, such as ``.safetensors``."""
     return [ending for source in _sources() for ending in source.endings]
 
 
@@ -100,23 +100,21 @@ def learned_names(id: str) -> list[str]:
 
 
 def ranked_names(problem: Problem) -> list[str]:
-    """Return the names of all shipped and ranked competitors of a problem: policies and estimators as they are, tuned
-    ones, and agents.
-    """
+    """Return the names of all shipped policies and estimators, untuned and tuned, and agents of an environment."""
     known = problem.baselines
     return [*known.policies, *known.estimators, *problem.tuned_policies, *learned_names(problem.id)]
 
 
 def shipped_names(problem: Problem) -> list[str]:
-    """Return the names of all shipped competitors of a problem: its own, tuned ones and agents."""
+    """Return the names of all shipped competitors of an environment, references, bounds and agents included."""
     return [*problem.names, *learned_names(problem.id)]
 
 
-def adopt(found: Any) -> Any:
-    """Return a user's object as a competitor: a model of a known library behind its adapter, others as they are."""
+def adopt(candidate: Any) -> Any:
+    """Return a user's object as a competitor: wrapped if it is a model of a known library, else unchanged."""
     for source in _sources():
-        found = source.adopt(found)
-    return found
+        candidate = source.adopt(candidate)
+    return candidate
 
 
 def find_competitors(
@@ -124,7 +122,7 @@ def find_competitors(
     competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
     trust: bool = False,
 ) -> list[Competitor]:
-    """Return several competitors, each by its name; arguments and errors as of :func:`~filtergym.evaluate`."""
+    """Return the competitors of several names or objects; arguments and errors as of :func:`~filtergym.evaluate`."""
     if isinstance(competitors, str | Path):
         competitors = [competitors]
     if not isinstance(competitors, Mapping | Sequence):
@@ -149,10 +147,10 @@ def find_competitors(
 
 
 def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
-    """Return names of competitors, with each ``module:Class`` in a process of its own.
+    """Return competitors' names with ``isolated:`` before each ``module:Class``, to run it in a separate process.
 
     Raises:
-        ValueError: for a competitor behind a gate, which acts in this process.
+        ValueError: for ``gated:module:Class``, which acts in this process.
     """
     for name in names:
         if name.startswith("gated:") and is_module(problem, name.removeprefix("gated:")):
@@ -166,5 +164,5 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
 
 
 def is_module(problem: Problem, name: str) -> bool:
-    """Return whether a name is ``module:Class`` of a user."""
+    """Return whether a name has the form ``module:Class`` of a user's competitor."""
     return problem.find(name) is None and MODULE.fullmatch(name) is not None

@@ -1,4 +1,4 @@
-"""Offline data: episodes of policies as Minari data sets, to learn from without an environment.
+"""Minari data sets of episodes of policies, for offline reinforcement learning.
 
 A data set holds the episodes of one policy in one environment: observations, actions and rewards exactly as
 ``gymnasium.make`` gives them, and of every episode its seed. ``minari.load_dataset`` reads it, and
@@ -41,7 +41,7 @@ ENVIRONMENT_KEYWORDS = ("reward", "dtype")
 
 
 class DatasetSummary(NamedTuple):
-    """A written data set."""
+    """Summary of a written data set."""
 
     name: str
     """Name for ``minari.load_dataset``."""
@@ -84,7 +84,7 @@ def write_datasets(
     trust: bool = False,
     **keywords: Any,
 ) -> list[DatasetSummary]:
-    """Write the episodes of policies as Minari data sets, one for each policy.
+    """Write the episodes of policies as Minari data sets, one for each policy, and return summaries.
 
     The environment of a policy is made with the policy's own control and parameters. One that has no
     control of its own, such as ``random``, acts in the environment of the policy named before it: these two data sets
@@ -119,7 +119,7 @@ def write_datasets(
 
 
 class DatasetPlan(NamedTuple):
-    """Data sets before they are written; all errors except those of the folder have been raised by then."""
+    """Checked plan of data sets: experiment, policies and names; writing it raises errors of the folder only."""
 
     experiment: Experiment
     """Experiment of the episodes."""
@@ -156,7 +156,7 @@ class DatasetPlan(NamedTuple):
         return written
 
     def _write_one(self, i: int, name: str, progress: Progress) -> tuple[DatasetSummary, Any]:
-        """Write the data set of a policy; return its summary, and the data set."""
+        """Write the data set of policy ``i``; return its summary, and the Minari data set."""
         policy, stepping, id = self.names[i], self.policies[i], self.experiment.task.id
         made_with = {**stepping.keywords, **self.environment_keywords}
         dataset: Any = None
@@ -188,7 +188,7 @@ def plan_datasets(
     policies: Sequence[str | Path] | None = None,
     trust: bool = False,
 ) -> DatasetPlan:
-    """Return the plan of data sets.
+    """Check all arguments of a request for data sets, and return the plan to write them.
 
     Args:
         problem: problem of the policies.
@@ -209,7 +209,7 @@ def plan_datasets(
         try:
             training_scenarios(cls, cls.default_scenario if scenario is None else scenario)
         except ValueError as error:
-            raise ValueError(f"{error}, or take the split test for data to be judged on") from error
+            raise ValueError(f"{error}, or take the split test for evaluation data") from error
     parameters = dict(experiment.keywords)
     environment_keywords = {name: parameters.pop(name) for name in ENVIRONMENT_KEYWORDS if name in parameters}
     check_names(cls, parameters, ENVIRONMENT_KEYWORDS)
@@ -227,12 +227,12 @@ def plan_datasets(
 
 
 def _has_any_control(maker: Any) -> bool:
-    """Return whether a policy has no control of its own."""
+    """Return whether a policy can act in any control: it declares neither control nor action space."""
     return getattr(maker, "control", None) is None and getattr(maker, "action_space", None) is None
 
 
 def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) -> list[str]:
-    """Return the names of the policies' data sets.
+    """Return the name of each policy's data set, such as ``filtergym/maneuvering-target/imm-v0``.
 
     Raises:
         ValueError: for an invalid namespace, and if a data set has one of the names.
@@ -256,13 +256,13 @@ def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) 
 
 
 def _minari_name(text: str) -> str:
-    """Return the text in letters, digits and hyphens, as Minari requires of a name."""
+    """Return a text with hyphens for all characters that Minari rejects in a name."""
     return re.sub(r"[^\w-]+", "-", text).strip("-")
 
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Let Minari store its data sets in a folder; it reads the environment variable every time."""
+    """Set the folder of Minari's data sets, inside a ``with`` block."""
     variable = "MINARI_DATASETS_PATH"
     before = os.environ.get(variable)
     os.environ[variable] = str(folder.absolute())
@@ -292,7 +292,7 @@ def _buffers(episodes: Sequence[Transitions]) -> list[Any]:
 
 
 def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, about: str) -> Any:
-    """Make a Minari data set of its first episodes."""
+    """Return a new Minari data set that contains the given episodes."""
     import minari
 
     with warnings.catch_warnings():
@@ -312,7 +312,7 @@ def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, a
 
 
 def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> None:
-    """Store the mean returns that are 0 and 1 in ``minari.get_normalized_score``, where both are known."""
+    """Store the mean returns of score 0 and 1 of ``minari.get_normalized_score`` in data sets with random actions."""
     for entry, dataset in zip(written, stored, strict=True):
         alike = [other for other in written if other.environment == entry.environment]
         low = next((other.mean_return for other in alike if other.policy == RANDOM), None)
@@ -322,14 +322,14 @@ def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> N
             dataset.storage.update_metadata({**scores, "num_episodes_average_score": entry.episodes})
 
 
-def datasets_table(written: Iterable[DatasetSummary]) -> Table:
-    """Return a table of data sets; those with the same environment can be combined."""
+def datasets_table(summaries: Iterable[DatasetSummary]) -> Table:
+    """Return a table of written data sets for the terminal, grouped by environment."""
     table = plain_table()
     table.add_column("data set", overflow="fold")
     table.add_column("environment", overflow="fold")
     for title in ("episodes", "steps", "mean return"):
         table.add_column(title, justify="right")
-    for entry in written:
+    for entry in summaries:
         made_with = ", ".join(f"{name}={value}" for name, value in entry.environment.items())
         table.add_row(
             entry.name, made_with, f"{entry.episodes:,}", f"{entry.steps:,}", f"{entry.mean_return:.4g}"

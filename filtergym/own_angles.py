@@ -23,12 +23,11 @@ HALVINGS = 30
 def find_periods(
     angles: Any, names: Sequence[str], places: Sequence[int | None], channels: Sequence[Channel]
 ) -> dict[int, float]:
-    """Return the periods of the components that are angles, by their numbers: the declared ones, and those that a
-    sensor of angles measures directly.
+    """Return the period of each component that is an angle, by its index: declared, or measured as an angle.
 
     Args:
-        angles: unit of each, by its name.
-        names: of all components.
+        angles: unit of each declared angle, by the component's name.
+        names: names of all components.
         places: component that each number of a measurement measures, or None.
         channels: the sensors.
 
@@ -57,20 +56,20 @@ def find_periods(
 
 def warn_of_turns(
     model: StateSpaceModel,
-    given: numpy.ndarray,
+    typical: numpy.ndarray,
     components: Mapping[str, bool],
     channels: Sequence[Channel],
 ) -> None:
-    """Warn of a component or a sensor whose function jumps by a whole turn and that is not declared an angle.
+    """Warn of components and sensors whose function jumps by a whole turn and that are not declared angles.
 
     Args:
         model: traced equations.
-        given: a typical state, then the interval and the inputs that the functions take, ``(n + 1 + p,)``.
-        components: whether each is declared, by its name.
+        typical: a typical state, then the interval and the inputs that the functions take, ``(n + 1 + p,)``.
+        components: whether each component is declared an angle, by its name.
         channels: the sensors.
     """
-    n, inputs = len(components), given[len(components) + 1 :]
-    of_motion = given if model.timed else numpy.concatenate([given[:n], inputs])
+    n, inputs = len(components), typical[len(components) + 1 :]
+    of_motion = typical if model.timed else numpy.concatenate([typical[:n], inputs])
     jumping = _jumping_rows(model.f, of_motion[: n + model.f.given], n)
     for row, (name, declared) in enumerate(components.items()):
         if row in jumping and not declared:
@@ -78,7 +77,7 @@ def warn_of_turns(
             _warn(
                 f"f takes whole turns off {name}, which is no declared angle: write angles={{{name!r}: {unit!r}}}"
             )
-    jumping = _jumping_rows(model.h, numpy.concatenate([given[:n], inputs])[: n + model.h.given], n)
+    jumping = _jumping_rows(model.h, numpy.concatenate([typical[:n], inputs])[: n + model.h.given], n)
     for channel in channels:
         found = next((jumping[row] for row in channel.numbers if row in jumping), None)
         if found is not None and channel.period is None:
@@ -93,7 +92,7 @@ def _warn(text: str) -> None:
 
 
 def _jumping_rows(function: VectorFunction, given: numpy.ndarray, n: int) -> dict[int, str]:
-    """Return the units of the turns by which rows of a function jump along a component of the state, by row number."""
+    """Return the unit, "rad" or "deg", of each row of a function that jumps by a turn, by row number."""
     found: dict[int, str] = {}
     for place in range(n):
         for step, count in STEPS:
@@ -115,9 +114,7 @@ def _jumping_rows(function: VectorFunction, given: numpy.ndarray, n: int) -> dic
 def _jumps_by(
     function: VectorFunction, row: int, low: numpy.ndarray, high: numpy.ndarray, period: float
 ) -> bool:
-    """Return whether a row of a function jumps by a turn between two points ``(n,)``; a step of a smooth function that
-    is as large by chance vanishes with the distance.
-    """
+    """Return whether a row of a function jumps by ``period`` between two points ``(n,)``, found by bisection."""
     for _ in range(HALVINGS):
         points = numpy.stack([low, 0.5 * (low + high), high], axis=1)
         with numpy.errstate(all="ignore"):

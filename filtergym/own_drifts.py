@@ -7,14 +7,14 @@ import numpy
 
 from .compiler import namespace
 from .compiler.vector_functions import VectorFunction
-from .filters.discretisation import choose_series, discretise, held_noise, runge_kutta
+from .filters.discretisation import choose_series, constant_matrix_noise, discretise, runge_kutta
 
 LONGEST = 1e4
 """Sampling intervals over which linear models are exact to rounding."""
 
 
 class Discretised(NamedTuple):
-    """A model of an interval."""
+    """A discrete-time model for any interval."""
 
     motion: Callable[[Any, Any, Any], Any]
     """State ``(n,)`` after the interval, from state, interval and inputs ``(p,)``."""
@@ -25,10 +25,10 @@ class Discretised(NamedTuple):
 def discretise_drift(
     drift: VectorFunction, diffusion: numpy.ndarray, interval: float, steps: int
 ) -> Discretised:
-    """Return the model of an interval for a model in continuous time, see :mod:`.filters.discretisation`.
+    """Return the discrete-time model of a drift and a diffusion, see :mod:`.filters.discretisation`.
 
     Args:
-        drift: from state and inputs, ``(n + p,)``, to the derivative of the state, ``(n,)``.
+        drift: function from state and inputs, ``(n + p,)``, to the derivative of the state, ``(n,)``.
         diffusion: spectral density of the noise, ``(n, n)``.
         interval: typical time between measurements, s.
         steps: number of steps of the Runge-Kutta method in an interval.
@@ -41,7 +41,7 @@ def discretise_drift(
 
         def held(x: Any, dt: Any, u: Any) -> Any:
             A = drift.jacobian(namespace.concat([x, u])[:, None], namespace)[:, :n, 0]
-            return held_noise(A, diffusion, dt)
+            return constant_matrix_noise(A, diffusion, dt)
 
         return Discretised(lambda x, dt, u: runge_kutta(lambda y: slope(y, u), x, dt, steps), held)
     A = drift.matrix[:, :n]

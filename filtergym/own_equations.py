@@ -11,13 +11,14 @@ from .compiler import namespace
 from .compiler.namespace import NotTraceable
 from .compiler.vector_functions import VectorFunction
 from .envs.contract.parameters import read_numbers
-from .envs.linear.equations import StateSpaceModel, process_noise, sensor_noise, usual_sensor_noise
+from .envs.linear.equations import StateSpaceModel, nominal_sensor_noise, process_noise, sensor_noise
 from .envs.linear.inputs import Input
 from .own_drifts import Discretised, discretise_drift
 
 Function = Callable[..., Any] | Sequence[Sequence[float]] | numpy.ndarray
 """A function of the state ``(n,)`` that returns a list of numbers, or a matrix; with more arguments see
-:func:`.own_models.state_space`."""
+:func:`.own_models.state_space`.
+"""
 FURTHER = ("dt", "u")
 """Names of the further arguments that f may take after the state."""
 FAR = 3.0
@@ -48,30 +49,32 @@ class Surroundings:
     """Number of steps of the Runge-Kutta method in an interval, for a drift that is not linear."""
 
     @property
-    def usual_inputs(self) -> numpy.ndarray:
-        """Means of the inputs, ``(p,)``."""
+    def nominal_inputs(self) -> numpy.ndarray:
+        """Means of the distributions of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
 
-def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceModel:
-    """Trace a model.
+def make_model(equations: Mapping[str, Any], around: Surroundings) -> StateSpaceModel:
+    """Check the equations of a state-space model, and return them traced.
 
     Args:
-        given: f and Q, or drift and diffusion; h and R; with sensors the blocks of R.
+        equations: equations by name: f and Q, or drift and diffusion; h and R; with sensors the blocks of R.
         around: state, interval and inputs that they must fit; a timed covariance is checked at the typical interval.
 
     Raises:
         ValueError: for equations that do not fit, or cannot be traced.
     """
     n = len(around.mean)
-    h = trace_measurement("h", given["h"], n, len(around.inputs))
-    motion = _continuous(given, around) if given.get("drift") is not None else _discrete(given, around)
-    blocks = given["R"] if given.get("sensors") else [NoiseBlock("R", given["R"], h.size)]
+    h = trace_measurement("h", equations["h"], n, len(around.inputs))
+    motion = (
+        _continuous(equations, around) if equations.get("drift") is not None else _discrete(equations, around)
+    )
+    blocks = equations["R"] if equations.get("sensors") else [NoiseBlock("R", equations["R"], h.size)]
     R = _sensor_noise(blocks, around, isinstance(motion.Q, VectorFunction))
     model = StateSpaceModel(
-        motion.f, h, motion.Q, R, motion.G, _of_inputs(given["h"], h, around), motion.sources
+        motion.f, h, motion.Q, R, motion.G, _of_inputs(equations["h"], h, around), motion.sources
     )
-    check_covariance("Q", process_noise(model, around.mean, around.interval, around.usual_inputs), n)
+    check_covariance("Q", process_noise(model, around.mean, around.interval, around.nominal_inputs), n)
     _check_sensor_noise(model, blocks, around)
     return model
 
@@ -79,8 +82,7 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
 def _sensor_noise(
     blocks: Sequence[NoiseBlock], around: Surroundings, timed: bool
 ) -> numpy.ndarray | VectorFunction:
-    """Return the R of blocks: a matrix where all of them are, else a function of the state, the interval and the
-    inputs.
+    """Return R of all sensors: a matrix ``(m, m)``, or a traced function of state, interval and inputs.
 
     Raises:
         ValueError: for a block that is no covariance, cannot be traced, or takes an argument that does not exist.
@@ -122,7 +124,7 @@ def _matrix(R: Any) -> Any:
 
 
 def _noise_arguments(block: NoiseBlock, around: Surroundings, timed: bool) -> tuple[str, ...]:
-    """Return the arguments of a block's function, in its order: x, dt and u; empty for a matrix.
+    """Return the argument names of a block's function R, of x, dt and u, in its order; empty for a matrix.
 
     Raises:
         ValueError: for an argument that the model does not have.
@@ -150,9 +152,9 @@ def _check_sensor_noise(model: StateSpaceModel, blocks: Sequence[NoiseBlock], ar
     if not isinstance(model.R, VectorFunction):
         return
     deviations = numpy.array([one.deviation for one in around.inputs.values()])
-    inputs = around.usual_inputs[:, None] + deviations[:, None] * numpy.linspace(-FAR, FAR, 7)
+    inputs = around.nominal_inputs[:, None] + deviations[:, None] * numpy.linspace(-FAR, FAR, 7)
     R = sensor_noise(model, around.mean, numpy.full(inputs.shape[1], around.interval), inputs)
-    usual = usual_sensor_noise(model, around.mean, around.interval, around.inputs)
+    usual = nominal_sensor_noise(model, around.mean, around.interval, around.inputs)
     first = 0
     for block in blocks:
         own = slice(first, first + block.size)
@@ -211,7 +213,7 @@ def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 
 
 def _sources(what: str, given: Any) -> Mapping[str, Any]:
-    """Return the covariances of the sources of noise by their names; a single one has no name.
+    """Return covariances of process noise by the names of their sources; a single one has the name "".
 
     Raises:
         ValueError: for no source, or an invalid name.
@@ -261,9 +263,7 @@ def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 def _with_inputs(
     what: str, call: Callable[[Any, Any, Any], Any], timed: bool, around: Surroundings
 ) -> tuple[VectorFunction, VectorFunction | None]:
-    """Return the motion as a function of state, interval and inputs, and where an input has noise, as a function of the
-    inputs, too.
-    """
+    """Return the motion, traced twice: as a function of the state first, and of noisy inputs first, or None."""
     n, p = len(around.mean), len(around.inputs)
     further = int(timed)  # the interval stands between state and inputs, or nothing does
     of_state = lambda v: call(v[:n], v[n] if timed else None, v[n + further :])  # noqa: E731
@@ -275,7 +275,7 @@ def _with_inputs(
 
 
 def trace_measurement(what: str, h: Function, n: int, p: int) -> VectorFunction:
-    """Trace the measurement of a state of n numbers and, where it takes them, p inputs.
+    """Return the traced measurement h of a state of n numbers and, if it takes them, p inputs.
 
     Raises:
         ValueError: if it cannot be traced, or takes an argument that does not exist.
@@ -289,7 +289,7 @@ def trace_measurement(what: str, h: Function, n: int, p: int) -> VectorFunction:
 
 
 def _of_inputs(h: Function, traced: VectorFunction, around: Surroundings) -> VectorFunction | None:
-    """Return h as a function of the inputs and then of the state; None where no input with noise acts on it."""
+    """Return h traced as a function of the inputs first, for their noise; None if no noisy input acts on it."""
     p = len(around.inputs)
     if not callable(h) or not traced.given or not any(one.noise > 0.0 for one in around.inputs.values()):
         return None
@@ -297,12 +297,12 @@ def _of_inputs(h: Function, traced: VectorFunction, around: Surroundings) -> Vec
 
 
 def further_arguments(function: Any) -> tuple[str, ...]:
-    """Return the arguments among :data:`FURTHER` that a function takes after the state."""
+    """Return which of the arguments ``dt`` and ``u`` a function takes after the state."""
     return tuple(name for name in FURTHER if name in arguments(function)[1:])
 
 
 def arguments(function: Any) -> tuple[str, ...]:
-    """Return the names of the arguments of a function; empty for an object that is none, or has no signature."""
+    """Return the names of a function's arguments; empty for other objects, and without a signature."""
     if not callable(function):
         return ()
     try:
@@ -312,7 +312,7 @@ def arguments(function: Any) -> tuple[str, ...]:
 
 
 def check_array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:
-    """Return finite numbers of a shape (None: any number), or raise ValueError."""
+    """Return values as an array; raise ValueError unless they are finite and of the shape (None: any size)."""
     array = read_numbers(what, values)
     fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
     if fits and not numpy.isfinite(array).all():
@@ -324,7 +324,7 @@ def check_array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.
 
 
 def check_covariance(what: str, values: Any, size: int, definite: bool = False) -> numpy.ndarray:
-    """Return a covariance, or raise ValueError."""
+    """Return a matrix ``(size, size)``, made symmetric; raise ValueError if it is no covariance."""
     matrix = check_array(what, values, (size, size))
     scale = float(numpy.abs(matrix).max())
     smallest = float(numpy.linalg.eigvalsh(matrix).min())
@@ -335,16 +335,18 @@ def check_covariance(what: str, values: Any, size: int, definite: bool = False) 
     return 0.5 * (matrix + matrix.T)
 
 
-def trace(what: str, function: Function, size: int, answers: int | None, given: int = 0) -> VectorFunction:
-    """Trace a function of so many numbers, and others without a derivative; ``None`` allows any number of results.
+def trace(what: str, function: Function, size: int, results: int | None, further: int = 0) -> VectorFunction:
+    """Return a function, traced, of ``size`` numbers and ``further`` ones without derivative.
+
+    It must return ``results`` numbers; None: any number of them.
 
     Raises:
         ValueError: if it cannot be traced, or returns another number of results.
     """
     if not callable(function):
-        function = check_array(what, function, (answers, size))
+        function = check_array(what, function, (results, size))
     try:
-        made = VectorFunction(function, size, given)
+        made = VectorFunction(function, size, further)
     except NotTraceable as error:
         raise ValueError(
             f"{what} cannot be traced ({error}): write it with NumPy's functions of the state, return a list, and use "
@@ -352,13 +354,13 @@ def trace(what: str, function: Function, size: int, answers: int | None, given: 
         ) from error
     except ValueError as error:
         raise ValueError(f"{what} {error}") from error
-    if answers not in (None, made.size):
-        raise ValueError(f"{what} must return {answers} numbers, got {made.size}")
+    if results not in (None, made.size):
+        raise ValueError(f"{what} must return {results} numbers, got {made.size}")
     return made
 
 
 def _entries(matrix: Any) -> list[Any]:
-    """Return the numbers of a matrix, or of a list of its rows, row by row."""
+    """Return the entries of a matrix, or of a list of rows, as one flat list, row by row."""
     try:
         return [entry for row in matrix for entry in row]
     except TypeError:

@@ -70,7 +70,7 @@ def state_space(
     registered: bool = True,
     **parameters: Any,
 ) -> type[StateSpace]:
-    """Make an environment of a state-space model and register it: ``x = f(x) + w``, ``z = h(x) + v``.
+    """Return a new environment's task of a state-space model ``x = f(x) + w``, ``z = h(x) + v``, registered.
 
     Call it where your module is imported, as :func:`filtergym.register_task`. The class is also stored in your module,
     under the name in its id, where other processes find it.
@@ -192,7 +192,7 @@ def state_space(
     columns = dict.fromkeys(measured or [f"z{j + 1}" for j in range(m)], "")
     columns = sensor_columns(sensors, channels) if sensors else columns
     check_columns(measured or tuple(columns), m, inputs)
-    usual = numpy.concatenate([mean, [interval], around.usual_inputs])
+    usual = numpy.concatenate([mean, [interval], around.nominal_inputs])
     warn_of_turns(world[0], usual, {name: i in periods for i, name in enumerate(names)}, channels)
     measures = [units[places.index(j)] if j in places else "1" for j in range(m)]
     definition = StateSpaceDefinition(
@@ -241,7 +241,7 @@ def _sequence(what: str, given: Any) -> tuple[Any, ...]:
 def _sensors(
     sensors: Mapping[str, Sensor] | None, others: tuple[Any, Any, Sequence[str]]
 ) -> dict[str, Sensor]:
-    """Return the sensors; empty where h, R and perhaps ``measured`` replace them.
+    """Return the sensors by name; empty for a model with h and R instead.
 
     Raises:
         ValueError: if neither is given, or both.
@@ -268,7 +268,7 @@ def _check_motion(first: Mapping[str, Any]) -> None:
 
 
 def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return equations with some of them replaced, or raise ValueError for an unknown one."""
+    """Return equations by name with some of them replaced; raise ValueError for an unknown name."""
     own = first["sensors"]
     unused = {*(("h", "R") if own else ("sensors",))}
     unused |= {"f", "Q"} if first["f"] is None else {"drift", "diffusion"}
@@ -284,7 +284,7 @@ def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> di
 
 
 def _check_sources(filters: Sequence[StateSpaceModel], sensors: Iterable[str]) -> None:
-    """Raise ValueError if the named noises in Q differ between models, or share names with other noises."""
+    """Raise ValueError if sources of process noise differ between models, or share names with sensors."""
     first, *others = ([*model.sources] for model in filters)
     if any(one != first for one in others):
         raise ValueError(f"all models must name the same sources of noise, got {first} and {others}")
@@ -296,7 +296,7 @@ def _check_sources(filters: Sequence[StateSpaceModel], sensors: Iterable[str]) -
 
 
 def _stack(given: dict[str, Any], size: int, inputs: int) -> dict[str, Any]:
-    """Replace h and R by h and the noises of all sensors."""
+    """Return equations with h and R stacked from all sensors; unchanged without sensors."""
     if not given["sensors"]:
         return given
     h, R = stack_sensors(given["sensors"], size, inputs)
@@ -304,7 +304,7 @@ def _stack(given: dict[str, Any], size: int, inputs: int) -> dict[str, Any]:
 
 
 def _inputs(given: Mapping[str, Input] | Sequence[str]) -> dict[str, Input]:
-    """Return inputs by their names, or raise ValueError for an invalid one."""
+    """Return inputs as :class:`Input` by name; raise ValueError for an invalid one."""
     is_list = isinstance(given, Mapping | Sequence) and not isinstance(given, str)
     if not is_list or not all(isinstance(name, str) for name in given):
         raise ValueError(
@@ -331,11 +331,10 @@ def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:
 
 
 class _EstimatedReward:
-    """Reward of a class whose unit is estimated on first use, which takes a tenth of a second, or half a second for a
-    drift; most models never use it.
+    """Reward of a user's model, whose unit is estimated by simulation on first use, in 0.1 to 0.5 s.
 
     Args:
-        cls: the class.
+        cls: class of the task.
         parameters: parameters of the registered class.
     """
 
@@ -346,14 +345,12 @@ class _EstimatedReward:
 
     @functools.cached_property
     def unit(self) -> float:
-        """Typical cost of an episode."""
+        """Typical cost of an episode, the median over some episodes."""
         return _typical_cost(self._cls, self._parameters)
 
 
 def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:
-    """Return the median over some episodes of the cost of the filter as written, to two digits; 1 where that is no
-    unit.
-    """
+    """Return the median episode cost of the model's filter, to two digits; 1 if it is zero or not finite."""
     model: Any = Model(cls(parameters), cls.paper_policy.control)
     episodes, measurements = TRIED
     share = min(1.0, SMALL / cls.definition.world[0].f.size) ** 3

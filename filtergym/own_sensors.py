@@ -14,29 +14,33 @@ from .own_equations import Function, NoiseBlock, check_array, further_arguments,
 RESERVED = (RECORDING, "values", "available")
 """Names that have another meaning in a table or a measurement."""
 NOISES = ("process", "measurement")
-"""Owners of the other noises, by the noise's name."""
+"""Names of the other noises, which no sensor can have."""
 
 
-def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[str, Sensor]:
-    """Return sensors with some replaced by others of the same name.
+def replace_sensors(sensors: Mapping[str, Sensor] | None, replacements: Any) -> dict[str, Sensor]:
+    """Return sensors by name, some of them replaced; None in place of ``sensors`` allows any name.
 
     Raises:
         ValueError: for an object that is no sensor, or an unknown name.
     """
-    if not isinstance(given, Mapping) or not all(isinstance(one, Sensor) for one in given.values()):
-        raise ValueError(f"sensors must be a mapping from names to Sensor, got {quote_shortened(given)}")
-    if {*given} & {*NOISES}:
+    if not isinstance(replacements, Mapping) or not all(
+        isinstance(one, Sensor) for one in replacements.values()
+    ):
+        raise ValueError(
+            f"sensors must be a mapping from names to Sensor, got {quote_shortened(replacements)}"
+        )
+    if {*replacements} & {*NOISES}:
         raise ValueError(
             f"sensors cannot be called {' or '.join(NOISES)}, which are the names of other noises"
         )
-    if sensors is not None and not {*given} <= {*sensors}:
-        unknown = next(name for name in given if name not in sensors)
+    if sensors is not None and not {*replacements} <= {*sensors}:
+        unknown = next(name for name in replacements if name not in sensors)
         raise ValueError(f"sensors are {', '.join(sensors) or 'not named'}, got {unknown!r}")
-    return {**(sensors or {}), **given}
+    return {**(sensors or {}), **replacements}
 
 
 def stack_sensors(sensors: Mapping[str, Sensor], size: int, inputs: int) -> tuple[Function, list[NoiseBlock]]:
-    """Return h of all sensors together and their noises, for a state of n numbers and p inputs.
+    """Return h of all sensors stacked, and the noise of each, for a state of ``size`` numbers.
 
     Raises:
         ValueError: for sensors that do not fit.
@@ -62,15 +66,15 @@ def _numbers(h: Function, x: Any, u: Any) -> Any:
 def find_channels(
     sensors: Mapping[str, Sensor], counts: Sequence[int], interval: float
 ) -> tuple[Channel, ...]:
-    """Return the places of sensors among the numbers of a measurement.
+    """Return a :class:`Channel` for each sensor: its places in the measurement, period, availability and gate.
 
     Args:
         sensors: sensors by their names; empty: one sensor measures everything.
-        counts: number of measured numbers of each.
+        counts: number of measured numbers of each sensor.
         interval: time between measurements, s.
 
     Raises:
-        ValueError: for a sensor with a shorter period.
+        ValueError: for a sensor whose interval is shorter than ``interval``.
     """
     if not sensors:
         return (Channel("values", 0, counts[0]),)
@@ -88,7 +92,7 @@ def find_channels(
 
 
 def sensor_columns(sensors: Mapping[str, Sensor], channels: Sequence[Channel]) -> dict[str, str]:
-    """Return the units of the measured numbers by the names of their columns; empty where a component gives the unit.
+    """Return the unit of each measured number by its column's name; "" where the sensor states none.
 
     Raises:
         ValueError: for names or units that do not fit.
@@ -108,7 +112,7 @@ def sensor_columns(sensors: Mapping[str, Sensor], channels: Sequence[Channel]) -
 
 
 def check_columns(names: Sequence[str], count: int, inputs: Iterable[str]) -> None:
-    """Raise ValueError for names of measured numbers that are ambiguous in a table, also with those of the inputs."""
+    """Raise ValueError unless ``names`` are ``count`` different column names, distinct from inputs, time and truth."""
     lower = [str(name).lower() for name in (*names, *inputs)]
     if len(names) != count or len({*lower}) != len(lower) or {*lower} & {*TIME, *RESERVED, ""}:
         raise ValueError(
@@ -116,4 +120,4 @@ def check_columns(names: Sequence[str], count: int, inputs: Iterable[str]) -> No
             f"be {', '.join(RESERVED)} either"
         )
     if any(name.startswith(TRUTH) for name in lower):
-        raise ValueError(f"names of what is measured must not begin with {TRUTH}, got {names!r}")
+        raise ValueError(f"names of measured numbers must not begin with {TRUTH}, got {names!r}")

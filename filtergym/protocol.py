@@ -40,20 +40,20 @@ MOST_BYTES = 100_000
 
 
 class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One environment of a protocol."""
+    """One environment of a protocol: version, paper's algorithm and scenarios."""
 
     id: str
     """Gymnasium id."""
     interface: int
-    """Version of what an agent observes and of its reward."""
+    """Version of the agent's observation and reward."""
     paper: str
-    """Name of the paper's algorithm, in its stronger reading."""
+    """Name of the paper's algorithm, in the reading of lower cost."""
     lost_cost: float
     """Mean cost of an episode beyond which its track is lost."""
     training: str
-    """Scenario of the number."""
+    """Training scenario, on which the protocol's number is measured."""
     held_out: tuple[str, ...] = ()
-    """Scenarios of which the worst is reported."""
+    """Held-out scenarios, of which the one of highest cost is reported."""
 
     @property
     def short(self) -> str:
@@ -80,13 +80,13 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def protocol_names() -> list[str]:
-    """Return the names of this package's protocols, the newest last: by number, not by letter."""
+    """Return the names of this package's protocols, by number, the newest last."""
     found = [file.name.removesuffix(SUFFIX) for file in FOLDER.iterdir() if file.name.endswith(SUFFIX)]
     return sorted(found, key=lambda name: int(name.rpartition("-")[2]))
 
 
 def read_protocol(name: str) -> tuple[Protocol, str]:
-    """Read a protocol.
+    """Return a protocol, read from its file and checked, and the file's digest.
 
     Args:
         name: name of one of this package, or the path of a ``.toml``.
@@ -117,7 +117,7 @@ def read_protocol(name: str) -> tuple[Protocol, str]:
 
 
 def _check(protocol: Protocol) -> None:
-    """Raise ValueError where this package would run a different experiment."""
+    """Raise ValueError if this package's version would run another experiment than the protocol states."""
     if not protocol.environments:
         raise ValueError(f"protocol {protocol.name} names no environment")
     pairs: list[tuple[str, Any, Any]] = [("resamples", protocol.resamples, RESAMPLES)]
@@ -151,10 +151,10 @@ class Entry(NamedTuple):
 def find_entries(
     protocol: Protocol, words: Sequence[str], trust: bool = False, rename: Any = None
 ) -> list[Entry]:
-    """Return the entry of each environment of a protocol.
+    """Return the competitor entered in each environment of a protocol, from words of the command line.
 
     Args:
-        protocol: that is run.
+        protocol: protocol to run.
         words: ``NAME`` for all environments, at most once, and ``ENVIRONMENT=NAME`` for one of them.
         trust: whether to load models that can execute code.
         rename: function of a problem and names that returns names; see :func:`.names.isolate_names`.
@@ -202,7 +202,7 @@ def _find_entry(own: ProtocolEnvironment, name: str, trust: bool, rename: Any) -
 
 
 class EnvironmentResult(NamedTuple):
-    """Result of one environment."""
+    """Result of a competitor in one environment of a protocol."""
 
     entry: Entry
     cost: IntervalEstimate
@@ -228,7 +228,7 @@ class EnvironmentResult(NamedTuple):
 
 
 class ProtocolResult(NamedTuple):
-    """Result of a protocol."""
+    """Results of the entries of a protocol, and its number."""
 
     protocol: Protocol
     digest: str
@@ -239,17 +239,17 @@ class ProtocolResult(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Names of the entries, each once."""
+        """Names of the entered competitors, each once, separated by commas."""
         return ", ".join(dict.fromkeys(one.entry.name for one in self.environments))
 
     @property
     def complete(self) -> bool:
-        """Whether all environments were entered; otherwise there is no number."""
+        """Whether every environment of the protocol has an entry; otherwise there is no number."""
         return len(self.environments) == len(self.protocol.environments)
 
     @property
     def cost(self) -> IntervalEstimate | None:
-        """The number: geometric mean over the environments of the cost ratios, less one; None if not complete."""
+        """Geometric mean over the environments of the cost ratios, less one, with interval; None if not complete."""
         if not self.complete:
             return None
         bootstrap = Bootstrap(self.protocol.episodes, self.protocol.resamples)
@@ -279,7 +279,7 @@ def run_protocol(
     progress: Progress | None = None,
     **options: Any,
 ) -> ProtocolResult:
-    """Run the entries of a protocol, with the papers' algorithms beside them.
+    """Run the entries of a protocol and the papers' algorithms, and return the results.
 
     Args:
         protocol: protocol from :func:`read_protocol`.
@@ -308,14 +308,12 @@ def run_protocol(
 
 
 def measurements_of(protocol: Protocol, entries: Sequence[Entry]) -> int:
-    """Return the number of measurements of a run."""
+    """Return the number of measurements that a run of the protocol simulates, over all competitors."""
     return sum(one.measurements for e in entries for cell in _cells(protocol, e, {}) for one in cell)
 
 
 def _cells(protocol: Protocol, entry: Entry, options: Mapping[str, Any]) -> Iterator[list[EvaluationRequest]]:
-    """Yield the requests of each scenario: the paper's algorithm, references, and the competitor unless it is one of
-    these.
-    """
+    """Yield the evaluation requests of each scenario: the paper's algorithm, references, and the competitor."""
     own = entry.environment
     problem = problem_of(own.id)
     makers = {name: problem.competitor(name) for name in (own.paper, *entry.references)}
@@ -374,7 +372,7 @@ def _costs(found: Sequence[Summary]) -> Iterator[tuple[str, numpy.ndarray]]:
 
 
 def bib_entry(result: ProtocolResult, version: str) -> str:
-    """Return a BibTeX entry of the protocol.
+    """Return a BibTeX entry that cites the protocol of a result.
 
     Args:
         result: result to quote.

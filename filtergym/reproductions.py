@@ -21,7 +21,7 @@ def papers() -> dict[str, str]:
 
 
 def paper_module(name: str) -> ModuleType:
-    """Import the reproduction of a paper.
+    """Return the module that reproduces a paper, imported.
 
     Raises:
         ValueError: if there is none of that name, or the package is installed without the repository.

@@ -16,10 +16,10 @@ the protocol on fresh episodes, from a seed that did not exist when the file was
 number by number. The interval of a difference of independent numbers a in [a_l, a_u] and b in [b_l, b_u] with a > b has
 the half-width sqrt((a - a_l)^2 + (b_u - b)^2) (method of variance estimates recovery: G. Y. Zou and A. Donner,
 Construction of confidence limits about effect measures, Statistics in Medicine 27, 2008). The 95 % intervals are
-stretched to the confidence 1 - ALARM / n of a normal distribution for n numbers (Bonferroni), so that chance refuses
-about the share :data:`ALARM` of honest submissions. Over 32 episodes intervals are somewhat short: of pairs of
-batches up to six in 10,000 were refused in the five environments. The geometric mean of ratios of costs is compared by
-its logarithm.
+stretched to the confidence 1 - ALARM / n of a normal distribution for n numbers (Bonferroni), so that chance rejects
+about the share :data:`ALARM` of correct submissions. Over 32 episodes intervals are somewhat short: of pairs of batches
+up to six in 10,000 were rejected in the five environments. The geometric mean of ratios of costs is compared by its
+logarithm.
 """
 
 import hashlib
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-6
 """Largest relative difference of a number in a second run; of a ratio below one, the absolute difference."""
 ALARM = 1e-4
-"""Share of honest submissions that chance refuses on fresh episodes where estimates are normal, at most."""
+"""Share of correct submissions that chance rejects on fresh episodes where estimates are normal, at most."""
 SEED_BITS = 128
 """Random bits of the seed of fresh episodes: more than a competitor can try."""
 NEGLIGIBLE = 5e-5
@@ -67,7 +67,7 @@ SMALLEST = 1e-300
 MOST_BYTES = 8_000_000
 """Largest size of a file, bytes."""
 OWN = "submission"
-"""Name of a submission among the competitors of its evaluation."""
+"""Name of the submitted competitor in its evaluation."""
 TIME = "nanoseconds"
 """The metric that differs from run to run: it is reported, not compared."""
 RATIOS = (
@@ -94,7 +94,7 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 
 class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a file, without further members."""
+    """Base of the parts of a submission's file; further members are errors."""
 
 
 class Card(_Stored, frozen=True):
@@ -179,7 +179,7 @@ def protocol_of(problem: Problem, name: str) -> tuple[Protocol, str]:
 
 
 def read_submission(path: Path) -> tuple[Submission, str]:
-    """Read a submission without running any of it.
+    """Return the submission in a file, without running any of it, and the file's digest.
 
     Args:
         path: path of the file.
@@ -235,7 +235,7 @@ def _decode(path: Path, content: bytes) -> Submission:
 
 
 def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
-    """Return the part of a submission that contains a competitor, which its author names.
+    """Return a competitor as the part of a submission: arrays, source text, or its name if it is shipped.
 
     Args:
         problem: problem of the competitor.
@@ -274,7 +274,7 @@ def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
 
 
 def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = False) -> Any:
-    """Return the maker of a submission's competitor.
+    """Return the maker of the competitor in a submission: agent, source code or shipped filter.
 
     Args:
         problem: problem of the submission.
@@ -308,8 +308,8 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
     return found
 
 
-def _load_agent(problem: Problem, held: Arrays, path: Path) -> Any:
-    """Load an agent.
+def _load_agent(problem: Problem, arrays: Arrays, path: Path) -> Any:
+    """Return the agent of a submission, loaded from its arrays.
 
     Raises:
         ValueError: in one printable sentence that names the submission, if the arrays are no agent of the environment,
@@ -317,7 +317,7 @@ def _load_agent(problem: Problem, held: Arrays, path: Path) -> Any:
     """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "agent.safetensors"
-        file.write_bytes(held.safetensors)
+        file.write_bytes(arrays.safetensors)
         try:
             found = load_policy(problem.task, file)
             stored: Any = getattr(found, "policy", found)
@@ -330,7 +330,7 @@ def _load_agent(problem: Problem, held: Arrays, path: Path) -> Any:
 
 
 def _check_trained(problem: Problem, scenario: Any) -> None:
-    """Check the scenario, or the mixture of some, that an agent was trained on; a name in the file opens no other file.
+    """Raise ValueError unless an agent was trained on one or several training scenarios of the environment.
 
     Raises:
         ValueError: for a scenario that is held out, or none.
@@ -352,7 +352,7 @@ def make_submission(
     workers: Workers,
     progress: Progress | None = None,
 ) -> Submission:
-    """Run a protocol and return the submission.
+    """Run a protocol with a competitor, and return the submission with its results.
 
     Args:
         problem: problem to solve.
@@ -376,7 +376,7 @@ def make_submission(
 
 
 def check_submission(problem: Problem, submission: Submission, path: Path) -> Protocol:
-    """Check the statements of a submission against this package, without running it, and return its protocol.
+    """Check a submission's protocol and digest against this package, without running it; return the protocol.
 
     Raises:
         ValueError: for a protocol that is not this package's.
@@ -419,7 +419,7 @@ def run_submission(
     seed: int | None = None,
     references: bool = False,
 ) -> Run:
-    """Run the competitor of a submission over the scenarios of its protocol.
+    """Run the competitor of a submission over the scenarios of its protocol, and return the results.
 
     Args:
         problem: problem of the submission.
@@ -449,7 +449,7 @@ def run_submission(
 def _suspicions(
     problem: Problem, references: Sequence[str], costs: Mapping[str, Mapping[str, numpy.ndarray]]
 ) -> Iterator[Suspicion]:
-    """Yield the references whose costs are significantly above those of the submission, by a paired t-test.
+    """Yield a suspicion for each reference and scenario of significantly higher cost (paired t-test).
 
     Args:
         problem: problem of the references.
@@ -473,7 +473,7 @@ def _figures(records: "Sequence[Record]", physical: tuple[str, str]) -> Iterator
 
 
 class Deviation(NamedTuple):
-    """The number of some results that differs most from the second run."""
+    """The largest deviation of claimed results from those of a second run."""
 
     size: float
     """Size in units of what rounding, or on fresh episodes chance, explains; infinite where one of both has
@@ -483,18 +483,18 @@ class Deviation(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether rounding or chance explains it."""
+        """Whether rounding, or on fresh episodes chance, explains the deviation."""
         return self.size <= 1.0
 
 
-def deviation(claimed: Sequence[Figure], found: Sequence[Figure]) -> Deviation:
-    """Compare results with those of a second run of the same episodes; times are not compared.
+def deviation(claimed: Sequence[Figure], repeated: Sequence[Figure]) -> Deviation:
+    """Return the largest deviation of results from a second run over the same episodes; times are not compared.
 
     Args:
         claimed: results of a file.
-        found: results of the second run.
+        repeated: results of the second run.
     """
-    stated, known = _by_name(claimed), _by_name(found)
+    stated, known = _by_name(claimed), _by_name(repeated)
     worst = Deviation(0.0, "")
     if stated.keys() != known.keys() or len(stated) != sum(f.metric != TIME for f in claimed):
         odd = sorted(stated.keys() ^ known.keys())
@@ -519,7 +519,7 @@ def deviation(claimed: Sequence[Figure], found: Sequence[Figure]) -> Deviation:
 
 
 def fresh_deviation(claimed: Sequence[Figure], fresh: Sequence[Figure]) -> Deviation:
-    """Compare results with those of as many other episodes, by both intervals; times are not compared.
+    """Return the largest deviation of results from those over other episodes, by both intervals, without times.
 
     Args:
         claimed: results of a file, which hold on their own episodes.
@@ -551,14 +551,12 @@ def _numbers(figure: Figure) -> tuple[float | None, float | None, float | None]:
 
 
 def _critical(count: int) -> float:
-    """Return the number of standard errors within which all of some numbers are with probability ``1 - ALARM`` at
-    least.
-    """
+    """Return how many standard errors contain all of ``count`` normal numbers with probability ``1 - ALARM``."""
     return statistics.NormalDist().inv_cdf(1.0 - 0.5 * ALARM / max(count, 1))
 
 
 def _errors_apart(one: Figure, other: Figure) -> float:
-    """Return the difference of two independent numbers in standard errors; infinite where there is no interval."""
+    """Return the difference of two independent numbers in standard errors; infinite without intervals."""
     scale = []
     for figure in (one, other):
         numbers = [math.nan if number is None else number for number in _numbers(figure)]
@@ -584,7 +582,7 @@ def _number(value: float | None) -> str:
 
 
 class Verification(NamedTuple):
-    """Results of a verification."""
+    """Results of a verification: deviations on the same and on fresh episodes, and suspicions."""
 
     submission: Submission
     digest: str
@@ -602,7 +600,7 @@ class Verification(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether rounding explains the one deviation, and chance the other."""
+        """Whether the results hold: rounding explains the deviation on the same episodes, chance that on fresh ones."""
         return self.deviation.holds and self.fresh_deviation.holds
 
 
@@ -614,7 +612,7 @@ def verify(
     seed: int | None = None,
     same_seeds: bool = False,
 ) -> Verification:
-    """Run the protocol of a submission again, on its own episodes and then on fresh ones.
+    """Run the protocol of a submission again, on its own and on fresh episodes, and compare the results.
 
     Results that do not hold on their own episodes are not run on fresh ones.
 

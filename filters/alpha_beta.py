@@ -28,7 +28,7 @@ from .array_namespace import Array, namespace
 
 
 class Covariance(NamedTuple):
-    """Error covariance of one coordinate: three arrays of one shape."""
+    """Error covariance of position and velocity in one coordinate: three arrays of one shape."""
 
     position: Array
     """Variance of the position, m^2."""
@@ -39,27 +39,29 @@ class Covariance(NamedTuple):
 
 
 def benedict_bordner_beta(alpha: Array) -> Array:
-    """Return the velocity gain that goes with a position gain: ``beta = alpha^2 / (2 - alpha)``, equation (21).
+    """Return the Benedict-Bordner velocity gain for a position gain, ``beta = alpha^2 / (2 - alpha)``.
 
-    Benedict and Bordner (1962): the relation that minimises noise and transient error together.
+    Equation (21).
+
+    Benedict and Bordner (1962): this relation minimises noise and transient error together.
     """
     return alpha * alpha / (2.0 - alpha)
 
 
 def predict(position: Array, velocity: Array, T: float | Array) -> Array:
-    """Return the predicted position, ``x + T v``; the predicted velocity is the velocity."""
+    """Return the predicted position ``x + T v``; the velocity does not change."""
     return position + T * velocity
 
 
 def update(
     predicted: Array, velocity: Array, innovation: Array, alpha: Array, beta: Array, T: float | Array
 ) -> tuple[Array, Array]:
-    """Return the position and velocity after the innovation, equations (19) and (20)."""
+    """Return position and velocity updated with an innovation, equations (19) and (20)."""
     return predicted + alpha * innovation, velocity + (beta / T) * innovation
 
 
 def predict_covariance(P: Covariance, T: float | Array) -> Covariance:
-    """Return the covariance of the prediction, ``F P F^T`` with ``F = [[1, T], [0, 1]]`` and no process noise."""
+    """Return the predicted covariance ``F P F^T`` with ``F = [[1, T], [0, 1]]``, without process noise."""
     cross = P.cross + T * P.velocity
     return Covariance(P.position + T * (P.cross + cross), cross, P.velocity)
 
@@ -68,11 +70,11 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
     """Return the covariance after an update with any gains (Joseph form).
 
     Args:
-        P: covariance of the prediction.
+        P: predicted covariance.
         R: variance of the measurement, m^2.
         alpha: position gain.
         beta: velocity gain; ``beta / T`` enters the filter.
-        T: s since the last measurement.
+        T: time since the last measurement, s.
     """
     rate = beta / T
     rest = 1.0 - alpha
@@ -84,23 +86,23 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
     )
 
 
-def left_by_acceleration(
+def add_acceleration_error(
     P: Covariance, mean_square: Array, alpha: Array, beta: Array, T: float | Array, since: float | Array = 0.0
 ) -> Covariance:
-    """Return the covariance after an update when the target has accelerated since the measurement before.
+    """Return the covariance after an update, increased by the error that an acceleration leaves.
 
-    An acceleration ``a`` over an interval moves the position by ``d = a T^2 / 2`` and the velocity by ``2 d / T``, of
-    which the update (19), (20) leaves ``(1 - alpha) d`` and ``(2 - beta) d / T``. Where it goes on for ``since`` s
-    after the update, without a measurement, these become, with ``r = since / T``,
-    ``(1 - alpha + (2 - beta) r + r^2) d`` and ``(2 - beta + 2 r) d / T``.
+    The target accelerates since the previous measurement. An acceleration ``a`` over an interval moves the position by
+    ``d = a T^2 / 2`` and the velocity by ``2 d / T``, of which the update (19), (20) leaves ``(1 - alpha) d`` and
+    ``(2 - beta) d / T``. Where it lasts for ``since`` s after the update, without a measurement, these become, with
+    ``r = since / T``, ``(1 - alpha + (2 - beta) r + r^2) d`` and ``(2 - beta + 2 r) d / T``.
 
     Args:
-        P: covariance without it, after the update, or predicted from there by ``since``.
-        mean_square: of ``d``, m^2.
+        P: covariance without acceleration, after the update, or predicted from there by ``since``.
+        mean_square: mean square of ``d``, m^2.
         alpha: position gain of the update.
-        beta: its velocity gain.
-        T: s from the measurement before to the update.
-        since: s after the update.
+        beta: velocity gain of the update.
+        T: time from the previous measurement to the update, s.
+        since: time since the update, s.
     """
     ratio = since / T
     left = 2.0 - beta
@@ -113,7 +115,7 @@ def left_by_acceleration(
 
 
 def predict_joint_covariance(P: Array, T: float | Array) -> Array:
-    """Return ``F P F^T`` for several coordinates at once, with cross terms and without process noise.
+    """Return the predicted covariance ``F P F^T`` of several coordinates together, without process noise.
 
     Args:
         P: covariance of (positions, velocities), ``(2 d, 2 d, ...)``.
@@ -126,14 +128,14 @@ def predict_joint_covariance(P: Array, T: float | Array) -> Array:
 
 
 def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: float | Array) -> Array:
-    """Update the covariance by the Joseph form for several coordinates at once with the same gains in each.
+    """Return the covariance of several coordinates after an update with the same gains in each (Joseph form).
 
     Args:
-        P: covariance of the prediction of (positions, velocities), ``(2 d, 2 d, ...)``.
+        P: predicted covariance of (positions, velocities), ``(2 d, 2 d, ...)``.
         R: measurement variance of each coordinate, ``(d, ...)``; coordinates are measured independently.
         alpha: position gain, broadcasting against the trailing axes.
         beta: velocity gain; ``beta / T`` enters the filter.
-        T: s since the last measurement; one for all, or broadcasting in the same way.
+        T: time since the last measurement, s; one for all, or broadcasting in the same way.
     """
     xp = namespace(P)
     d = P.shape[0] // 2

@@ -1,4 +1,4 @@
-"""Differences of vectors of which some components are angles.
+"""Differences of vectors with angles among their components, without whole turns.
 
 An angle with the period c, 2 pi rad or 360 degrees, is known up to whole turns, so a difference d of two is one of
 d + k c. The shortest is ``d - c round(d / c)``, between minus and plus half a turn.
@@ -10,16 +10,16 @@ from collections.abc import Mapping
 from .array_namespace import Array, namespace
 
 PERIODS = {"rad": 2.0 * math.pi, "deg": 360.0}
-"""Of angles, by their units."""
+"""Periods of angles, by their units."""
 
 
 def unwrap(values: Array, reference: Array, periods: Mapping[int, float]) -> Array:
-    """Return the values with their angles on the turn nearest to a reference; values already there keep their bits.
+    """Return values whose angles are shifted by whole turns to within half a turn of a reference.
 
     Args:
-        values: ``(n, ...)``.
-        reference: ``(n, ...)``, of a shape that broadcasts.
-        periods: of the rows that are angles, by their numbers.
+        values: vectors, ``(n, ...)``; angles within half a turn keep their bits.
+        reference: vectors, ``(n, ...)``, of a shape that broadcasts.
+        periods: period of each row that is an angle, by its number.
     """
     if not periods:
         return values
@@ -30,5 +30,5 @@ def unwrap(values: Array, reference: Array, periods: Mapping[int, float]) -> Arr
 
 
 def shorten(difference: Array, periods: Mapping[int, float]) -> Array:
-    """Return the difference ``(n, ...)`` without whole turns; ``periods`` as of :func:`unwrap`."""
+    """Return differences ``(n, ...)`` with their angles within half a turn; ``periods`` by row as in :func:`unwrap`."""
     return unwrap(difference, 0.0 * difference, periods) if periods else difference

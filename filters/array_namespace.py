@@ -1,4 +1,4 @@
-"""The array library that an array belongs to, NumPy or torch through the array API standard, and ways between them."""
+"""Array namespace (array API standard) of NumPy arrays and torch tensors, and operations on nested arrays."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -13,11 +13,11 @@ Array = Any
 
 
 _BY_TYPE: dict[type, ModuleType] = {numpy.ndarray: numpy}
-"""Namespaces of the types of array seen so far."""
+"""Cache of the namespaces by type of array."""
 
 
 def namespace(array: Array) -> ModuleType:
-    """Return the array API namespace of ``array``.
+    """Return the array API namespace of an array: NumPy or that of torch.
 
     NumPy 2 implements the standard itself. Asking ``array_api_compat`` costs as much as three small array
     operations, and ``torch.compile`` cannot follow it, so the result is stored by type.
@@ -29,18 +29,18 @@ def namespace(array: Array) -> ModuleType:
 
 
 def lane_arrays(values: Any) -> list[Array]:
-    """Return the arrays with axes that stand among the numbers of nested lists."""
+    """Return a list of the arrays with axes in nested lists of numbers and arrays."""
     if isinstance(values, list | tuple):
         return [array for value in values for array in lane_arrays(value)]
     return [values] if getattr(values, "ndim", 0) else []
 
 
 def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
-    """Return the array of nested lists of numbers and arrays ``(N,)``, ``(..., N)``.
+    """Return nested lists of numbers and arrays ``(N,)`` as one array ``(..., N)``.
 
     Args:
         values: nested lists.
-        zero: ``(N,)``, added to every number.
+        zero: zeros ``(N,)``, added to every number.
         xp: array namespace.
     """
     if isinstance(values, list | tuple):
@@ -49,12 +49,12 @@ def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
 
 
 def zeros_for(shape: Sequence[int], *parts: Any) -> numpy.ndarray:
-    """Zeros of NumPy whose entries may be set to those of the parts, which may be expressions in place of numbers."""
+    """Return a NumPy array of zeros whose type can store entries of the parts, which may be traced expressions."""
     return numpy.zeros(shape, numpy.result_type(float, *map(numpy.asarray, parts)))
 
 
 def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
-    """Apply a function to the arrays of nested tuples and dictionaries; None contains no array."""
+    """Return nested tuples and dictionaries with a function applied to each of their arrays; None stays None."""
     first = parts[0]
     if first is None:
         return None
@@ -67,24 +67,22 @@ def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
 
 
 def select_nested(which: Array, one: Any, other: Any) -> Any:
-    """Return the entries of one nested tuple or dictionary of arrays ``(..., N)`` where ``which``, ``(N,)``, is
-    true, and of another elsewhere; None contains no array.
-    """
+    """Return nested arrays ``(..., N)`` with entries of ``one`` where a mask ``(N,)`` is true, else of ``other``."""
     return map_nested(functools.partial(namespace(which).where, which), one, other)
 
 
 def is_tensor(values: Any) -> bool:
-    """Return whether this is a torch tensor, without importing torch."""
+    """Return whether a value is a torch tensor, without importing torch."""
     return type(values).__module__.partition(".")[0] == "torch"
 
 
 def host_array(values: Any) -> numpy.ndarray:
-    """Return an array or tensor of any device as a NumPy array, without its gradient."""
+    """Return an array or a tensor on any device as a NumPy array."""
     return values.detach().cpu().numpy() if is_tensor(values) else numpy.asarray(values)
 
 
 def tensor_on(values: Any, device: Any) -> Array:
-    """Return a tensor on ``device``: a tensor keeps its gradient and precision, anything else is copied."""
+    """Return a value as a torch tensor on a device; a tensor keeps its gradient and type."""
     import torch
 
     return values.to(device) if is_tensor(values) else torch.tensor(values, device=device)

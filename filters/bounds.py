@@ -13,7 +13,7 @@ from .small_matrices import product, transpose
 
 
 def predict_bound(P: Array, F: Array, Q: Array | float = 0.0) -> Array:
-    """Return the bound before the measurement, ``F P F^T + Q``.
+    """Return the posterior Cramér-Rao bound before the next measurement, ``F P F^T + Q``.
 
     Args:
         P: bound after the previous measurement, ``(n, n, N)``.
@@ -24,15 +24,12 @@ def predict_bound(P: Array, F: Array, Q: Array | float = 0.0) -> Array:
 
 
 def posterior_cramer_rao_bound(P: Array, H: Array, R: Array) -> Array:
-    """Return the bound after a measurement.
+    """Return the posterior Cramér-Rao bound after a measurement, ``(n, n, N)``.
 
     Args:
         P: bound before it, ``(n, n, N)``.
         H: measurement matrix, ``(m, n)`` or ``(m, n, N)``.
         R: covariance of the measurement noise at the true state, ``(m, m)`` or ``(m, m, N)``.
-
-    Returns:
-        ``(n, n, N)``.
     """
     nothing = 0.0 * P[:, 0]
     result: Update = update(nothing, P, nothing[: H.shape[0]], H, R)

@@ -45,7 +45,7 @@ from .small_matrices import apply, cholesky, product, solve_lower, transpose
 
 
 class Models(NamedTuple):
-    """Motion of each class and the one radar that measures them all."""
+    """Linear motion models of M classes, and the measurement model of the radar."""
 
     Phi: Array
     """Transition matrices, ``(n, n, M)``."""
@@ -58,7 +58,7 @@ class Models(NamedTuple):
 
 
 class Advance(NamedTuple):
-    """The bank after radar update and class transition, before the ESM."""
+    """Estimates and probabilities of all classes after radar update and class transition, before the ESM decision."""
 
     mean: Array
     """Conditional estimates (9), ``(n, M, N)``."""
@@ -69,15 +69,15 @@ class Advance(NamedTuple):
     innovation: Array
     """Whitened innovations of the filters before mixing, ``(m, M, N)``: :func:`whiten`."""
     log_likelihood: Array
-    """log Lambda of the filters before mixing, as a density, ``(M, N)``."""
+    """Log-likelihood log Lambda of the radar measurement under each filter before mixing, ``(M, N)``."""
 
 
 def whiten(factor: list[list[Array]], innovation: Array) -> Array:
-    """Return ``L^-1 Delta`` with ``Theta = L L^T``: independent components of variance one, ``(m, ...)``.
+    """Return the whitened innovation ``L^-1 Delta`` with ``Theta = L L^T``, ``(m, ...)``.
 
-    The first is the innovation of the first component over its predicted sigma, the next what of the second
-    the first does not explain, over its sigma, and so on. Their squares add to the normalised innovation
-    squared.
+    ``factor`` is L. The first component is the first innovation over its predicted sigma, the next the part of the
+    second innovation that the first does not explain, over its sigma, and so on. The sum of their squares is the
+    normalised innovation squared.
     """
     return namespace(innovation).stack(solve_lower(factor, innovation))
 
@@ -85,16 +85,16 @@ def whiten(factor: list[list[Array]], innovation: Array) -> Array:
 def advance(
     probabilities: Array, mean: Array, covariance: Array, z: Array, models: Models, class_transition: Array
 ) -> Advance:
-    """Return the steps 1 to 3 of the recursion: radar update of every filter, class transition, mixing.
+    """Return the estimates of all classes after radar update, class transition and mixing: steps 1 to 3.
 
-    A class that cannot be reached keeps its own filter.
+    A class that cannot be reached keeps its own estimate.
 
     Args:
         probabilities: P(s(k-1)), ``(M, N)``.
         mean: x(s(k-1)), ``(n, M, N)``.
         covariance: R(s(k-1)), ``(n, n, M, N)``.
         z: radar measurement, ``(m, N)``.
-        models: of the classes.
+        models: models of the classes.
         class_transition: q, ``(M, M)``, row = from, column = to.
     """
     xp = namespace(mean)
@@ -126,7 +126,7 @@ def advance(
 
 
 def _solve_upper(L: list[list[Array]], B: Array) -> Array:
-    """Solve ``L^T X = B``."""
+    """Return X with ``L^T X = B``, for a list of the rows of L."""
     size = len(L)
     x: list[Array] = [None] * size
     for i in reversed(range(size)):
@@ -141,7 +141,10 @@ def _solve_upper(L: list[list[Array]], B: Array) -> Array:
 
 
 class Channels(NamedTuple):
-    """Gains and covariances of a bank of constant classes, which do not depend on the data, for scans 0 to K."""
+    """Gains, covariances and innovation statistics of Kalman filters of constant classes, for scans 0 to K.
+
+    They do not depend on the data.
+    """
 
     gain: Array
     """Kalman gains, ``(n, m, M, K + 1)``; zero at scan 0, where the track starts."""
@@ -154,10 +157,10 @@ class Channels(NamedTuple):
 
 
 def design_channels(models: Models, start: numpy.ndarray, scans: int) -> Channels:
-    """Return the gains, covariances and innovation statistics of the Kalman filters of all classes.
+    """Return gains, covariances and innovation statistics of the Kalman filters of all classes, for K scans.
 
     Args:
-        models: of the classes, NumPy arrays.
+        models: models of the classes, NumPy arrays.
         start: covariances at scan 0, ``(n, n, M)``.
         scans: K, the last scan.
     """
@@ -185,24 +188,24 @@ def design_channels(models: Models, start: numpy.ndarray, scans: int) -> Channel
 
 
 class ChannelUpdate(NamedTuple):
-    """Result of one scan of the bank of constant classes."""
+    """Result of the radar update of one scan in filters of constant classes."""
 
     mean: Array
-    """``(n, M, N)``."""
+    """Updated means, ``(n, M, N)``."""
     innovation: Array
-    """Whitened, ``(m, M, N)``."""
+    """Whitened innovations, ``(m, M, N)``."""
     log_likelihood: Array
-    """``(M, N)``."""
+    """Log-likelihoods of the measurement under each class, ``(M, N)``."""
 
 
 def update_channels(mean: Array, z: Array, models: Models, channels: Channels) -> ChannelUpdate:
-    """Apply step 1 of the recursion to filters whose gains are known.
+    """Return the means of all classes updated with a radar measurement, by precomputed gains (step 1).
 
     Args:
         mean: x(s), ``(n, M, N)``.
         z: radar measurement, ``(m, N)``.
-        models: of the classes.
-        channels: design of the filters, in place of K + 1 scans that of the scan of each episode, ``(..., N)``.
+        models: models of the classes.
+        channels: design of the filters at the present scan of each episode, ``(..., N)`` instead of ``(..., K + 1)``.
     """
     predicted = apply(models.Phi[..., None], mean)
     innovation = z[:, None] - apply(models.H[..., None, None], predicted)
@@ -218,14 +221,14 @@ def update_channels(mean: Array, z: Array, models: Models, channels: Channels) -
 def add_coloured_errors(
     models: Models, start: numpy.ndarray, share: float, decay: float
 ) -> tuple[Models, numpy.ndarray]:
-    """Return the models whose states hold the coloured errors of the measured components, too; NumPy arrays.
+    """Return the models and covariances of states augmented by the radar's coloured errors; NumPy arrays.
 
     With x the state and e the errors, ``e(k) = decay e(k-1) + w``, the new state is (x + H^T e, e): each measured
-    component comes with its error, so that measurements are the first m components and white errors. At the start these
+    component includes its error, so that measurements are the first m components and white errors. At the start these
     components are those of a measurement.
 
     Args:
-        models: of the classes, with ``H = [I 0]``.
+        models: models of the classes, with ``H = [I 0]``.
         start: covariances at scan 0, ``(n, n, M)``.
         share: variance of a coloured error over that of the white one.
         decay: factor on the coloured error from scan to scan.
@@ -252,13 +255,13 @@ def add_coloured_errors(
     return whole, numpy.moveaxis(P, 0, -1)
 
 
-def take_away_coloured_errors(mean: Array, covariance: Array, measured: int = 2) -> tuple[Array, Array]:
-    """Return the state without the coloured errors of :func:`add_coloured_errors`.
+def remove_coloured_errors(mean: Array, covariance: Array, measured: int = 2) -> tuple[Array, Array]:
+    """Return mean and covariance of the state x itself, from those of :func:`add_coloured_errors`.
 
     Args:
-        mean: ``(n + m, N)``.
-        covariance: ``(n + m, n + m, N)``.
-        measured: m.
+        mean: mean of the augmented state, ``(n + m, N)``.
+        covariance: covariance of the augmented state, ``(n + m, n + m, N)``.
+        measured: number m of measured components.
     """
     xp, n = namespace(mean), mean.shape[0] - measured
     states = xp.concat([mean[:measured] - mean[n:], mean[measured:n]])
@@ -271,7 +274,7 @@ def take_away_coloured_errors(mean: Array, covariance: Array, measured: int = 2)
 
 
 def decision_probabilities(confusion: numpy.ndarray, composition: numpy.ndarray) -> numpy.ndarray:
-    """Return the probability pi(rho | s) of every ESM decision for every class, ``(M, J)``.
+    """Return the probability pi(rho | s) of each ESM decision rho for each class s, ``(M, J)``.
 
     Args:
         confusion: pi(rho | type), ``(J, J)``, row = true type, column = decision; equation (5).
@@ -281,14 +284,14 @@ def decision_probabilities(confusion: numpy.ndarray, composition: numpy.ndarray)
 
 
 def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_composition: Array) -> Array:
-    """Return the log-likelihood of the classes when all decisions are about one unchanging type, ``(M, N)``.
+    """Return the log-likelihood of each class if all decisions are on one constant type, ``(M, N)``.
 
     (8) multiplies pi(rho | s) at every decision, which is Bayes' rule only if the type is drawn anew each
     time. For one type ``log sum_j P(type j | s) prod_rho pi(rho | type j)^count(rho)``: the posterior of type
     and class together, summed over the type.
 
     Args:
-        counts: how often each type was decided, ``(J, N)``.
+        counts: number of decisions for each type, ``(J, N)``.
         log_confusion: log pi(rho | type), ``(J, J)``, row = true type; finite.
         log_composition: log P(type | s), ``(M, J)``; finite.
     """
@@ -301,12 +304,13 @@ def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_compo
 
 
 def change_class_and_type(log_joint: Array, log_composition: Array, change: float) -> Array:
-    """Return the log-probabilities of class and type after the class may have changed and brought its own type, ``(M,
-    J, N)``.
+    """Return the log-probabilities of class and type after a possible change of the class, ``(M, J, N)``.
+
+    A new class has its own type.
 
     ``P(s, j) <- (1 - c) P(s, j) + c P(type j | s) sum_{s' != s} P(s') / (M - 1)``: the transition q of (8), for a type
-    that changes only together with the class. It is the prediction of Bayes' rule for a hidden Markov chain, and a
-    forgetting of the joint posterior: what speaks for another class counts for less the longer ago it was heard.
+    that changes only together with the class. It is the prediction of Bayes' rule for a hidden Markov chain. Old
+    evidence loses weight.
 
     Args:
         log_joint: log P(s, j), up to a constant, ``(M, J, N)``.
@@ -322,12 +326,12 @@ def change_class_and_type(log_joint: Array, log_composition: Array, change: floa
 
 
 def bearing_gate(radar_sigma: float, esm_sigma: float, error_probability: float) -> float:
-    """Return the largest difference of two bearings that are taken for one target, equation (7), in the sigmas' unit.
+    """Return the largest difference of two bearings of one target at an error probability, equation (7).
 
-    ``sqrt(sigma_Z^2 + sigma_Y^2) F^-1(1 - P_err / 2)``.
+    ``sqrt(sigma_Z^2 + sigma_Y^2) F^-1(1 - P_err / 2)``, in the unit of the sigmas.
 
     Raises:
-        ValueError: ``error_probability`` is not between 0 and 1.
+        ValueError: if ``error_probability`` is not between 0 and 1.
     """
     if not 0.0 < error_probability < 1.0:
         raise ValueError(f"error_probability must be above 0 and below 1, got {error_probability!r}")
@@ -335,6 +339,6 @@ def bearing_gate(radar_sigma: float, esm_sigma: float, error_probability: float)
 
 
 def bearing_difference(first: Array, second: Array) -> Array:
-    """Return the difference of two bearings in degrees, wrapped to [-180, 180)."""
+    """Return the difference of two bearings, degrees, wrapped to [-180, 180)."""
     difference = first - second
     return difference - 360.0 * namespace(difference).floor((difference + 180.0) / 360.0)

@@ -1,4 +1,4 @@
-r"""Kalman's update where some measurements, it is unknown which, have far larger errors than stated.
+r"""Kalman update with measurements of which an unknown few have far larger errors than stated (outliers).
 
 The error is normal with variance R, or with probability g an outlier of variance k^2 R (the contaminated normal:
 J. W. Tukey, A survey of sampling from contaminated distributions, 1960). Either hypothesis i has its innovation
@@ -28,18 +28,18 @@ from .small_matrices import apply, mirror_lower, outer, product, transpose
 def update_position(
     mean: Array, covariance: Array, z: Array, variance: Array, probability: float, factor: float
 ) -> Update:
-    """Update with measurements of the first two components of the state, whose errors are independent.
+    """Return the update with measurements of the first two state components, which may be outliers.
 
     Args:
-        mean: predicted, ``(n, ...)``.
-        covariance: predicted, ``(n, n, ...)``.
+        mean: predicted mean, ``(n, ...)``.
+        covariance: predicted covariance, ``(n, n, ...)``.
         z: measurements, ``(2, ...)``.
         variance: R of measurements that are no outliers, ``(2, ...)``.
-        probability: g, of an outlier; zero: none.
-        factor: k, of its standard deviation.
+        probability: g, probability of an outlier; zero: none.
+        factor: k, factor on its standard deviation.
 
     Returns:
-        The update, with the log-density of the mixture; the squared distance is the mean of both by their weights.
+        The update, with the log-density of the mixture; the squared distance is the weighted mean of both.
     """
     xp = namespace(mean)
     innovation = z - mean[:2]

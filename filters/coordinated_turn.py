@@ -1,4 +1,4 @@
-r"""The nearly coordinated turn: motion at constant speed with a turn rate that is estimated with it.
+r"""Nearly coordinated turn: motion at constant speed with an estimated turn rate.
 
 The state is (x, y, vx, vy, omega), omega anticlockwise positive, and over an interval T with theta = omega T
 
@@ -24,7 +24,7 @@ from .small_matrices import product, transpose
 
 
 def _sine_ratio(angle: Array) -> Array:
-    """Return the sine of an angle over the angle."""
+    """Return ``sin(x) / x``, one at zero."""
     xp = namespace(angle)
     nonzero = angle != 0.0
     divisor = xp.where(nonzero, angle, 1.0)
@@ -32,7 +32,7 @@ def _sine_ratio(angle: Array) -> Array:
 
 
 def _sine_ratio_derivative(angle: Array, cosine: Array, ratio: Array) -> Array:
-    """Return the derivative of :func:`_sine_ratio`; below 0.1, where the closed form cancels, a series to rounding."""
+    """Return the derivative of ``sin(x) / x``, from a series where the closed form cancels."""
     xp = namespace(angle)
     small = xp.abs(angle) < 0.1
     square = angle * angle
@@ -41,11 +41,11 @@ def _sine_ratio_derivative(angle: Array, cosine: Array, ratio: Array) -> Array:
 
 
 def propagate(state: Array, T: float | Array) -> Array:
-    """Return the state after an interval at constant turn rate.
+    """Return the state after an interval at a constant turn rate, ``(5, ...)``.
 
     Args:
         state: position (m), velocity (m/s) and turn rate (rad/s), ``(5, ...)``.
-        T: interval, s; one for all, or ``(...)``.
+        T: interval, s, a number or ``(...)``.
     """
     xp = namespace(state)
     x, y, vx, vy, omega = (state[i] for i in range(5))
@@ -64,7 +64,7 @@ def propagate(state: Array, T: float | Array) -> Array:
 
 
 def jacobian(state: Array, T: float | Array) -> Array:
-    """Return the derivative of :func:`propagate` with respect to the state, ``(5, 5, ...)``; arguments as there."""
+    """Return the Jacobian of :func:`propagate` with respect to the state, ``(5, 5, ...)``."""
     xp = namespace(state)
     vx, vy, omega = state[2], state[3], state[4]
     angle = T * omega
@@ -84,24 +84,24 @@ def jacobian(state: Array, T: float | Array) -> Array:
 
 
 def process_noise(T: float, acceleration_sigma: float, turn_acceleration_sigma: float) -> list[list[float]]:
-    """Return the covariance of the noise over an interval, ``(5, 5)``, as nested lists.
+    """Return the covariance of the process noise over an interval, ``(5, 5)``, as nested lists.
 
     Args:
         T: interval, s.
         acceleration_sigma: standard deviation of the acceleration along x and y, m/s^2.
-        turn_acceleration_sigma: of the change of the turn rate, rad/s^2.
+        turn_acceleration_sigma: standard deviation of the rate of change of the turn rate, rad/s^2.
     """
     Q = white_acceleration(T, acceleration_sigma, axes=2)[1]
     return [*([*row, 0.0] for row in Q), [0.0, 0.0, 0.0, 0.0, (T * turn_acceleration_sigma) ** 2]]
 
 
 def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple[Array, Array]:
-    """Apply the time update of the extended Kalman filter, ``P' = F P F^T + Q`` with the Jacobian F at the estimate.
+    """Return mean and covariance predicted by the extended Kalman filter, ``F P F^T + Q`` with the Jacobian F.
 
     Args:
-        mean: ``(5, N)``.
-        covariance: ``(5, 5, N)``.
-        T: interval, s; one for all, or ``(N,)``.
+        mean: mean of the state, ``(5, N)``.
+        covariance: its covariance, ``(5, 5, N)``.
+        T: interval, s, a number or ``(N,)``.
         Q: covariance of the process noise, ``(5, 5, 1)`` or ``(5, 5, N)``.
     """
     F = jacobian(mean, T)
@@ -109,15 +109,12 @@ def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple
 
 
 def augment_turn_rate(mean: Array, covariance: Array, variance: float) -> tuple[Array, Array]:
-    """Return the estimate of position and velocity with an independent turn rate of mean zero as fifth state.
+    """Return mean ``(5, N)`` and covariance of position and velocity, with an independent turn rate of mean zero.
 
     Args:
-        mean: ``(4, N)``.
-        covariance: ``(4, 4, N)``.
-        variance: of the turn rate, (rad/s)^2.
-
-    Returns:
-        ``(5, N)`` and ``(5, 5, N)``.
+        mean: mean of position and velocity, ``(4, N)``.
+        covariance: their covariance, ``(4, 4, N)``.
+        variance: variance of the turn rate, (rad/s)^2.
     """
     xp = namespace(mean)
     zero = 0.0 * mean

@@ -1,4 +1,4 @@
-r"""Association of plots with a track: the nearest one in a gate, or all of them by their probabilities.
+r"""Association of plots (detections) with a track: nearest neighbour in a gate, or probabilistic (PDA).
 
 A scan gives K plots z_i with error variances R_i, of which one at most is the target's; the others are false, uniform
 with density lambda (a Poisson number in a region), and the target is seen with probability P_D. With the innovations
@@ -39,7 +39,7 @@ class Plots(NamedTuple):
     """All plots of a scan in the window of a track, in random order."""
 
     position: Array
-    """x and y, m, ``(2, K, N)``; zero where there is none, where an estimator gets NaN."""
+    """Positions x and y, m, ``(2, K, N)``; zero without a plot, NaN where an estimator receives them."""
     variance: Array
     """Variances of their errors, evaluated at the plots, m^2, ``(2, K, N)``."""
     available: Array
@@ -47,19 +47,19 @@ class Plots(NamedTuple):
 
 
 def _invert(xx: Array, xy: Array, yy: Array) -> tuple[Array, Array]:
-    """Return the inverse ``(2, 2, ...)`` and determinant of a symmetric matrix of two rows."""
+    """Return the inverse ``(2, 2, ...)`` and the determinant of a symmetric two-by-two matrix."""
     xp, determinant = namespace(xx), xx * yy - xy * xy
     return xp.stack([xp.stack([yy, -xy]), xp.stack([-xy, xx])]) / determinant, determinant
 
 
 def squared_distances(position: Array, covariance: Array, plots: Array, variances: Array) -> Array:
-    """Return the squared distances (1) of plots from a predicted position, ``(K, ...)``.
+    """Return the squared Mahalanobis distances (1) of K plots from a predicted position, ``(K, ...)``.
 
     Args:
-        position: predicted, ``(2, ...)``.
-        covariance: of the prediction, ``(2, 2, ...)``.
-        plots: positions, ``(2, K, ...)``.
-        variances: R of their errors, which are independent, ``(2, K, ...)``.
+        position: predicted position, ``(2, ...)``.
+        covariance: its covariance, ``(2, 2, ...)``.
+        plots: positions of the plots, ``(2, K, ...)``.
+        variances: variances R of their errors, which are independent, ``(2, K, ...)``.
     """
     nu = plots - position[:, None]
     P = covariance[:, :, None]
@@ -70,10 +70,10 @@ def squared_distances(position: Array, covariance: Array, plots: Array, variance
 
 
 def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[Array, Array]:
-    """Return the plot that is nearest to the prediction.
+    """Return a mask of the plot that is nearest to the prediction, and whether it is in the gate.
 
     Args:
-        distances: squared, ``(K, N)``.
+        distances: squared distances, ``(K, N)``.
         available: above zero where there is a plot, ``(K, N)``.
         gate: largest squared distance.
 
@@ -93,18 +93,18 @@ def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[
 def update_position(
     mean: Array, covariance: Array, plots: Plots, detection_probability: float, density: Array
 ) -> Update:
-    """Update with all plots of a scan, which measure the first two components of the state.
+    """Return the PDA update with all plots of a scan, which measure the first two state components.
 
     Args:
-        mean: predicted, ``(n, ...)``.
-        covariance: predicted, ``(n, n, ...)``.
-        plots: of the scan; their errors are independent.
-        detection_probability: P_D.
-        density: lambda, false plots per unit of area, ``(...)``.
+        mean: predicted mean, ``(n, ...)``.
+        covariance: predicted covariance, ``(n, n, ...)``.
+        plots: plots of the scan; their errors are independent.
+        detection_probability: P_D, probability of detection.
+        density: lambda, number of false plots per unit of area, ``(...)``.
 
     Returns:
-        The update; ``log_likelihood`` is that of the ratio, the squared distance is the mean of those of the plots by
-        their beta.
+        The update; ``log_likelihood`` is the log of the likelihood ratio to false plots alone, and the squared distance
+        the mean over the plots weighted by beta.
     """
     xp = namespace(mean)
     none = math.log(1.0 - detection_probability) + 0.0 * covariance[0, 0]

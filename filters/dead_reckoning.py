@@ -1,8 +1,8 @@
-r"""Positions with slow errors, anchored by dead reckoning from a second sensor.
+r"""Positions with slowly varying errors, filtered with dead reckoning from a second sensor.
 
-A receiver's errors last: for minutes they look like motion, and no filter of its positions alone can tell both apart. A
-sensor of another kind, such as wheels and a compass, a camera or an INS, can: its errors grow with the way, and the
-receiver's do not. With its displacement d over an interval T, scaled by k and turned clockwise by h,
+A receiver's errors last: for minutes they look like motion, and its positions alone do not separate both. A sensor of
+another kind, such as wheels and a compass, a camera or an INS, does: its errors grow with the distance travelled, and
+the receiver's do not. With its displacement d over an interval T, scaled by k and turned clockwise by h,
 
     p' = p + k A(h) d + w                  position,                       w ~ N(0, q^2 l I)
     v' = (k A(h) d + w) / T                velocity, the mean of T
@@ -29,24 +29,24 @@ from .array_namespace import Array, namespace
 from .kalman import predict
 
 CREEP = 0.01
-"""m/s, by which the way that dead reckoning may err over grows at a standstill; ours."""
+"""Speed by which the distance grows at a standstill, for the error of dead reckoning, m/s; ours."""
 
 
 class Noise(NamedTuple):
-    """Constants of the filter."""
+    """Noise parameters of the filter."""
 
     drift: float | Array
-    """q, m over the root of a metre."""
+    """q, error of dead reckoning, m over the root of the distance in m."""
     acceleration: float | Array
-    """Deviation of a where there is no displacement, m/s^2."""
+    """Standard deviation of the acceleration a without dead reckoning, m/s^2."""
     correlation_time: float | Array
-    """tau, s."""
+    """tau, correlation time of the receiver's error, s."""
     deviation: float | Array
-    """s, m."""
+    """s, standard deviation of the receiver's error, m."""
 
 
 def _both_axes(block: list[list[Array]]) -> Array:
-    """Put a matrix ``(3, 3)`` of one axis, entries ``(N,)``, into that of both, ``(6, 6, N)``."""
+    """Return a matrix ``(3, 3)`` of one axis, entries ``(N,)``, as the block matrix of both axes, ``(6, 6, N)``."""
     xp, zero = namespace(block[0][0]), 0.0 * block[0][0]
     return xp.stack(
         [xp.stack([block[i // 2][j // 2] if i % 2 == j % 2 else zero for j in range(6)]) for i in range(6)]
@@ -54,15 +54,12 @@ def _both_axes(block: list[list[Array]]) -> Array:
 
 
 def start(mean: Array, covariance: Array, deviation: float | Array) -> tuple[Array, Array]:
-    """Return the state of which a measured position is all that is known: ``p = z - e - n``.
+    """Return mean ``(6, N)`` and covariance of the state at a first measured position, ``p = z - e - n``.
 
     Args:
         mean: position and velocity, the position as it was measured, ``(4, N)``, m and m/s.
-        covariance: of their white errors, ``(4, 4, N)``.
-        deviation: s, m.
-
-    Returns:
-        Mean ``(6, N)`` and covariance ``(6, 6, N)``.
+        covariance: covariance of their white errors, ``(4, 4, N)``.
+        deviation: s, standard deviation of the receiver's error, m.
     """
     xp = namespace(mean)
     zero = 0.0 * mean[0]
@@ -79,7 +76,7 @@ def start(mean: Array, covariance: Array, deviation: float | Array) -> tuple[Arr
 
 
 def calibrate(displacement: Array, scale: float | Array, heading_offset: float | Array) -> Array:
-    """Return displacements ``(2, N)``, scaled and turned clockwise by an angle, rad."""
+    """Return displacements ``(2, N)`` multiplied by a scale factor and turned clockwise by an angle, rad."""
     xp = namespace(displacement)
     angle = heading_offset + 0.0 * displacement[0]
     cosine, sine = scale * xp.cos(angle), scale * xp.sin(angle)
@@ -95,15 +92,15 @@ def predict_position(
     T: Array,
     noise: Noise,
 ) -> tuple[Array, Array]:
-    """Apply the time update.
+    """Return mean and covariance predicted with the displacement of dead reckoning, or without one.
 
     Args:
-        mean: ``(6, N)``.
-        covariance: ``(6, 6, N)``.
-        displacement: calibrated, m, ``(2, N)``.
-        available: above zero where there is one, ``(N,)``.
-        T: s, ``(N,)``.
-        noise: constants of the filter.
+        mean: mean of the state, ``(6, N)``.
+        covariance: its covariance, ``(6, 6, N)``.
+        displacement: calibrated displacement, m, ``(2, N)``.
+        available: above zero where there is a displacement, ``(N,)``.
+        T: interval, s, ``(N,)``.
+        noise: noise parameters of the filter.
     """
     xp = namespace(mean)
     known = available > 0.0

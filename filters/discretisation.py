@@ -1,4 +1,4 @@
-r"""A continuous model with white noise, over an interval: transition, process noise, and motion of a nonlinear one.
+r"""Discretisation of a continuous model with white noise: transition matrix and process noise over an interval.
 
     dx/dt = A x + noise of spectral density D,   x(t + dt) = F x(t) + w,  w ~ N(0, Q)
     F = exp(A dt),   Q = integral from 0 to dt of exp(A s) D exp(A^T s) ds
@@ -26,24 +26,22 @@ import numpy
 from .array_namespace import Array
 
 SHORT = 0.5
-"""Largest norm of A h, for which the series is."""
+"""Largest norm of A h up to which the series is used."""
 TERMS = 14
-"""Of the series: 0.5^15 / 15! is 2e-17."""
+"""Number of terms of the series: 0.5^15 / 15! is 2e-17."""
 GAUSS_LEGENDRE = tuple(zip(*(part.tolist() for part in numpy.polynomial.legendre.leggauss(3)), strict=True))
-"""Points on [-1, 1] and their weights."""
+"""Points of Gauss-Legendre quadrature on [-1, 1] and their weights."""
 
 
 class Series(NamedTuple):
-    """Number of terms of the sum, and number of doublings of the interval."""
+    """Number of terms of the series, and number of doublings of the interval."""
 
     terms: int
     doublings: int
 
 
 def choose_series(A: numpy.ndarray, longest: float) -> Series:
-    """Return the series that is exact to rounding up to the longest interval, s; of integrators in a chain it ends
-    by itself.
-    """
+    """Return the series that is exact to rounding for intervals up to ``longest``, s; for integrators it ends."""
     power = numpy.eye(len(A))
     for k in range(1, len(A) + 1):
         power = power @ A
@@ -54,13 +52,13 @@ def choose_series(A: numpy.ndarray, longest: float) -> Series:
 
 
 def discretise(A: numpy.ndarray, D: numpy.ndarray, interval: Any, series: Series) -> tuple[Array, Array]:
-    """Return the transition less the unit matrix, and process noise, ``(n, n)`` both.
+    """Return the transition matrix minus the identity, and the process noise, over an interval, ``(n, n)`` each.
 
     Args:
-        A: ``(n, n)``, 1/s.
+        A: matrix of the continuous model, ``(n, n)``, 1/s.
         D: spectral density of the noise, ``(n, n)``.
-        interval: s, a number.
-        series: of :func:`choose_series`.
+        interval: interval, s, a number.
+        series: series from :func:`choose_series`.
     """
     h = interval / 2.0**series.doublings
     moved, noise, power = A, D, 1.0 * h
@@ -77,13 +75,13 @@ def discretise(A: numpy.ndarray, D: numpy.ndarray, interval: Any, series: Series
 
 
 def runge_kutta(drift: Callable[[Array], Array], x: Array, interval: Any, steps: int = 1) -> Array:
-    """Return the state an interval later by the classical method of order 4, ``(n,)``.
+    """Return the state of a nonlinear model after an interval, ``(n,)``, by the Runge-Kutta method of order 4.
 
     Args:
-        drift: from the state to its derivative.
-        x: ``(n,)``.
-        interval: s.
-        steps: of equal length.
+        drift: function from the state to its derivative.
+        x: state at the start, ``(n,)``.
+        interval: interval, s.
+        steps: number of steps of equal length.
     """
     h = interval / float(steps)
     for _ in range(steps):
@@ -95,8 +93,8 @@ def runge_kutta(drift: Callable[[Array], Array], x: Array, interval: Any, steps:
     return x
 
 
-def held_noise(A: Array, D: numpy.ndarray, interval: Any) -> Array:
-    """Return the process noise of a constant matrix A, ``(n, n)``; arguments as of :func:`discretise`."""
+def constant_matrix_noise(A: Array, D: numpy.ndarray, interval: Any) -> Array:
+    """Return the process noise over an interval for a matrix A that is constant in it, ``(n, n)``, by quadrature."""
     square = A @ A
     cube, total = square @ A, 0.0
     for point, weight in GAUSS_LEGENDRE:

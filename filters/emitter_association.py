@@ -1,4 +1,4 @@
-r"""Whose emitter was heard: type decisions of a target beside a second emitter, when the target is silent at times.
+r"""Association of ESM decisions with a target or a second emitter, for a target that is silent at times.
 
 At a look a station hears the second emitter with probability q, otherwise the target if it radiates, otherwise nothing.
 It decides that the heard emitter is of type rho, with the probabilities pi(rho | type), and measures its bearing: the
@@ -37,26 +37,26 @@ from .array_namespace import Array, namespace
 from .class_fusion import bearing_difference
 
 LEAST_DECISION = 1e-9
-"""Probability of a decision that the station's matrix calls impossible."""
+"""Least probability of a decision, also for those that the confusion matrix excludes."""
 FARTHEST = 300.0
-"""Largest exponent of a bearing's density: a larger difference has the same density."""
+"""Largest exponent of a bearing's density; larger differences have the same density."""
 
 
 class Surroundings(NamedTuple):
-    """Grid over the unknown second emitter and the unknown silences of the target, ``(V, 1)`` each."""
+    """Grid of V points over the unknown second emitter and the target's silences, ``(V, 1)`` each."""
 
     other_type: Array
-    """Index i of the second emitter's type, a whole number, ``(V,)``."""
+    """Index i of the second emitter's type, an integer, ``(V,)``."""
     separation: Array
-    """delta: its bearing minus the target's, in the unit of sigma."""
+    """delta, bearing of the second emitter minus the target's, in the unit of sigma."""
     second_emitter: Array
-    """q."""
+    """q, probability that the second emitter is heard at a look."""
     silence_start: Array
-    """f."""
+    """f, probability that a radiating target becomes silent before a look."""
     silence_end: Array
-    """g."""
+    """g, probability that a silent target radiates again."""
     weight: Array
-    """Prior probability of all but the type of the second emitter."""
+    """Prior probability of the point, given the type of the second emitter."""
 
 
 def surroundings(
@@ -65,13 +65,13 @@ def surroundings(
     sides: int,
     rates: Sequence[tuple[float, float, float, float]],
 ) -> Surroundings:
-    """Make a grid of NumPy arrays.
+    """Return a grid over type and bearing of the second emitter and rates of silence, of NumPy arrays.
 
     Args:
-        types: that a second emitter may have.
+        types: number of types that a second emitter may have.
         separation: limits of the size of delta, in the unit of sigma.
-        sides: points of delta on either side, in the middles of equal parts.
-        rates: ``(q, f, g, probability)`` of each; where q is zero nothing is laid out over type and separation.
+        sides: number of points of delta on either side, in the middles of equal parts.
+        rates: ``(q, f, g, probability)`` of each; where q is zero there is one separation only.
     """
     low, high = separation
     middles = low + (high - low) * (numpy.arange(sides) + 0.5) / sides
@@ -93,27 +93,27 @@ def surroundings(
 
 
 def start_table(grid: Surroundings, labels: int) -> Array:
-    """Return the table before the first look, the same for all labels, with silences in balance, ``(J, 2, V, 1)``.
+    """Return the table of likelihoods before the first look, ``(J, 2, V, 1)``, with stationary silences.
 
     Args:
-        grid: of NumPy arrays.
-        labels: J.
+        grid: grid of NumPy arrays.
+        labels: number J of labels.
     """
     balance = grid.silence_end / (grid.silence_start + grid.silence_end)
     return numpy.stack([numpy.stack([grid.weight * (1.0 - balance), grid.weight * balance])] * labels)
 
 
-def fall_silent(table: Array, grid: Surroundings, looked: Array) -> Array:
-    """Apply equation (3) before a look.
+def predict_silence(table: Array, grid: Surroundings, is_looking: Array) -> Array:
+    """Return the table of likelihoods after a possible start or end of silence before a look, equation (3).
 
     Args:
-        table: ``(J, 2, V, N)``.
-        grid: of the table.
-        looked: whether the station looks, ``(N,)`` of booleans.
+        table: table of likelihoods, ``(J, 2, V, N)``.
+        grid: grid of the table.
+        is_looking: mask of episodes in which the station looks, ``(N,)`` booleans.
     """
     xp = namespace(table)
-    off = xp.where(looked, grid.silence_start, 0.0) * table[:, 1]
-    on = xp.where(looked, grid.silence_end, 0.0) * table[:, 0]
+    off = xp.where(is_looking, grid.silence_start, 0.0) * table[:, 1]
+    on = xp.where(is_looking, grid.silence_end, 0.0) * table[:, 0]
     change = on - off
     return xp.stack([table[:, 0] - change, table[:, 1] + change], axis=1)
 
@@ -122,25 +122,26 @@ class Look(NamedTuple):
     """Report of the station at one scan."""
 
     looked: Array
-    """Whether it looks, ``(N,)`` of booleans."""
+    """Mask of episodes in which the station looks, ``(N,)`` booleans."""
     decision: Array
-    """rho, or K where nothing is heard, ``(N,)``."""
+    """Decision rho, or K if nothing is heard, ``(N,)``."""
     difference: Array
-    """Target's bearing minus the measured one, degrees, ``(N,)``; anything where nothing is heard."""
+    """Target's bearing minus the measured one, degrees, ``(N,)``; any number if nothing is heard."""
 
 
 def look_likelihood(
     grid: Surroundings, confusion: Array, other_confusion: Array, look: Look, deviation: float
 ) -> Array:
-    """Return the likelihood (1), (2) of a look over the density of a bearing at its mean, ``(J, 2, V, N)``; one
-    without a look.
+    """Return the likelihood (1), (2) of a look for each label, silence and grid point, ``(J, 2, V, N)``.
+
+    It is relative to the density of a bearing at its mean, and one without a look.
 
     Args:
-        grid: V points.
+        grid: grid of V points.
         confusion: pi(rho | label), ``(J, K)``, K decisions.
         other_confusion: pi(rho | type) of the second emitter, ``(I, K)``.
-        look: of the scan.
-        deviation: sigma, degrees.
+        look: report of the scan.
+        deviation: sigma, standard deviation of a bearing, degrees.
     """
     looked, decision, difference = look
     xp, decisions = namespace(difference), confusion.shape[1]

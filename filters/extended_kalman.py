@@ -1,4 +1,4 @@
-r"""The measurement update of an extended Kalman filter, one scalar observation after the other.
+r"""Measurement update of an extended Kalman filter, by one scalar observation after the other.
 
 With the prediction x', P', the residual nu = y - S(x') and the rows h of the Jacobian dS/dx at x', for every
 observation j with variance r_j:
@@ -22,7 +22,7 @@ beyond the threshold, is the usual way to it. With one scalar observation its fi
 
     s' = h P h^T + r' = max(s, sqrt(r) |nu'| / k),
 
-and s' takes the place of s. The prediction is believed as before: an innovation that h P h^T explains is no
+and s' takes the place of s. The prediction has its usual weight: an innovation that h P h^T explains is no
 outlier. Sources: P. J. Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 35,
 1964; in the update of a Kalman filter, by reweighting: Z. M. Durovic and B. D. Kovacevic, Robust estimation with
 unknown noise statistics, IEEE Transactions on Automatic Control 44, 1999.
@@ -41,26 +41,27 @@ from .array_namespace import Array, namespace
 
 
 class JacobianRow(NamedTuple):
-    """Non-zero part of one row of a Jacobian."""
+    """Non-zero entries of one row of a Jacobian."""
 
     columns: tuple[int, ...]
-    """Which states enter."""
+    """Indices of the states with non-zero derivatives."""
     values: tuple[Array | float, ...]
-    """Derivative with respect to each of them, ``(...)`` or a number."""
+    """Derivatives with respect to these states, ``(...)`` or numbers."""
 
 
 class Correction(NamedTuple):
-    """Result of an update by scalar observations."""
+    """Result of a measurement update by scalar observations."""
 
     mean: Array
-    """``(n, ...)``."""
+    """Updated mean, ``(n, ...)``."""
     covariance: Array
-    """``(n, n, ...)``."""
+    """Updated covariance, ``(n, n, ...)``."""
     log_likelihood: Array
     """Log-density of the available observations given the prediction, ``(...)``."""
     squared_residuals: tuple[Array, ...]
-    """Of every observation, its normalised residual squared given those before it, zero where it is not
-    available; m arrays ``(...)``. Their sum is the normalised innovation squared."""
+    """Normalised squared residual of every observation given those before it, zero where it is not available; m arrays
+    ``(...)``. Their sum is the normalised innovation squared.
+    """
 
 
 def update_one_by_one(
@@ -73,15 +74,15 @@ def update_one_by_one(
     thresholds: Sequence[Array | float] | None = None,
     cautions: Sequence[Array | float] | None = None,
 ) -> Correction:
-    """Return the mean, covariance and likelihood after m independent scalar observations.
+    """Return mean, covariance and log-likelihood after m independent scalar observations.
 
     Args:
-        mean: predicted, ``(n, ...)``.
-        covariance: predicted, ``(n, n, ...)``.
-        residual: ``(m, ...)``, all of them at the predicted mean.
-        rows: the Jacobian at the predicted mean.
-        variance: of the noise, m values that broadcast against ``(...)``.
-        available: one where an observation is there, zero where it is not; m values that broadcast.
+        mean: predicted mean, ``(n, ...)``.
+        covariance: predicted covariance, ``(n, n, ...)``.
+        residual: observations minus their predictions at the predicted mean, ``(m, ...)``.
+        rows: rows of the Jacobian at the predicted mean.
+        variance: variances of the noise, m values that broadcast against ``(...)``.
+        available: one for an available observation, zero for others; m values that broadcast.
         thresholds: k of each observation in the robust update, m values; infinity for none. None: the plain update.
         cautions: factor on the variance of each observation in its gain alone, m values. None: the Kalman gain.
 

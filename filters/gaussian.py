@@ -1,4 +1,4 @@
-"""Gaussian densities of innovations and errors, with the quadratic form that goes with them."""
+"""Gaussian log-densities and squared Mahalanobis distances of innovations and errors."""
 
 import math
 
@@ -8,14 +8,14 @@ from .small_matrices import cholesky, solve_lower
 
 
 def log_density(residual: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return the log-density of ``N(0, covariance)`` at ``residual``, and the squared Mahalanobis distance.
+    """Return the log-density of ``N(0, covariance)`` at a residual, and its squared Mahalanobis distance.
 
     ``log N = -1/2 (d^2 + log det(2 pi S))``, ``d^2 = nu^T S^-1 nu``, by Cholesky factor; equation (11) of the
     IMM paper in logarithms, so that an innovation of 500 sigma keeps its likelihood.
 
     Args:
-        residual: ``(m, ...)``.
-        covariance: ``(m, m, ...)``, symmetric positive definite.
+        residual: innovation or error, ``(m, ...)``.
+        covariance: its covariance, ``(m, m, ...)``, symmetric positive definite.
 
     Returns:
         Log-density ``(...)`` and squared distance ``(...)``; the latter is chi-square with m degrees of

@@ -1,4 +1,4 @@
-r"""The WGS-84 ellipsoid: Earth-fixed coordinates of a site, and the east-north-up frame that stands on it.
+r"""WGS-84 ellipsoid: Earth-fixed coordinates of a site, and its local east-north-up frame.
 
     r = [(n + h) cos(B) cos(L), (n + h) cos(B) sin(L), (n (1 - e^2) + h) sin(B)]^T,
     n = a / sqrt(1 - e^2 sin^2(B)),   e^2 = f (2 - f)
@@ -17,9 +17,9 @@ import numpy
 from .array_namespace import Array
 
 SEMI_MAJOR_AXIS = 6378137.0
-"""Metres, WGS-84."""
+"""Semi-major axis of WGS-84, m."""
 FLATTENING = 1.0 / 298.257223563
-"""WGS-84."""
+"""Flattening of WGS-84."""
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 """Square of the first eccentricity, WGS-84."""
 EARTH_RATE = 7.2921150e-5
@@ -29,12 +29,12 @@ GRAVITATIONAL_PARAMETER = 3.986004418e14
 
 
 def earth_fixed(latitude: Array, longitude: Array, height: Array) -> Array:
-    """Return the Earth-fixed Cartesian coordinates of a site, ``(3,)``, m; of many ``(3, n)``.
+    """Return the Earth-fixed Cartesian coordinates of geodetic ones, m, ``(3,)`` or ``(3, n)``.
 
     Args:
         latitude: geodetic latitude, rad; a number or ``(n,)``, as the others.
-        longitude: rad, positive to the east.
-        height: above the ellipsoid, m.
+        longitude: longitude, rad, positive to the east.
+        height: height above the ellipsoid, m.
     """
     sine = numpy.sin(latitude)
     n = SEMI_MAJOR_AXIS / numpy.sqrt(1.0 - ECCENTRICITY_SQUARED * sine**2)
@@ -49,11 +49,11 @@ def earth_fixed(latitude: Array, longitude: Array, height: Array) -> Array:
 
 
 def east_north_up(latitude: float, longitude: float) -> Array:
-    """Return the rotation from the Earth-fixed frame to east, north, up at a site, ``(3, 3)``.
+    """Return the rotation matrix from the Earth-fixed to the east-north-up frame of a site, ``(3, 3)``.
 
     Args:
         latitude: geodetic latitude, rad.
-        longitude: rad.
+        longitude: longitude, rad.
     """
     sin_b, cos_b = numpy.sin(latitude), numpy.cos(latitude)
     sin_l, cos_l = numpy.sin(longitude), numpy.cos(longitude)
@@ -67,14 +67,15 @@ def east_north_up(latitude: float, longitude: float) -> Array:
 
 
 def east_north(latitude: Array, longitude: Array, height: Array, site: tuple[float, float]) -> Array:
-    """Return the coordinates east and north of a site on the ellipsoid, in the plane that touches it there, ``(2,
-    n)``, m.
+    """Return the coordinates east and north of a site in its tangent plane, ``(2, n)``, m.
+
+    The site is on the ellipsoid.
 
     Args:
         latitude: geodetic latitude, rad, ``(n,)``.
-        longitude: rad, ``(n,)``.
-        height: above the ellipsoid, m, ``(n,)``.
-        site: latitude and longitude, rad.
+        longitude: longitude, rad, ``(n,)``.
+        height: height above the ellipsoid, m, ``(n,)``.
+        site: latitude and longitude of the site, rad.
     """
     away = earth_fixed(latitude, longitude, height) - earth_fixed(*site, 0.0)[:, None]
     return (east_north_up(*site) @ away)[:2]
@@ -84,18 +85,18 @@ class PlaneOrigin(NamedTuple):
     """Point at which the local tangent plane of a log touches the ellipsoid."""
 
     latitude: float
-    """Degrees, as the longitude."""
+    """Geodetic latitude, degrees; the longitude is in degrees, too."""
     longitude: float
     altitude: float = 0.0
-    """Above the ellipsoid, m, of a position without a height; the plane itself lies at zero."""
+    """Height above the ellipsoid, m, for positions without a height; the plane itself is at zero."""
 
     def east_north(self, latitude: Array, longitude: Array, altitude: Array) -> Array:
-        """Return the coordinates east and north of the origin, ``(2, n)``, m.
+        """Return the coordinates of positions east and north of the origin, ``(2, n)``, m.
 
         Args:
-            latitude: degrees, ``(n,)``, as the longitude.
-            longitude: positive to the east.
-            altitude: above the ellipsoid, m, ``(n,)``; NaN where it is not known.
+            latitude: geodetic latitude, degrees, ``(n,)``.
+            longitude: longitude, degrees, ``(n,)``, positive to the east.
+            altitude: height above the ellipsoid, m, ``(n,)``; NaN where it is not known.
         """
         height = numpy.where(numpy.isfinite(altitude), altitude, self.altitude)
         site = float(numpy.radians(self.latitude)), float(numpy.radians(self.longitude))
@@ -103,14 +104,13 @@ class PlaneOrigin(NamedTuple):
 
 
 def geodetic(position: Array) -> Array:
-    """Return the latitude, rad, longitude, rad, and height above the ellipsoid, m, of Earth-fixed coordinates, ``(3,
-    n)``.
+    """Return latitude, rad, longitude, rad, and height, m, of Earth-fixed coordinates, ``(3, n)``.
 
     The inverse of :func:`earth_fixed`, within a hundredth of a micrometre near the ground: Bowring's formula, The
     accuracy of geodetic latitude and height equations, Survey Review 28, 1985.
 
     Args:
-        position: Earth-fixed, m, ``(3, n)``, not near the Earth's centre.
+        position: Earth-fixed coordinates, m, ``(3, n)``, not near the Earth's centre.
     """
     x, y, z = position
     axis = numpy.hypot(x, y)

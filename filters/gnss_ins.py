@@ -1,4 +1,4 @@
-r"""A user, its receiver clock and the attitude errors of its INS, seen by GNSS and inertial sensors.
+r"""GNSS and inertial observations of a user with a receiver clock and INS attitude errors: motion and Jacobians.
 
 State (ENU frame fixed to the Earth at the site), Moroz's lambda:
 
@@ -18,7 +18,7 @@ Observations, S satellites at s_j with velocities w_j, ``u_j = (s_j - X) / |s_j 
     accelerometers     f      = C(phi_INS - eps) (A + [0, 0, g]^T)          (body axes forward, right, down)
     attitude           y_eps  = eps
 
-with C = R_1(roll) R_2(pitch) R_3(heading) N, N: ENU -> NED, and phi_INS, the angles that the INS shows
+with C = R_1(roll) R_2(pitch) R_3(heading) N, N: ENU -> NED, and phi_INS, the angles that the INS outputs
 (true angle plus error), a known input. Jacobians:
 
     drho/dX = -u^T,  drho'/dV = -u^T,  drho'/dX = -(w - V - u u^T (w - V))^T / |s - X|,
@@ -58,33 +58,33 @@ SIZE = 17
 
 
 class AxisModel(NamedTuple):
-    """Motion of one axis of the user on (x, v, a) over one step."""
+    """Linear motion model of one axis of the user, on (x, v, a), over one step."""
 
     transition: Array
-    """``(3, 3)``, upper triangular with one in the first place."""
+    """Transition matrix, ``(3, 3)``, upper triangular with one in the first place."""
     noise: Array
-    """Covariance, ``(3, 3)``."""
+    """Covariance of the process noise, ``(3, 3)``."""
 
 
 def rest_model(T: float, velocity_sigma: float, acceleration_sigma: float) -> AxisModel:
-    """Return the model of hypothesis 1: the position stays, velocity and acceleration are reset to zero.
+    """Return the axis model of hypothesis 1, rest: the position is constant, velocity and acceleration are zero.
 
     Args:
         T: step, s.
-        velocity_sigma: of the regularising noise, m/s; the position takes T times as much.
-        acceleration_sigma: of the regularising noise, m/s^2.
+        velocity_sigma: standard deviation of the regularising noise, m/s; that of the position is T times as large.
+        acceleration_sigma: standard deviation of the regularising noise, m/s^2.
     """
     sigmas = numpy.array([velocity_sigma * T, velocity_sigma, acceleration_sigma])
     return AxisModel(numpy.diag([1.0, 0.0, 0.0]), numpy.diag(sigmas**2))
 
 
 def constant_velocity_model(T: float, increment_sigma: float, acceleration_sigma: float) -> AxisModel:
-    """Return the model of hypothesis 2: constant velocity with a random increment; the acceleration is reset to zero.
+    """Return the axis model of hypothesis 2: constant velocity with random increments, zero acceleration.
 
     Args:
         T: step, s.
-        increment_sigma: of the velocity increment of one step, m/s; its input is ``[T/2, 1]^T``.
-        acceleration_sigma: of the regularising noise, m/s^2.
+        increment_sigma: standard deviation of the velocity increment of one step, m/s; its input is ``[T/2, 1]^T``.
+        acceleration_sigma: standard deviation of the regularising noise, m/s^2.
     """
     transition = numpy.array([[1.0, T, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     entry = increment_sigma * numpy.array([T / 2.0, 1.0, 0.0])
@@ -92,23 +92,23 @@ def constant_velocity_model(T: float, increment_sigma: float, acceleration_sigma
 
 
 def singer_model(T: float, alpha: float, sigma: float) -> AxisModel:
-    """Return the model of hypothesis 3: Singer's manoeuvre; see :mod:`.singer`."""
+    """Return the axis model of hypothesis 3, Singer's manoeuvre; arguments as in :mod:`.singer`."""
     return AxisModel(singer.transition(alpha, T), singer.process_noise(alpha, sigma, T))
 
 
 class CommonModel(NamedTuple):
-    """Clock and attitude errors, which move alike under every hypothesis."""
+    """Model of clock and attitude errors over one step, the same under every hypothesis."""
 
     T: float
     """Step, s."""
     decay: float
     """Factor of the attitude rates over one step."""
     clock_noise: Array
-    """Covariance on (D', V'), ``(2, 2)``: m^2, m^2/s, m^2/s^2."""
+    """Covariance of the noise of (D', V'), ``(2, 2)``: m^2, m^2/s, m^2/s^2."""
     attitude_variance: float
-    """Of the random walk of each angle in one step, rad^2."""
+    """Variance of the random walk of each angle in one step, rad^2."""
     attitude_rate_variance: float
-    """Driving noise of each rate in one step, (rad/s)^2."""
+    """Variance of the driving noise of each rate in one step, (rad/s)^2."""
 
 
 def common_model(
@@ -119,11 +119,11 @@ def common_model(
     rate_sigma: float,
     rate_time: float,
 ) -> CommonModel:
-    """Discretise the clock and the attitude errors.
+    """Return the discrete model of the clock and of the attitude errors.
 
     The clock is the usual two-state model (Brown and Hwang, Introduction to Random Signals and Applied Kalman
     Filtering, 2012, section 9.3): ``q_DD = S_f T + S_g T^3 / 3``, ``q_DV = S_g T^2 / 2``, ``q_VV = S_g T``;
-    the covariance of bias and drift is kept.
+    the covariance of bias and drift is included.
 
     Args:
         T: step, s.
@@ -164,11 +164,11 @@ def process_noise(axis: AxisModel, common: CommonModel) -> Array:
 
 
 def advance(state: Array, axis: Array, T: float, decay: float) -> Array:
-    """Multiply by the transition matrix from the left, ``F x`` or ``F P``, without its zeros.
+    """Return the product of the transition matrix with a vector or matrix, ``F x`` or ``F P``, without its zeros.
 
     Args:
-        state: ``(17, ...)``.
-        axis: transition of (x, v, a), ``(3, 3, ...)`` with trailing axes that broadcast, such as
+        state: x or P, ``(17, ...)``.
+        axis: transition matrix of (x, v, a), ``(3, 3, ...)`` with trailing axes that broadcast, such as
             ``(3, 3, M, 1)`` for M hypotheses; upper triangular with one in the first place.
         T: step, s.
         decay: factor of the attitude rates.
@@ -191,12 +191,12 @@ def advance(state: Array, axis: Array, T: float, decay: float) -> Array:
 def predict(
     mean: Array, covariance: Array, axis: Array, T: float, decay: float, Q: Array
 ) -> tuple[Array, Array]:
-    """Apply the time update of a bank, step 4: ``F x`` and ``F P F^T + Q``.
+    """Return the predicted means ``F x`` and covariances ``F P F^T + Q`` of M hypotheses (step 4).
 
     Args:
-        mean: ``(17, M, N)``.
-        covariance: ``(17, 17, M, N)``.
-        axis: ``(3, 3, M, 1)``, see :func:`advance`.
+        mean: means, ``(17, M, N)``.
+        covariance: covariances, ``(17, 17, M, N)``.
+        axis: transition matrices of (x, v, a), ``(3, 3, M, 1)``, see :func:`advance`.
         T: step, s.
         decay: factor of the attitude rates.
         Q: covariance of the process noise, ``(17, 17, M, 1)``.
@@ -208,25 +208,25 @@ def predict(
 
 
 class Geometry(NamedTuple):
-    """Positions of the satellites relative to a user."""
+    """Distances, directions and velocities of S satellites relative to a user."""
 
     distance: Array
-    """``|s - X|``, ``(S, ...)``, m."""
+    """Distance ``|s - X|``, ``(S, ...)``, m."""
     unit: Array
-    """From the user to the satellite, ``(3, S, ...)``."""
+    """Unit vector from the user to the satellite, ``(3, S, ...)``."""
     relative_velocity: Array
-    """w - V, ``(3, S, ...)``, m/s."""
+    """Relative velocity w - V, ``(3, S, ...)``, m/s."""
     range_rate: Array
-    """u^T (w - V), ``(S, ...)``, m/s."""
+    """Range rate u^T (w - V), ``(S, ...)``, m/s."""
 
 
 def geometry(state: Array, satellite_position: Array, satellite_velocity: Array) -> Geometry:
-    """Return the distances, directions and range rates of S satellites.
+    """Return distances, directions and range rates of S satellites relative to a user.
 
     Args:
-        state: ``(17, ...)``.
-        satellite_position: ``(3, S, ...)``, m; trailing axes broadcast against those of ``state``.
-        satellite_velocity: ``(3, S, ...)``, m/s.
+        state: state of the user, ``(17, ...)``.
+        satellite_position: positions, ``(3, S, ...)``, m; trailing axes broadcast against those of ``state``.
+        satellite_velocity: velocities, ``(3, S, ...)``, m/s.
     """
     d = satellite_position - state[POSITION][:, None]
     distance = namespace(state).sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
@@ -235,23 +235,24 @@ def geometry(state: Array, satellite_position: Array, satellite_velocity: Array)
     return Geometry(distance, unit, w, unit[0] * w[0] + unit[1] * w[1] + unit[2] * w[2])
 
 
-def ranges(state: Array, seen: Geometry) -> tuple[Array, Array]:
-    """Return the pseudoranges, m, and pseudorange rates, m/s, each ``(S, ...)``."""
-    return seen.distance + state[CLOCK_BIAS], seen.range_rate + state[CLOCK_DRIFT]
+def ranges(state: Array, satellites: Geometry) -> tuple[Array, Array]:
+    """Return the predicted pseudoranges, m, and pseudorange rates, m/s, of S satellites, ``(S, ...)`` each."""
+    return satellites.distance + state[CLOCK_BIAS], satellites.range_rate + state[CLOCK_DRIFT]
 
 
-def range_jacobian(seen: Geometry) -> list[JacobianRow]:
-    """Return the rows of the Jacobian of S pseudoranges and then of S pseudorange rates."""
+def range_jacobian(satellites: Geometry) -> list[JacobianRow]:
+    """Return the Jacobian rows of S pseudoranges, then of S pseudorange rates."""
     x, v = range(0, 3), range(4, 7)
-    across = (seen.relative_velocity - seen.unit * seen.range_rate) / seen.distance
-    count = seen.distance.shape[0]
+    across = (satellites.relative_velocity - satellites.unit * satellites.range_rate) / satellites.distance
+    count = satellites.distance.shape[0]
     ranges_rows = [
-        JacobianRow((*x, CLOCK_BIAS), (*(-seen.unit[i, j] for i in range(3)), 1.0)) for j in range(count)
+        JacobianRow((*x, CLOCK_BIAS), (*(-satellites.unit[i, j] for i in range(3)), 1.0))
+        for j in range(count)
     ]
     rate_rows = [
         JacobianRow(
             (*x, *v, CLOCK_DRIFT),
-            (*(-across[i, j] for i in range(3)), *(-seen.unit[i, j] for i in range(3)), 1.0),
+            (*(-across[i, j] for i in range(3)), *(-satellites.unit[i, j] for i in range(3)), 1.0),
         )
         for j in range(count)
     ]
@@ -278,15 +279,15 @@ def body_axes(angles: Array) -> tuple[tuple[Array, Array, Array], ...]:
 
 
 def specific_force(state: Array, ins_angles: Array, gravity: float) -> tuple[Array, list[JacobianRow]]:
-    """Return the accelerometer readings, ``(3, ...)``, m/s^2, and the rows of their Jacobian.
+    """Return the predicted accelerometer readings, ``(3, ...)``, m/s^2, and their Jacobian rows.
 
     The derivatives of C by its own angles are combinations of the readings themselves, for example
     ``df/droll = [0, f_down, -f_right]``.
 
     Args:
-        state: ``(17, ...)``.
-        ins_angles: heading, pitch and roll shown by the INS, ``(3, ...)``, rad; trailing axes broadcast.
-        gravity: m/s^2.
+        state: state of the user, ``(17, ...)``.
+        ins_angles: heading, pitch and roll that the INS outputs, ``(3, ...)``, rad; trailing axes broadcast.
+        gravity: acceleration of gravity, m/s^2.
     """
     xp = namespace(state)
     angles = ins_angles - state[ATTITUDE_ERROR]
@@ -305,23 +306,23 @@ def specific_force(state: Array, ins_angles: Array, gravity: float) -> tuple[Arr
 
 
 def attitude_jacobian() -> list[JacobianRow]:
-    """Return the rows of the Jacobian of the three attitude errors: each is observed directly."""
+    """Return the Jacobian rows of the three attitude errors, each of which is observed directly."""
     return [JacobianRow((column,), (1.0,)) for column in range(11, 14)]
 
 
 def observe(
     state: Array, satellite_position: Array, satellite_velocity: Array, ins_angles: Array, gravity: float
 ) -> tuple[Array, list[JacobianRow]]:
-    """Return the observations of a state, ``(2 S + 6, ...)``, and the rows of their Jacobian there.
+    """Return the predicted observations of a state, ``(2 S + 6, ...)``, and their Jacobian rows.
 
     In this order: S pseudoranges, S pseudorange rates, three accelerometers, three attitude errors.
 
     Args:
-        state: ``(17, ...)``.
-        satellite_position: ``(3, S, ...)``, m; trailing axes broadcast against those of ``state``.
-        satellite_velocity: ``(3, S, ...)``, m/s.
-        ins_angles: ``(3, ...)``, rad.
-        gravity: m/s^2.
+        state: state of the user, ``(17, ...)``.
+        satellite_position: positions, ``(3, S, ...)``, m; trailing axes broadcast against those of ``state``.
+        satellite_velocity: velocities, ``(3, S, ...)``, m/s.
+        ins_angles: heading, pitch and roll that the INS outputs, ``(3, ...)``, rad.
+        gravity: acceleration of gravity, m/s^2.
     """
     seen = geometry(state, satellite_position, satellite_velocity)
     pseudoranges, rates = ranges(state, seen)
@@ -331,7 +332,7 @@ def observe(
 
 
 def sensor_groups(satellites: int) -> Sequence[slice]:
-    """Return the slices of pseudoranges, rates, accelerometers and attitude in the observations."""
+    """Return the slices of pseudoranges, rates, accelerometers and attitude errors in the observations."""
     return (
         slice(0, satellites),
         slice(satellites, 2 * satellites),

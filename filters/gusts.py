@@ -1,4 +1,4 @@
-r"""Atmospheric turbulence as coloured noise: the first-order forming filter of the vertical gust.
+r"""First-order forming filter of the vertical gust: atmospheric turbulence as coloured noise.
 
 The Dryden spectrum of the vertical gust is approximated by one pole,
 
@@ -14,26 +14,24 @@ from typing import NamedTuple
 
 
 class FormingFilter(NamedTuple):
-    """White noise shaped to the gust angle."""
+    """Filter that shapes white noise to the gust angle."""
 
     rate: float
     """Bandwidth V / L, 1/s."""
     sigma: float
     """Stationary standard deviation of the gust angle, degrees."""
     intensity: float
-    """Of the white noise at the input, degrees^2 / s."""
+    """Intensity of the white noise at the input, degrees^2 / s."""
 
 
 def vertical_gust(airspeed: float, length: float, sigma: float) -> FormingFilter:
-    """Return the first-order forming filter of the vertical gust seen as an angle of attack.
+    """Return the first-order forming filter of the vertical gust, as an angle of attack in degrees.
 
     Args:
         airspeed: V, m/s.
         length: scale of turbulence L, m.
         sigma: standard deviation of the vertical gust speed, m/s.
 
-    Returns:
-        The filter, in degrees.
 
     Raises:
         ValueError: if speed or length is not positive, or sigma is negative.

@@ -1,6 +1,6 @@
-r"""The interacting multiple model: mixing, mode probabilities, combination.
+r"""Interacting multiple model (IMM): mixing, mode probabilities, combination.
 
-M filters run side by side, one for each mode of the target; the mode is a Markov chain with matrix
+M filters run in parallel, one for each mode of the target; the mode is a Markov chain with matrix
 ``transition[i, j] = P{mode j at k | mode i at k-1}`` (row = from, column = to, rows sum to one). Equation
 numbers are those of the paper by Bakulev, Sychev and Nguyen (the recursion itself is Blom and Bar-Shalom's,
 1988). One cycle: :func:`predict_mode_probabilities`, :func:`mix`, the M filters, :func:`mode_posterior`,
@@ -21,22 +21,22 @@ from .small_matrices import outer
 
 
 class ModePrediction(NamedTuple):
-    """Prediction of the Markov chain before the measurement."""
+    """Predicted mode probabilities and mixing weights, before the measurement."""
 
     probabilities: Array
     """Predicted mode probabilities (13), ``(M, N)``."""
     mixing: Array
-    """Weights of (10), ``[i, j] = mu_{i|j}``, ``(M, M, N)``; every column sums to one."""
+    """Mixing weights (10), ``[i, j] = mu_{i|j}``, ``(M, M, N)``; every column sums to one."""
 
 
 def predict_mode_probabilities(transition: Array, probabilities: Array) -> ModePrediction:
-    """Return the predicted probabilities (13) and mixing weights (10).
+    """Return the predicted mode probabilities (13) and mixing weights (10) of a Markov chain.
 
     A mode that cannot be reached (predicted probability zero) keeps its own estimate.
 
     Args:
-        transition: ``(M, M)``, or ``(M, M, N)`` where it differs in the batch.
-        probabilities: ``mu_i(k-1)``, ``(M, N)``.
+        transition: transition matrix, row = from, column = to, ``(M, M)`` or ``(M, M, N)``.
+        probabilities: mode probabilities ``mu_i(k-1)``, ``(M, N)``.
     """
     xp = namespace(probabilities)
     if transition.ndim == 2:
@@ -50,29 +50,30 @@ def predict_mode_probabilities(transition: Array, probabilities: Array) -> ModeP
 
 
 def mix(mean: Array, covariance: Array, mixing: Array) -> tuple[Array, Array]:
-    """Return the mixed inputs of the M filters, equations (8) and (9).
+    """Return the mixed means and covariances at the input of the M filters, equations (8) and (9).
 
     Args:
-        mean: ``x^i(k-1|k-1)``, ``(n, M, N)``.
-        covariance: ``P^i(k-1|k-1)``, ``(n, n, M, N)``.
-        mixing: ``mu_{i|j}``, ``(M, M, N)``.
+        mean: means ``x^i(k-1|k-1)``, ``(n, M, N)``.
+        covariance: covariances ``P^i(k-1|k-1)``, ``(n, n, M, N)``.
+        mixing: mixing weights ``mu_{i|j}``, ``(M, M, N)``.
 
     Returns:
-        ``x^{0j}`` and ``P^{0j}``, of the same shapes.
+        Means ``x^{0j}`` and covariances ``P^{0j}``, of the same shapes.
     """
     return combine(mean[:, :, None], covariance[:, :, :, None], mixing)
 
 
 def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:
-    """Return the mean and covariance of a Gaussian mixture, equations (15) and (16).
+    """Return mean and covariance of a Gaussian mixture, equations (15) and (16).
 
     Args:
-        mean: ``(n, M, ...)``.
-        covariance: ``(n, n, M, ...)``.
-        weights: ``(M, ...)``, summing to one over the M components.
+        mean: means of the components, ``(n, M, ...)``.
+        covariance: their covariances, ``(n, n, M, ...)``.
+        weights: their weights, ``(M, ...)``, which sum to one.
 
     Returns:
-        ``(n, ...)`` and ``(n, n, ...)``, trailing axes broadcast; the covariance holds the spread of the means.
+        Mean ``(n, ...)`` and covariance ``(n, n, ...)``, trailing axes broadcast; the covariance includes the spread of
+        the means.
     """
     centre = weighted_sum(weights, mean)
     differences = (mean[:, i] - centre for i in range(weights.shape[0]))
@@ -84,7 +85,7 @@ def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Arra
 
 
 def log_probabilities(probabilities: Array) -> Array:
-    """Return the logarithm of probabilities, with a floor of 1e-300 in place of minus infinity."""
+    """Return the logarithms of probabilities, at least log 1e-300 instead of minus infinity."""
     xp = namespace(probabilities)
     if probabilities.dtype == xp.float64:
         return xp.log(xp.clip(probabilities, 1e-300, None))
@@ -94,31 +95,31 @@ def log_probabilities(probabilities: Array) -> Array:
 
 
 def softmax(logarithms: Array) -> Array:
-    """Return the probabilities from logarithms known up to a constant, normalised over the first axis, ``(M, N)``."""
+    """Return the probabilities ``(M, N)`` from their logarithms up to a constant, normalised over the first axis."""
     xp = namespace(logarithms)
     scaled = xp.exp(logarithms - xp.max(logarithms, axis=0))
     return scaled / ordered_sum(scaled)
 
 
 def log_mixture_density(log_weights: Array, log_likelihood: Array) -> Array:
-    """Return the logarithm of a mixture's density, ``log sum_j w_j Lambda_j``, ``(N,)``.
+    """Return the log-density of a mixture, ``log sum_j w_j Lambda_j``, ``(N,)``.
 
     Args:
-        log_weights: of the components, ``(M, N)``; the weights sum to one.
-        log_likelihood: logarithms of their densities, ``(M, N)``.
+        log_weights: logarithms of the weights, ``(M, N)``; the weights sum to one.
+        log_likelihood: logarithms of the components' densities, ``(M, N)``.
     """
     return log_sum(log_weights + log_likelihood)
 
 
 def log_sum(logarithms: Array) -> Array:
-    """Return the logarithm of the sum over the first axis of what has these logarithms, ``(M, ...)``."""
+    """Return the logarithm of the sum of exponentials over the first axis, ``(M, ...)`` to ``(...)``."""
     xp = namespace(logarithms)
     largest = xp.max(logarithms, axis=0)
     return largest + xp.log(ordered_sum(xp.exp(logarithms - largest)))
 
 
 def mode_posterior(log_predicted: Array, log_likelihood: Array) -> Array:
-    """Return the posterior mode probabilities, equations (12) and (14), in logarithms.
+    """Return the posterior mode probabilities ``(M, N)``, equations (12) and (14), computed in logarithms.
 
     Working in logarithms, probabilities survive likelihoods that underflow (an innovation of 500 sigma).
 

@@ -1,4 +1,4 @@
-r"""Kalman's update with an innovation and a gain that are given: extended, unscented and learned filters.
+r"""Kalman update with a given innovation and gain, for extended, unscented and learned filters.
 
     S = H P H^T + R,  K = P H^T S^-1,  x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T       (Joseph form)
 
@@ -24,33 +24,33 @@ from .unscented import GAUSSIAN, Spread, transform
 
 
 class Received(NamedTuple):
-    """Received part of a measurement."""
+    """Measurement model restricted to the received entries of a measurement."""
 
     innovation: Array
-    """``(m, N)``, zero where nothing was."""
+    """Innovation, ``(m, N)``; zero for entries not received."""
     H: Array
-    """``(m, n, N)``, at the same points."""
+    """Measurement Jacobian, ``(m, n, N)``; zero rows for entries not received."""
     R: Array
-    """``(m, m, N)``, of the identity where nothing was."""
+    """Noise covariance, ``(m, m, N)``; identity for entries not received."""
     available: Array
-    """1 where there is a reading and 0 where there is none, ``(m, N)``."""
+    """1 for entries received, 0 for others, ``(m, N)``."""
 
 
 def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Received:
-    """Remove the entries that were not received from an update.
+    """Return the measurement model without the entries that were not received: zero innovation and H, unit noise.
 
     Args:
-        innovation: ``(m, N)``, finite.
-        H: ``(m, n)`` or ``(m, n, N)``.
-        R: ``(m, m)`` or ``(m, m, N)``.
-        available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
+        innovation: innovation, ``(m, N)``, finite.
+        H: measurement Jacobian, ``(m, n)`` or ``(m, n, N)``.
+        R: noise covariance, ``(m, m)`` or ``(m, m, N)``.
+        available: 1 for entries received, 0 for others, ``(m, N)``.
     """
     H, R = (part[..., None] if part.ndim == 2 else part for part in (H, R))
     return Received(available * innovation, available[:, None] * H, _independent(R, available), available)
 
 
 def _independent(S: Array, available: Array) -> Array:
-    """Return the covariance of ``(m, m, N)`` with rows and columns of the identity where nothing was received."""
+    """Return a covariance ``(m, m, N)`` with rows and columns of the identity for entries not received."""
     xp = namespace(available)
     m = available.shape[0]
     identity = xp.eye(m, dtype=available.dtype, device=available.device)[..., None]
@@ -58,22 +58,22 @@ def _independent(S: Array, available: Array) -> Array:
 
 
 def kalman_gain(covariance: Array, received: Received) -> Array:
-    """Return the gain that is optimal for a predicted covariance ``(n, n, N)``, ``(n, m, N)``."""
+    """Return the Kalman gain ``(n, m, N)`` for a predicted covariance ``(n, n, N)``."""
     HP = product(received.H, covariance)
     return transpose(solve_definite(product(HP, transpose(received.H)) + received.R, HP))
 
 
 def update_with_gain(mean: Array, covariance: Array, received: Received, K: Array) -> Update:
-    """Return the measurement update with any gain.
+    """Return the measurement update with any gain (Joseph form).
 
     Args:
-        mean: predicted, ``(n, N)``.
-        covariance: predicted, ``(n, n, N)``.
+        mean: predicted mean, ``(n, N)``.
+        covariance: predicted covariance, ``(n, n, N)``.
         received: innovation with its model.
         K: gain, ``(n, m, N)``.
 
     Returns:
-        The update, with the likelihood of what was received under the prediction.
+        The update, with the log-likelihood of the received entries.
     """
     xp = namespace(mean)
     nu, H, R, available = received
@@ -86,7 +86,7 @@ def update_with_gain(mean: Array, covariance: Array, received: Received, K: Arra
 
 
 def _of_missing(available: Array) -> Array:
-    """Return the contribution of entries that were not received to a log-density, ``(N,)``."""
+    """Return the correction of a log-density that removes the entries that were not received, ``(N,)``."""
     return 0.5 * math.log(2.0 * math.pi) * ordered_sum(1.0 - available)
 
 
@@ -101,21 +101,22 @@ def unscented_update(
     spread: Spread = GAUSSIAN,
     subtract: Callable[[Array, Array], Array] = operator.sub,
 ) -> Update:
-    """Return the measurement update by sigma points; Julier and Uhlmann, Unscented filtering and nonlinear estimation,
-    Proceedings of the IEEE 92 (2004), 401-422.
+    """Return the measurement update of an unscented Kalman filter, by sigma points.
+
+    Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE 92 (2004), 401-422.
 
     Args:
-        mean: predicted, ``(n, N)``.
-        covariance: predicted, ``(n, n, N)``, positive definite.
+        mean: predicted mean, ``(n, N)``.
+        covariance: predicted covariance, ``(n, n, N)``, positive definite.
         z: measurement, ``(m, N)``, finite also where it was not received.
-        h: from points ``(n, 2n + 1, N)`` to measurements ``(m, 2n + 1, N)``.
-        R: ``(m, m)`` or ``(m, m, N)``.
-        available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
-        within_gates: from innovation ``(m, N)`` and its covariance to 1 for entries that are taken in, else 0,
-            ``(m, N)``; the likelihood counts the others all the same. None: all are.
+        h: function from points ``(n, 2n + 1, N)`` to measurements ``(m, 2n + 1, N)``.
+        R: noise covariance, ``(m, m)`` or ``(m, m, N)``.
+        available: 1 for entries received, 0 for others, ``(m, N)``.
+        within_gates: function from innovation ``(m, N)`` and its covariance to 1 for entries inside their gates, 0 for
+            others, ``(m, N)``; the likelihood includes entries outside, too. None: there are no gates.
         spread: parameters of the transform.
-        subtract: from measurement and prediction ``(m, N)`` to the innovation; of angles the nearer way round, and then
-            h returns angles that are continuous from point to point.
+        subtract: function from measurement and prediction ``(m, N)`` to the innovation; for angles the shortest
+            difference, and then h returns angles that are continuous from point to point.
     """
     xp = namespace(mean)
     n = mean.shape[0]

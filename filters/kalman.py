@@ -1,4 +1,4 @@
-r"""The discrete Kalman filter on batches of small systems.
+r"""Discrete Kalman filter on batches of small systems.
 
     prediction  x' = F x + b,  P' = F P F^T + Q
     update      nu = z - H x', S = H P' H^T + R, K = P' H^T S^-1,
@@ -19,9 +19,9 @@ class Update(NamedTuple):
     """Result of a measurement update."""
 
     mean: Array
-    """``(n, N)``."""
+    """Updated mean, ``(n, N)``."""
     covariance: Array
-    """``(n, n, N)``."""
+    """Updated covariance, ``(n, n, N)``."""
     log_likelihood: Array
     """Log-density of the measurement given the prediction, ``(N,)``."""
     squared_distance: Array
@@ -29,18 +29,18 @@ class Update(NamedTuple):
 
 
 def _with_batch_axis(matrix: Array) -> Array:
-    """Give a matrix shared by the batch a batch axis of one."""
+    """Return a matrix that is shared by the batch with a last axis of one."""
     return matrix[..., None] if matrix.ndim == 2 else matrix
 
 
 def predict(
     mean: Array, covariance: Array, F: Array, Q: Array, offset: Array | None = None
 ) -> tuple[Array, Array]:
-    """Apply the time update.
+    """Return the predicted mean ``F x + b`` and covariance ``F P F^T + Q``.
 
     Args:
-        mean: ``(n, N)``.
-        covariance: ``(n, n, N)``.
+        mean: mean of the state, ``(n, N)``.
+        covariance: its covariance, ``(n, n, N)``.
         F: transition matrix, ``(n, n)`` or ``(n, n, N)``.
         Q: covariance of the process noise, ``(n, n)`` or ``(n, n, N)``.
         offset: known input, ``(n, N)`` or None.
@@ -56,8 +56,8 @@ def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Upda
     """Return the measurement update in Joseph form, with the log-likelihood of the measurement.
 
     Args:
-        mean: predicted, ``(n, N)``.
-        covariance: predicted, ``(n, n, N)``.
+        mean: predicted mean, ``(n, N)``.
+        covariance: predicted covariance, ``(n, n, N)``.
         z: measurement, ``(m, N)``.
         H: measurement matrix, ``(m, n)`` or ``(m, n, N)``.
         R: covariance of the measurement noise, ``(m, m)`` or ``(m, m, N)``.
@@ -79,7 +79,7 @@ def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Upda
 
 
 def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list[float]], list[list[float]]]:
-    """Return the constant-velocity model with an acceleration that is constant and independent in every interval.
+    """Return F and Q, nested lists, of the constant-velocity model with a piecewise constant white acceleration.
 
     ``F = [[I, T I], [0, I]]``, ``Q = sigma^2 [[T^4/4 I, T^3/2 I], [T^3/2 I, T^2 I]]`` for the state
     (positions, velocities); ``B = [T^2/2, T]`` of the IMM paper with ``w ~ N(0, sigma^2)``.
@@ -88,9 +88,6 @@ def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list
         T: sampling interval, s.
         sigma: standard deviation of the acceleration, m/s^2.
         axes: number of coordinates.
-
-    Returns:
-        F and Q as nested lists.
     """
     n = 2 * axes
     F = [[1.0 if i == j else T if j == i + axes else 0.0 for j in range(n)] for i in range(n)]
@@ -103,16 +100,15 @@ def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list
 
 
 def constant_acceleration(T: Array, axes: int = 1) -> Array:
-    """Return the transition matrices of constant acceleration for the state (positions, velocities, accelerations).
+    """Return the transition matrices of the constant-acceleration model, ``(3 axes, 3 axes, N)``.
+
+    The state is (positions, velocities, accelerations).
 
     ``F = [[I, T I, T^2/2 I], [0, I, T I], [0, 0, I]]``; Bar-Shalom, Li and Kirubarajan, section 6.2.3.
 
     Args:
         T: intervals, s, ``(N,)``.
         axes: number of coordinates.
-
-    Returns:
-        ``(3 axes, 3 axes, N)``.
     """
     xp, zero = namespace(T), 0.0 * T
     derivatives = [1.0 + zero, T, 0.5 * T**2]

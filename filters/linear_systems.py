@@ -1,4 +1,4 @@
-r"""Design of linear filters and regulators: discretisation, Riccati and Lyapunov equations, separation.
+r"""Design of linear filters and regulators: discretisation, Riccati and Lyapunov equations, separation principle.
 
 Plant, measurement and feedback of the paper by Gridnev, Rusetski and Rak (numbers in brackets are theirs):
 
@@ -23,15 +23,15 @@ from typing import Any, NamedTuple
 import numpy
 from numpy.typing import ArrayLike, NDArray
 
-from .stored_solutions import stored
+from .stored_solutions import use_stored_solution
 
 Matrix = NDArray[numpy.float64]
 _MARGIN = 1e-9
-"""Distance from the limit of stability that counts as on it: eigenvalues are known to rounding only."""
+"""Distance from the limit of stability below which an eigenvalue counts as on it, since rounding moves it."""
 
 
 def square_matrix(name: str, matrix: ArrayLike, size: int | None = None) -> Matrix:
-    """Check a square matrix of finite numbers; a number is a matrix of one row.
+    """Return a square matrix of finite numbers as an array, after a check; a number is a matrix of one row.
 
     Raises:
         ValueError: for anything else, or a size other than ``size``.
@@ -44,7 +44,7 @@ def square_matrix(name: str, matrix: ArrayLike, size: int | None = None) -> Matr
 
 
 def intensity_matrix(name: str, matrix: ArrayLike, size: int, definite: bool = False) -> Matrix:
-    """Check an intensity or a covariance: symmetric, no negative eigenvalue.
+    """Return an intensity or covariance matrix as an array, after a check that it is symmetric and semidefinite.
 
     Raises:
         ValueError: for anything else; with ``definite`` also for an eigenvalue of zero.
@@ -59,13 +59,13 @@ def intensity_matrix(name: str, matrix: ArrayLike, size: int, definite: bool = F
     return array
 
 
-@stored
+@use_stored_solution
 def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
-    """Return the discrete model of ``dx/dt = A x + B u`` with ``u`` constant in each interval.
+    """Return F and B of the discrete model of ``dx/dt = A x + B u``, with ``u`` constant in each interval.
 
     Args:
-        A: ``(n, n)``, 1/s.
-        B: ``(n, r)``.
+        A: matrix of the continuous model, ``(n, n)``, 1/s.
+        B: its input matrix, ``(n, r)``.
         T: interval, s.
 
     Returns:
@@ -81,9 +81,9 @@ def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
-@stored
+@use_stored_solution
 def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matrix]:
-    """Return the transition matrix and process-noise covariance of a continuous model.
+    """Return transition matrix F and process noise covariance Q of a continuous model over an interval.
 
     ``Q = integral over [0, T] of exp(A s) W exp(A^T s) ds`` from one exponential of
     ``[[-A, W], [0, A^T]] T``: Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404. Its upper left block
@@ -91,15 +91,15 @@ def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matr
     doubled: ``Q(2 T) = F Q F^T + Q``, ``F(2 T) = F F``.
 
     Args:
-        A: ``(n, n)``, 1/s.
-        intensity: of the white noise on the right-hand side, ``W = G Q G^T`` of (5), ``(n, n)``.
+        A: matrix of the continuous model, ``(n, n)``, 1/s.
+        intensity: intensity of the white noise on the right-hand side, ``W = G Q G^T`` of (5), ``(n, n)``.
         T: interval, s.
 
     Returns:
         F and Q, both ``(n, n)``; Q is symmetric to the last bit.
 
     Raises:
-        ValueError: an interval that is not positive, a matrix of the wrong shape, an indefinite intensity.
+        ValueError: for an interval that is not positive, a matrix of the wrong shape, or an indefinite intensity.
     """
     from scipy.linalg import expm
 
@@ -123,7 +123,7 @@ def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matr
 
 
 def noise_factor(Q: Matrix, negligible: float = 1e-12) -> Matrix:
-    """Return the lower-triangular ``C`` with ``C C^T = Q`` for a semidefinite ``Q``.
+    """Return the lower triangular matrix C with ``C C^T = Q`` for a semidefinite covariance Q.
 
     A coordinate whose variance, given those before it, is below ``negligible`` of its own variance gets a
     column of zeros: noise that enters through an integrator is nearly collinear with its source, and the
@@ -147,12 +147,12 @@ def noise_factor(Q: Matrix, negligible: float = 1e-12) -> Matrix:
 
 
 def spectral_radius(F: Matrix) -> float:
-    """Return the largest modulus of the eigenvalues of ``F``; a discrete system is stable below one."""
+    """Return the largest modulus of the eigenvalues of F; a discrete system is stable below one."""
     return float(numpy.max(numpy.abs(numpy.linalg.eigvals(F))))
 
 
 def unobservable_modes(F: Matrix, H: Matrix, continuous: bool = False) -> list[complex]:
-    """Return the eigenvalues on or beyond the limit of stability that no measurement shows.
+    """Return the eigenvalues of modes that neither decay nor appear in the measurements.
 
     Popov-Belevitch-Hautus test: the rank of ``[F - lambda I; H]``. The pair is detectable when the list is
     empty; with ``(F^T, B^T)`` in place of ``(F, H)`` it is stabilisable.
@@ -175,20 +175,20 @@ def _list(modes: list[complex]) -> str:
 
 
 class SteadyFilter(NamedTuple):
-    """Steady state of the Kalman recursion."""
+    """Steady-state Kalman filter."""
 
     gain: Matrix
-    """K, ``(n, m)``, for an innovation against the prediction."""
+    """Kalman gain K, ``(n, m)``."""
     predicted: Matrix
-    """Covariance before the update, ``(n, n)``; of a continuous filter the same as ``posterior``."""
+    """Covariance before the update, ``(n, n)``; for a continuous filter equal to ``posterior``."""
     posterior: Matrix
     """Covariance after the update, ``(n, n)``."""
     poles: numpy.ndarray
-    """Eigenvalues of the error's recursion, ``(I - K H) F``, or of ``A - K H``."""
+    """Poles of the filter: eigenvalues of ``(I - K H) F`` or of ``A - K H``."""
 
 
 def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) -> None:
-    """Raise ValueError with the reason if there is no stabilising solution."""
+    """Raise ValueError with the reason if the Riccati equation of the filter has no stabilising solution."""
     if numpy.min(numpy.linalg.eigvalsh(R)) <= 0.0:
         raise ValueError(f"the measurement noise must be positive definite, got R = {R.tolist()}")
     hidden = unobservable_modes(F, H, continuous)
@@ -211,12 +211,12 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
         )
 
 
-@stored
+@use_stored_solution
 def riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Any:
-    """Return the stabilising solution of an algebraic Riccati equation, "discrete" or "continuous".
+    """Return the stabilising solution of a discrete or continuous algebraic Riccati equation.
 
     Raises:
-        ValueError: where it exists, but has no digits left in float64.
+        ValueError: if it cannot be computed in float64.
     """
     from scipy import linalg
 
@@ -230,7 +230,7 @@ def riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> A
 
 
 def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
-    """Return the steady discrete Kalman filter (12), from the discrete algebraic Riccati equation.
+    """Return the steady-state discrete Kalman filter (12), from the algebraic Riccati equation.
 
     Args:
         F: transition matrix, ``(n, n)``.
@@ -239,7 +239,7 @@ def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
         R: covariance of the measurement noise, ``(m, m)``.
 
     Raises:
-        ValueError: where no stabilising solution exists, with the mode to blame.
+        ValueError: if no stabilising solution exists, with the mode that prevents it.
     """
     _check_filter(F, H, Q, R, continuous=False)
     predicted = riccati_solution("discrete", F.T, H.T, Q, R)
@@ -250,18 +250,18 @@ def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
 
 
 def steady_kalman_bucy(A: ArrayLike, H: ArrayLike, intensity: ArrayLike, R: ArrayLike) -> SteadyFilter:
-    """Return the steady continuous Kalman filter (4), (5), from the continuous algebraic Riccati equation.
+    """Return the steady-state continuous Kalman filter (4), (5), from the algebraic Riccati equation.
 
     A random constant in the state violates its conditions: the variance falls for ever, like 1/t.
 
     Args:
-        A: ``(n, n)``, 1/s.
-        H: ``(m, n)``.
-        intensity: of the process noise, ``G Q G^T``, ``(n, n)``.
+        A: matrix of the model, ``(n, n)``, 1/s.
+        H: measurement matrix, ``(m, n)``.
+        intensity: intensity of the process noise, ``G Q G^T``, ``(n, n)``.
         R: intensity of the measurement noise, ``(m, m)``.
 
     Raises:
-        ValueError: where no stabilising solution exists, with the mode to blame.
+        ValueError: if no stabilising solution exists, with the mode that prevents it.
     """
     A = square_matrix("A", A)
     H = numpy.atleast_2d(numpy.asarray(H, float))
@@ -292,26 +292,27 @@ def _check_regulator(F: Matrix, B: Matrix, weight: Matrix, R: Matrix) -> None:
 
 
 class Regulator(NamedTuple):
-    """Optimal control of a linear plant by quadratic cost, all of its state known."""
+    """Linear-quadratic regulator of a plant whose state is known."""
 
     feedback: Matrix
-    """L of ``u = -L x``, ``(r, n)``."""
+    """Gain L of ``u = -L x``, ``(r, n)``."""
     regret: Matrix
-    """``R + B^T S B``, ``(r, r)``: a control that is d away from the optimal one costs ``d^T (R + B^T S B) d`` more in
-    all, by completing the square in Bellman's equation with the value ``x^T S x``."""
+    """``R + B^T S B``, ``(r, r)``: a control that differs by d from the optimal one costs ``d^T (R + B^T S B) d`` more
+    in all, by completing the square in Bellman's equation with the value ``x^T S x``.
+    """
 
 
 def discrete_regulator(F: Matrix, B: Matrix, weight: Matrix, control_weight: Matrix) -> Regulator:
-    """Return the control that minimises the sum of ``x^T W x + u^T R u`` (discrete LQR).
+    """Return the regulator that minimises the sum of ``x^T W x + u^T R u`` (discrete LQR).
 
     Args:
-        F: ``(n, n)``.
-        B: ``(n, r)``.
-        weight: W, ``(n, n)``.
-        control_weight: R, ``(r, r)``.
+        F: transition matrix, ``(n, n)``.
+        B: input matrix, ``(n, r)``.
+        weight: W, weight of the state, ``(n, n)``.
+        control_weight: R, weight of the control, ``(r, r)``.
 
     Raises:
-        ValueError: where no stabilising solution exists, with the reason.
+        ValueError: if no stabilising solution exists, with the reason.
     """
     _check_regulator(F, B, weight, control_weight)
     S = riccati_solution("discrete", F, B, weight, control_weight)
@@ -327,7 +328,7 @@ def check_stable(F: Matrix) -> None:
 
 
 def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
-    """Return the covariance X of ``x(k+1) = F x(k) + w(k)``: the discrete Lyapunov equation ``X = F X F^T + Q``.
+    """Return the stationary covariance X of ``x(k+1) = F x(k) + w(k)``, from ``X = F X F^T + Q``.
 
     Raises:
         ValueError: if F is not asymptotically stable.
@@ -340,16 +341,16 @@ def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
 
 
 def feedforward_gain(F: Matrix, B: Matrix, output: Matrix, L: Matrix) -> float:
-    """Return the gain N of ``u = N r - L x`` that makes the static gain from the command to ``output x`` one.
+    """Return the gain N of ``u = N r - L x`` for a static gain of one from the command r to ``output x``.
 
     Args:
-        F: ``(n, n)``.
-        B: ``(n, 1)``.
-        output: row of the output, ``(n,)``.
-        L: ``(1, n)``.
+        F: transition matrix, ``(n, n)``.
+        B: input matrix, ``(n, 1)``.
+        output: row of the output matrix, ``(n,)``.
+        L: feedback gain, ``(1, n)``.
 
     Raises:
-        ValueError: if the loop does not pass a constant command on to the output.
+        ValueError: if a constant command has no effect on the output.
     """
     static = output @ numpy.linalg.solve(numpy.eye(len(F)) - F + B @ L, B[:, 0])
     if abs(static) < 1e-12:
@@ -358,7 +359,7 @@ def feedforward_gain(F: Matrix, B: Matrix, output: Matrix, L: Matrix) -> float:
 
 
 class ClosedLoop(NamedTuple):
-    """Linear recursion ``s(k+1) = transition s(k) + noise`` of a control loop."""
+    """Linear recursion ``s(k+1) = transition s(k) + noise`` of a closed control loop."""
 
     transition: Matrix
     noise: Matrix
@@ -368,17 +369,17 @@ class ClosedLoop(NamedTuple):
 def estimate_feedback_loop(
     F: Matrix, B: Matrix, H: Matrix, L: Matrix, K: Matrix, Q: Matrix, R: Matrix
 ) -> ClosedLoop:
-    """Return the loop closed over a filter, ``u = -L x(k|k)``, in the coordinates state and error ``e = x - x(k|k)``.
+    """Return the loop closed over a filter, ``u = -L x(k|k)``, in state and error ``e = x - x(k|k)``.
 
     ``[x; e](k+1) = [[F - B L, B L], [0, (I - K H) F]] [x; e](k) + [[I, 0], [I - K H, -K]] [w; v]``. The zero
     block is the separation principle: the poles are those of ``F - B L`` and those of ``(I - K H) F``,
     whatever the gain K.
 
     Args:
-        F: ``(n, n)``.
-        B: ``(n, r)``.
-        H: ``(m, n)``.
-        L: ``(r, n)``.
+        F: transition matrix, ``(n, n)``.
+        B: input matrix, ``(n, r)``.
+        H: measurement matrix, ``(m, n)``.
+        L: feedback gain, ``(r, n)``.
         K: any constant filter gain, ``(n, m)``.
         Q: covariance of w, ``(n, n)``.
         R: covariance of v, ``(m, m)``.
@@ -391,7 +392,7 @@ def estimate_feedback_loop(
 
 
 def measurement_feedback_loop(F: Matrix, B: Matrix, H: Matrix, L: Matrix, Q: Matrix, R: Matrix) -> ClosedLoop:
-    """Return the loop closed over raw measurements, ``u = -L H^+ z``, in the coordinates of the state.
+    """Return the loop closed over raw measurements, ``u = -L H^+ z``, in coordinates of the state.
 
     A coordinate that no sensor measures is fed back as zero. The state holds the plant only: the noise of
     the measurement enters through the control.
@@ -401,7 +402,7 @@ def measurement_feedback_loop(F: Matrix, B: Matrix, H: Matrix, L: Matrix, Q: Mat
 
 
 def separation_defect(F: Matrix, B: Matrix, H: Matrix, L: Matrix, K: Matrix) -> float:
-    """Return the largest distance between a pole of the loop with filter and its partner in the separated designs.
+    """Return the largest distance between poles of the loop with filter and those of the separated designs.
 
     The loop is written in state and *estimate*, where separation is not visible, and its poles are matched
     one to one with the union of ``eig(F - B L)`` and ``eig((I - K H) F)``: rounding, if the principle holds.

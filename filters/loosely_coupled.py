@@ -1,4 +1,4 @@
-r"""Loosely coupled INS and GNSS on one axis: the INS error, the plain scheme, the augmented error state.
+r"""Loosely coupled INS and GNSS on one axis: INS error model, plain scheme, augmented error state.
 
     INS      dX/dt  = dXr/dt + beta + eta + xi,     beta constant,  d eta/dt = -eta / tau + w
     GNSS     Z      = Xr + zeta
@@ -31,13 +31,13 @@ from .linear_systems import Matrix, van_loan
 def error_model(
     drift: float, coloured: float, correlation_time: float, white_intensity: float
 ) -> tuple[Matrix, Matrix, Matrix]:
-    """Return the continuous model of the INS error (delta, beta, eta).
+    """Return the continuous model of the INS error (delta, beta, eta): A, noise intensity, initial covariance.
 
     Args:
         drift: standard deviation of the constant rate error, m/s.
         coloured: stationary standard deviation of the coloured rate error, m/s.
-        correlation_time: of the coloured rate error, s.
-        white_intensity: G, m^2/s.
+        correlation_time: correlation time of the coloured rate error, s.
+        white_intensity: G, intensity of the white rate error, m^2/s.
 
     Returns:
         ``A``, ``B G B^T`` and the covariance at the start, where INS and reference agree, each ``(3, 3)``.
@@ -48,7 +48,7 @@ def error_model(
 
 
 class Sampling(NamedTuple):
-    """Exact sampling of the INS error: ``delta += step beta + drive eta + dd``, ``eta = decay eta + de``."""
+    """Coefficients of the sampled INS error, ``delta += step beta + drive eta + dd``, ``eta = decay eta + de``."""
 
     step: float
     """Sampling interval, s."""
@@ -65,7 +65,7 @@ class Sampling(NamedTuple):
 
 
 def sampling(correlation_time: float, step: float) -> Sampling:
-    """Sample the INS error exactly (Van Loan), for a coloured rate error of unit variance, no white one."""
+    """Return the coefficients of the INS error sampled exactly, for a coloured rate error of unit variance."""
     A, BGBt, _ = error_model(0.0, 1.0, correlation_time, 0.0)
     Phi, Qd = van_loan(A, BGBt, step)
     coupling = Qd[0, 2] / Qd[2, 2]
@@ -80,12 +80,12 @@ def sampling(correlation_time: float, step: float) -> Sampling:
 
 
 def steady_state_gain(growth: Array, R: Array) -> Array:
-    """Return the gain at which the sampled plain scheme settles, ``P / (P + R)`` with the settled prediction P.
+    """Return the steady-state gain of the sampled plain scheme, ``P / (P + R)`` with the steady prediction P.
 
     ``P = q / 2 + sqrt(q^2 / 4 + q R)``; the gain is ``sqrt(Ge / N) step`` at first order in the step.
 
     Args:
-        growth: q, variance that the error gains in a step, ``Ge step``, m^2.
+        growth: q, increase of the error's variance in a step, ``Ge step``, m^2.
         R: variance of a measurement, ``N / step``, m^2.
     """
     P = growth / 2 + (growth * growth / 4 + growth * R) ** 0.5
@@ -99,32 +99,32 @@ def update_variance(P: Array, R: Array, gain: Array) -> Array:
 
 
 class PlainVariance(NamedTuple):
-    """Variance of the plain scheme's error under any gain, by two error models; four arrays of one shape, m^2."""
+    """Variances of the plain scheme's error under any gain, by two error models; arrays of one shape, m^2."""
 
     assumed: Array
-    """By the scheme's own model: white noise of an equivalent intensity, and nothing else."""
+    """Variance by the scheme's own model: only white noise of an equivalent intensity."""
     modelled: Array
-    """With every rate error of :func:`error_model`."""
+    """Variance with every rate error of :func:`error_model`."""
     with_drift: Array
     """Covariance of the error with the displacement ``step beta``."""
     with_coloured: Array
-    """And with the displacement ``drive eta``."""
+    """Covariance of the error with the displacement ``drive eta``."""
 
 
 def predict_plain(
     P: PlainVariance, s: Sampling, growth: float, drift: float, coloured: float, white_intensity: float
 ) -> PlainVariance:
-    """Return the variances after one step without a measurement.
+    """Return the variances of the plain scheme after one step without a measurement.
 
-    The rate errors keep their variances, because the plain scheme learns nothing of them.
+    The variances of the rate errors do not change, since the plain scheme does not estimate them.
 
     Args:
-        P: after the previous measurement.
+        P: variances after the previous measurement.
         s: sampling of the INS error.
-        growth: variance that the error gains in a step by the scheme's own model, ``Ge step``, m^2.
+        growth: increase of the error's variance in a step by the scheme's own model, ``Ge step``, m^2.
         drift: standard deviation of the constant rate error, m/s.
         coloured: stationary standard deviation of the coloured rate error, m/s.
-        white_intensity: G, m^2/s.
+        white_intensity: G, intensity of the white rate error, m^2/s.
     """
     by_drift, by_coloured = (s.step * drift) ** 2, (s.drive * coloured) ** 2
     coupled = s.coupling * (s.coloured * coloured) ** 2
@@ -138,12 +138,14 @@ def predict_plain(
 
 
 def update_plain(P: PlainVariance, R: Array, gain: Array) -> PlainVariance:
-    """Return the variances after an update with any gain that does not depend on the innovations (Joseph form).
+    """Return the variances of the plain scheme after an update with any gain (Joseph form).
+
+    The gain must not depend on the innovations.
 
     Args:
-        P: of the prediction.
+        P: predicted variances.
         R: variance of the measurement, m^2.
-        gain: zero where there is no measurement.
+        gain: gain; zero where there is no measurement.
     """
     rest = 1.0 - gain
     kept, noise = rest * rest, gain * gain * R
@@ -155,7 +157,7 @@ def update_plain(P: PlainVariance, R: Array, gain: Array) -> PlainVariance:
 def best_constant_gain(
     drift: float, coloured: float, correlation_time: float, white_intensity: float, receiver_intensity: float
 ) -> float:
-    """Return the gain K, 1/s, of the least settled mean square error: a bound for any tuning of the plain scheme.
+    """Return the gain K, 1/s, with the least steady mean square error: a bound for any tuning of the plain scheme.
 
     From (6) for ``d Delta/dt = -K Delta + beta + eta + xi - K zeta`` the settled mean square error is
     ``(sigma_b / K)^2 + sigma^2 / (K (K + 1/tau)) + (G + K^2 N) / (2 K)``, m^2; the first term is what is left
@@ -196,29 +198,29 @@ class AugmentedCovariance(NamedTuple):
     """Covariance of (delta, beta, eta): six arrays of one shape."""
 
     position: Array
-    """m^2."""
+    """Variance of delta, m^2."""
     position_drift: Array
-    """m^2/s."""
+    """Covariance of delta and beta, m^2/s."""
     position_coloured: Array
-    """m^2/s."""
+    """Covariance of delta and eta, m^2/s."""
     drift: Array
-    """m^2/s^2."""
+    """Variance of beta, m^2/s^2."""
     drift_coloured: Array
-    """m^2/s^2."""
+    """Covariance of beta and eta, m^2/s^2."""
     coloured: Array
-    """m^2/s^2."""
+    """Variance of eta, m^2/s^2."""
 
 
 def predict_augmented(
     P: AugmentedCovariance, s: Sampling, coloured: Array, white: Array
 ) -> AugmentedCovariance:
-    """Return the covariance after one step without a measurement, ``F P F^T + Qd``.
+    """Return the covariance of (delta, beta, eta) after one step without a measurement, ``F P F^T + Qd``.
 
     Args:
-        P: after the previous measurement.
+        P: covariance after the previous measurement.
         s: sampling of the INS error.
-        coloured: variance that the coloured rate error gains in a step, m^2/s^2.
-        white: variance of the displacement in a step that this gain does not explain, m^2.
+        coloured: increase of the coloured rate error's variance in a step, m^2/s^2.
+        white: variance of the displacement in a step that this increase does not explain, m^2.
     """
     position = P.position + s.step * P.position_drift + s.drive * P.position_coloured
     drift = P.position_drift + s.step * P.drift + s.drive * P.drift_coloured
@@ -235,25 +237,25 @@ def predict_augmented(
 
 
 class AugmentedFilterGain(NamedTuple):
-    """Gains of (delta, beta, eta)."""
+    """Gains of delta, beta and eta."""
 
     position: Array
     drift: Array
-    """1/s."""
+    """Gain of beta, 1/s."""
     coloured: Array
-    """1/s."""
+    """Gain of eta, 1/s."""
 
 
 def update_augmented(
     P: AugmentedCovariance, R: Array, available: Array
 ) -> tuple[AugmentedFilterGain, AugmentedCovariance]:
-    """Return the gains and covariance of a measurement of delta.
+    """Return the Kalman gains and the updated covariance of (delta, beta, eta) for a measurement of delta.
 
     ``K = P H^T / S``, ``P - K S K^T``; with this gain, which is Kalman's, and one measurement the position
     variance is ``P R / S``, positive whatever the rounding.
 
     Args:
-        P: of the prediction.
+        P: predicted covariance.
         R: variance of the measurement, m^2.
         available: one where there is a measurement, zero where there is none.
     """
@@ -270,11 +272,12 @@ def update_augmented(
 
 
 def update_augmented_by(P: AugmentedCovariance, R: Array, gain: AugmentedFilterGain) -> AugmentedCovariance:
-    """Return the covariance after a measurement of delta that was taken in with any gain, ``(I - K H) P (I - K H)^T +
-    K R K^T`` (Joseph form).
+    """Return the covariance of (delta, beta, eta) after an update with any gain (Joseph form).
+
+    ``(I - K H) P (I - K H)^T + K R K^T`` for a measurement of delta.
 
     Args:
-        P: of the prediction.
+        P: predicted covariance.
         R: variance of the measurement, m^2.
         gain: K; zero where there is no measurement.
     """

@@ -1,4 +1,4 @@
-r"""Noise levels estimated by a filter from what its own measurements say.
+r"""Adaptive estimation of noise variances from a filter's own innovations and residuals.
 
 Sage and Husa, "Adaptive filtering with unknown prior statistics", Joint Automatic Control Conference (1969):
 
@@ -9,8 +9,8 @@ Sage and Husa, "Adaptive filtering with unknown prior statistics", Joint Automat
 
 with the innovation ``nu = z - H x'``, the residual ``epsilon = z - H x``, P' and P the covariances before and
 after the update, b the forgetting factor. (2) is what the paper's estimate becomes when the filtered state
-stands in for the smoothed one; its samples have the mean R only where the filter already believes R, so it comes
-nearer by a fraction of the error, where (1) has no bias: it is not used here.
+stands in for the smoothed one; its samples have the mean R only where the filter's R is already right, so it
+converges by a fraction of the error, where (1) has no bias: it is not used here.
 
 Mehra, "Approaches to adaptive filtering", IEEE Transactions on Automatic Control 17(5), 1972, covariance
 matching over the last W measurements (after "On the identification of variances and adaptive Kalman filtering",
@@ -43,22 +43,22 @@ State = TypeVar("State")
 
 
 class Level(NamedTuple):
-    """A variance or a factor on a covariance, and how many samples it stands for."""
+    """An estimated variance or factor on a covariance, and the number of samples that it averages."""
 
     value: Array
-    """In the unit of the samples squared."""
+    """Variance or factor, in the unit of the samples squared."""
     weight: Array
-    """Samples that have not been forgotten, more than zero; one at the start gives equation (4)."""
+    """Effective number of samples, more than zero; one at the start gives equation (4)."""
 
 
 def fading_mean(level: Level, sample: Array, forgetting: float, available: Array | float = 1.0) -> Level:
-    """Return the mean of all samples with those of k measurements ago weighing ``forgetting^k``: equation (4).
+    """Return the exponentially fading mean with one more sample, equation (4): weights ``forgetting^k``.
 
     Args:
-        level: before.
-        sample: of the same unit and shape.
+        level: mean before.
+        sample: sample of the same unit and shape.
         forgetting: b, above 0 and at most 1.
-        available: whether there is a sample.
+        available: 1 with a sample, 0 without.
     """
     weight = level.weight + available * (1.0 - (1.0 - forgetting) * level.weight)
     return Level(level.value + (available / weight) * (sample - level.value), weight)
@@ -72,29 +72,28 @@ def sage_husa(
     least: Array | float,
     available: Array | float = 1.0,
 ) -> Level:
-    """Return the variance of a measurement's noise by equation (1), held above a least one.
+    """Return the updated estimate of a measurement's noise variance by Sage and Husa, (1), limited from below.
 
     Args:
-        level: before.
-        innovation: nu.
+        level: variance before.
+        innovation: innovation nu.
         predicted: variance of the predicted measurement, ``H P' H^T``.
-        forgetting: b.
-        least: smallest variance.
-        available: whether there is a measurement.
+        forgetting: b, above 0 and at most 1.
+        least: lower limit of the variance.
+        available: 1 with a measurement, 0 without.
     """
     after = fading_mean(level, innovation**2 - predicted, forgetting, available)
     return after._replace(value=namespace(after.value).clip(after.value, least, None))
 
 
 def process_noise_factor(correction: Array, updated: Array, carried: Array, unit: Array) -> Array:
-    """Return the sample of the factor on the process noise: the diagonal of equation (3) over that of the unit noise.
+    """Return a sample of the factor on the process noise, ``(N,)``, from the diagonal of equation (3).
 
-    Its mean is the true factor where the filter believes the right one. Without a measurement it is the factor
-    that the filter believes. Single samples are often negative: average them with :func:`fading_mean`, hold the average
-    above a least one.
+    Its mean is the true factor if the filter uses the right one. Without a measurement it is the factor that the filter
+    uses. Single samples are often negative: average them with :func:`fading_mean` and limit the average from below.
 
     Args:
-        correction: ``K nu`` of the coordinates that count, ``(c, N)``.
+        correction: ``K nu`` of the c coordinates to use, ``(c, N)``.
         updated: their variances after the update, ``(c, N)``.
         carried: their variances predicted without process noise, the diagonal of ``F P F^T``, ``(c, N)``.
         unit: their variances by the process noise of factor one, ``(c,)`` lists or ``(c, N)``, above zero.
@@ -107,7 +106,7 @@ def process_noise_factor(correction: Array, updated: Array, carried: Array, unit
 
 
 def start_window(variance: Array, size: int) -> Array:
-    """Return the window of equation (5) filled with the variance that is believed at the start, ``(size, ...)``."""
+    """Return the window of equation (5) filled with an initial variance, ``(size, ...)``."""
     return namespace(variance).stack([variance] * size, axis=0)
 
 
@@ -118,14 +117,14 @@ def mehra(
     least: Array | float,
     available: Array | float = 1.0,
 ) -> tuple[Array, Array]:
-    """Return the variance of a measurement's noise by equation (5), held above a least one.
+    """Return the updated estimate of a measurement's noise variance by Mehra, (5), limited from below, and the window.
 
     Args:
         window: the last samples, the oldest first, ``(W, ...)``.
-        innovation: nu.
+        innovation: innovation nu.
         predicted: variance of the predicted measurement, ``H P' H^T``.
-        least: smallest variance.
-        available: whether there is a measurement.
+        least: lower limit of the variance.
+        available: 1 with a measurement, 0 without.
 
     Returns:
         The variance, and the window with the new sample in place of the oldest.
@@ -138,26 +137,26 @@ def mehra(
 
 
 class InverseGamma(NamedTuple):
-    """Distribution of a variance."""
+    """Inverse-gamma distribution of a variance."""
 
     shape: Array
-    """alpha: half the number of measurements that it stands for."""
+    """Shape alpha: half the effective number of measurements."""
     scale: Array
-    """beta, in the unit of the variance."""
+    """Scale beta, in the unit of the variance."""
 
     @property
     def variance(self) -> Array:
-        """R of equation (7): the inverse of the mean of 1 / R."""
+        """Variance R of equation (7): the inverse of the mean of 1 / R."""
         return self.scale / self.shape
 
 
 def forget(noise: InverseGamma, forgetting: float, available: Array | float = 1.0) -> InverseGamma:
-    """Apply equation (6): the same variance from fewer measurements.
+    """Return the distribution with the same variance from fewer measurements, equation (6).
 
     Args:
-        noise: after the measurement before.
+        noise: distribution after the previous measurement.
         forgetting: rho, above 0 and at most 1.
-        available: whether there is a measurement now; the paper forgets by the clock, so that after a gap a single
+        available: 1 with a measurement now, 0 without; the paper forgets by the clock, so that after a gap a single
             measurement would decide.
     """
     kept = 1.0 - (1.0 - forgetting) * available
@@ -170,14 +169,14 @@ def variational_bayes(
     iterations: int,
     available: Array | float = 1.0,
 ) -> tuple[InverseGamma, State]:
-    """Return the state and noise from one measurement by the fixed point of equation (7).
+    """Return the noise distribution and the state after a measurement, by the fixed point of equation (7).
 
     Args:
-        noise: after :func:`forget`.
-        update: Kalman's update with the variances R: returns the residual epsilon and the variance of the measured
-            quantity after it, ``H P H^T``, each like R, and the state.
-        iterations: how often, at least 1; the paper finds two enough.
-        available: whether there is a measurement.
+        noise: distribution from :func:`forget`.
+        update: function from the variances R to the residual epsilon after the Kalman update, the variance ``H P H^T``
+            of the measured quantity after it, each like R, and the state.
+        iterations: number of updates, at least 1; the paper finds two enough.
+        available: 1 with a measurement, 0 without.
 
     Returns:
         The distribution, and the state of the last update.

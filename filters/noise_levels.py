@@ -1,6 +1,6 @@
-r"""Kalman filters side by side for the levels of a plant's noise that switch, with sensors whose levels switch too.
+r"""Bank of Kalman filters for switching levels of process noise, with sensors whose noise levels switch, too.
 
-Hypothesis j believes a level g_j of the process noise, ``Q_j = g_j^2 Q_s + Q_o``. Before each step the level of
+Hypothesis j assumes a level g_j of the process noise, ``Q_j = g_j^2 Q_s + Q_o``. Before each step the level of
 hypothesis i changes with probability c_i, and the new one is j with probability pi_j, whatever it was. With p_i the
 probabilities after the last measurement and v_i = c_i p_i, V = sum_i v_i,
 
@@ -31,39 +31,39 @@ from .ordered_sums import ordered_sum
 from .packed_covariance import column
 
 LEAST_PROBABILITY = 1e-30
-"""Of a hypothesis before a step: it can come back, and no weight is zero by zero."""
+"""Least probability of a hypothesis before a step, so that it can return and no weight is zero by zero."""
 
 
 class LevelHypotheses(NamedTuple):
-    """Filters, one for each hypothesis on the noise levels."""
+    """Estimates of H hypotheses on the noise levels, and their probabilities."""
 
     mean: Array
-    """``(n, H, N)``."""
+    """Means, ``(n, H, N)``."""
     covariance: Array
-    """Packed, ``(n (n + 1) / 2, H, N)``."""
+    """Packed covariances, ``(n (n + 1) / 2, H, N)``."""
     probability: Array
-    """``(H, N)``."""
+    """Probabilities of the hypotheses, ``(H, N)``."""
     sensors: tuple[Array, ...]
     """Probabilities of the levels of each sensor, ``(L, H, N)``."""
 
-    def take(self, some: slice) -> "LevelHypotheses":
-        """Return some of them."""
+    def take(self, part: slice) -> "LevelHypotheses":
+        """Return a slice of the hypotheses."""
         return LevelHypotheses(
-            self.mean[:, some],
-            self.covariance[:, some],
-            self.probability[some],
-            tuple(q[:, some] for q in self.sensors),
+            self.mean[:, part],
+            self.covariance[:, part],
+            self.probability[part],
+            tuple(q[:, part] for q in self.sensors),
         )
 
 
 def squares(deviation: Array) -> Array:
-    """Return the packed ``d d^T`` of ``(n, ...)``."""
+    """Return the packed lower triangles of ``d d^T`` for vectors ``(n, ...)``."""
     xp = namespace(deviation)
     return xp.concat([deviation[j:] * deviation[j] for j in range(deviation.shape[0])], axis=0)
 
 
 class Moments(NamedTuple):
-    """Mean and packed covariance of several hypotheses together."""
+    """Mean and packed covariance of a mixture of hypotheses."""
 
     mean: Array
     covariance: Array
@@ -74,12 +74,12 @@ class Moments(NamedTuple):
 
 
 def merge(mean: Array, covariance: Array, weights: Array) -> Moments:
-    """Return the moments (2) of hypotheses.
+    """Return the moments (2) of the mixture of H hypotheses.
 
     Args:
-        mean: ``(n, H, N)``.
-        covariance: packed, ``(n (n + 1) / 2, H, N)``.
-        weights: ``(H, N)``, with a sum above zero.
+        mean: means, ``(n, H, N)``.
+        covariance: packed covariances, ``(n (n + 1) / 2, H, N)``.
+        weights: weights, ``(H, N)``, with a sum above zero.
     """
     total = ordered_sum(weights)
     shares = weights / total
@@ -92,12 +92,12 @@ def merge(mean: Array, covariance: Array, weights: Array) -> Moments:
 def switch(
     before: LevelHypotheses, change: Array, prior: Array, sensor_change: Array, levels: Array
 ) -> LevelHypotheses:
-    """Apply the possible changes of level before a step, equations (1) to (4).
+    """Return the hypotheses after possible changes of level before a step, equations (1) to (4).
 
     Args:
-        before: after the last measurement.
-        change: c, ``(H, 1)``; above zero somewhere.
-        prior: pi, ``(H, 1)``; zero: nothing changes to this hypothesis.
+        before: hypotheses after the last measurement.
+        change: c, probability of a change, ``(H, 1)``; above zero for one at least.
+        prior: pi, probability of the new hypothesis, ``(H, 1)``; zero: nothing changes to it.
         sensor_change: probability that a sensor's level changes, by hypothesis, ``(H, 1)``.
         levels: probabilities of the level that a sensor changes to, ``(L, 1, 1)``.
     """
@@ -124,42 +124,42 @@ def switch(
 
 
 class SensorUpdate(NamedTuple):
-    """Hypotheses after a reading."""
+    """Result of an update with the reading of one sensor under all hypotheses."""
 
     mean: Array
     covariance: Array
     levels: Array
     """Probabilities of the sensor's levels, ``(L, H, N)``."""
     log_density: Array
-    """Of the reading, ``(H, N)``; zero without one."""
+    """Log-density of the reading, ``(H, N)``; zero without one."""
     nis: Array
-    """Its squared innovation over the variance, by the levels' probabilities, ``(H, N)``; zero without one."""
+    """Squared innovation over its variance, averaged over the levels, ``(H, N)``; zero without a reading."""
 
 
 class SensorNoise(NamedTuple):
     """Distribution of the noise level of a sensor."""
 
     variances: Array
-    """Of its levels, ascending, ``(L, H, 1)``."""
+    """Variances of the levels, ascending, ``(L, H, 1)``."""
     probabilities: Array
-    """Of its levels, ``(L, H, N)``."""
+    """Probabilities of the levels, ``(L, H, N)``."""
     outlier: float = 0.0
-    """Probability that a reading is an outlier, whatever the level."""
+    """Probability that a reading is an outlier, at any level."""
     outlier_variance: float = 0.0
-    """Of outliers, above that of every level."""
+    """Variance of outliers, above that of every level."""
 
 
 def update_sensor(
     mean: Array, covariance: Array, z: Array, rows: Sequence[int], noise: SensorNoise, available: Array
 ) -> SensorUpdate:
-    """Take in the reading of a sensor whose noise has one of several levels.
+    """Return the update with the reading of a sensor whose noise has one of several levels.
 
     Args:
-        mean: predicted, ``(n, H, N)``.
-        covariance: predicted, packed.
+        mean: predicted means, ``(n, H, N)``.
+        covariance: predicted covariances, packed.
         z: reading, ``(N,)``; where not available any finite number.
-        rows: coordinates whose sum the sensor reads.
-        noise: distribution of its level.
+        rows: coordinates whose sum the sensor measures.
+        noise: distribution of the sensor's noise level.
         available: 1 where there is a reading and 0 where there is none, ``(N,)``.
     """
     xp, n = namespace(mean), mean.shape[0]

@@ -1,4 +1,4 @@
-"""Sums whose bits do not depend on the width of the batch.
+"""Sums in a fixed order, whose rounding does not depend on the width of the batch.
 
 The reductions of NumPy and torch choose the order of their additions by the shape of the array, so that lane i
 of a wide batch would differ in the last bit from the same episode alone. Here the terms are added one after
@@ -13,23 +13,20 @@ from .array_namespace import Array
 
 
 def ordered_sum(values: Iterable[Array]) -> Array:
-    """Return the sum over the first axis, ``((values[0] + values[1]) + values[2]) + ...``.
+    """Return the sum ``(...)`` over the first axis, ``((values[0] + values[1]) + values[2]) + ...``.
 
     Args:
-        values: ``(M, ...)``, or any other series of at least one array.
-
-    Returns:
-        ``(...)``.
+        values: terms, an array ``(M, ...)`` or any series of at least one array.
     """
     return functools.reduce(operator.add, values)
 
 
 def weighted_sum(weights: Array, values: Array) -> Array:
-    """Return the sum over M hypotheses, ``sum_j weights[j] values[..., j, :]``.
+    """Return the weighted sum over M hypotheses, ``sum_j weights[j] values[..., j, :]``.
 
     Args:
-        weights: ``(M, ...)``.
-        values: ``(M, ...)``, ``(n, M, ...)`` or ``(n, n, M, ...)``: the axes behind M are as many as those of
+        weights: weights, ``(M, ...)``.
+        values: values, ``(M, ...)``, ``(n, M, ...)`` or ``(n, n, M, ...)``: the axes behind M are as many as those of
             ``weights`` and broadcast against them.
 
     Returns:

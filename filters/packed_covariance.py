@@ -1,4 +1,4 @@
-r"""Kalman covariances kept as the lower triangle, with sensors that each read one coordinate.
+r"""Kalman filter on covariances stored as lower triangles (packed), with sensors of single coordinates.
 
 A symmetric ``(n, n, N)`` is stored as ``(n (n + 1) / 2, N)``: the columns of its lower triangle one after
 the other, ``P00, P10, P20, ..., P11, P21, ...``. It is symmetric by construction, takes almost half the
@@ -30,33 +30,33 @@ def position(n: int, i: int, j: int) -> int:
 
 
 def column(n: int, j: int) -> list[int]:
-    """Return the rows of the packed triangle that hold column j of the matrix."""
+    """Return a list of the rows of the packed triangle that contain column j of the matrix."""
     return [position(n, i, j) for i in range(n)]
 
 
 def diagonal(n: int) -> list[int]:
-    """Return the rows of the packed triangle that hold the diagonal."""
+    """Return a list of the rows of the packed triangle that contain the diagonal."""
     return [position(n, i, i) for i in range(n)]
 
 
 def pack(P: Array) -> Array:
-    """Return the lower triangle of ``(n, n, ...)``, as ``(n (n + 1) / 2, ...)``."""
+    """Return the lower triangle of symmetric matrices ``(n, n, ...)``, packed as ``(n (n + 1) / 2, ...)``."""
     return namespace(P).concat([P[j:, j] for j in range(P.shape[0])], axis=0)
 
 
 def unpack(packed: Array, n: int) -> Array:
-    """Return the symmetric matrix ``(n, n, ...)`` of a packed triangle."""
+    """Return the symmetric matrices ``(n, n, ...)`` of packed lower triangles ``(n (n + 1) / 2, ...)``."""
     return packed[_matrix(n)]
 
 
 @functools.cache
 def _matrix(n: int) -> numpy.ndarray:
-    """Return the row of the packed triangle that holds each element of the matrix, ``(n, n)``."""
+    """Return the row of the packed triangle that contains each element of the matrix, ``(n, n)``."""
     return numpy.array([column(n, j) for j in range(n)])
 
 
 def propagator(F: numpy.ndarray) -> numpy.ndarray:
-    """Return the matrix M with ``pack(F P F^T) = M pack(P)``, ``(n (n + 1) / 2,) * 2``."""
+    """Return the matrix M with ``pack(F P F^T) = M pack(P)``, square of n (n + 1) / 2 rows."""
     n = len(F)
     M = numpy.zeros((n * (n + 1) // 2,) * 2)
     for j in range(n):
@@ -68,12 +68,12 @@ def propagator(F: numpy.ndarray) -> numpy.ndarray:
 
 
 class PackedUpdate(NamedTuple):
-    """Result of measurements of single coordinates."""
+    """Result of an update with measurements of single coordinates."""
 
     mean: Array
-    """``(n, N)``."""
+    """Updated mean, ``(n, N)``."""
     covariance: Array
-    """Packed, ``(n (n + 1) / 2, N)``."""
+    """Updated covariance, packed, ``(n (n + 1) / 2, N)``."""
     log_likelihood: Array
     """Log-density of the available measurements given the prediction, ``(N,)``."""
     squared_distance: Array
@@ -88,13 +88,13 @@ def update_coordinates(
     R: Array,
     available: Array,
 ) -> PackedUpdate:
-    """Take in measurements of single coordinates, or of sums of some, with independent noise.
+    """Return the update with independent measurements of single coordinates, or of sums of some.
 
     Args:
-        mean: predicted, ``(n, N)``.
-        covariance: predicted, packed, ``(n (n + 1) / 2, N)``.
+        mean: predicted mean, ``(n, N)``.
+        covariance: predicted covariance, packed, ``(n (n + 1) / 2, N)``.
         z: readings, ``(m, N)``; where not available any finite number.
-        coordinates: which coordinate each sensor reads, or the sum of which, m of them.
+        coordinates: index of the coordinate that each sensor measures, or indices of those whose sum it measures.
         R: variances of the readings, ``(m,)`` or ``(m, N)``.
         available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
     """
@@ -122,20 +122,20 @@ class GainModel(NamedTuple):
     """Covariance and variances from which a Kalman gain is computed, where they differ from those of the filter."""
 
     covariance: Array
-    """Predicted, packed, ``(n (n + 1) / 2, N)``."""
+    """Predicted covariance, packed, ``(n (n + 1) / 2, N)``."""
     R: Array
     """Variances of the readings, ``(m, N)``."""
 
 
 class UpdateWithGain(NamedTuple):
-    """Result of measurements of single coordinates with the gain of another covariance."""
+    """Result of an update of single coordinates with the gain of another covariance."""
 
     mean: Array
-    """``(n, N)``."""
+    """Updated mean, ``(n, N)``."""
     covariance: Array
-    """Packed, ``(n (n + 1) / 2, N)``."""
+    """Updated covariance, packed, ``(n (n + 1) / 2, N)``."""
     gain_covariance: Array
-    """Covariance from which the gain is computed, updated by it, in the same form."""
+    """Covariance from which the gain is computed, updated with it, packed."""
 
 
 def update_coordinates_with_gain(
@@ -147,7 +147,7 @@ def update_coordinates_with_gain(
     available: Array,
     gain_model: GainModel,
 ) -> UpdateWithGain:
-    """Take in measurements of single coordinates with the Kalman gain K of another covariance M and other variances.
+    """Return the update with measurements of single coordinates and the gain of another covariance M.
 
     One after the other, with the column m of M and the column p of P that belong to the coordinate i::
 
@@ -156,10 +156,10 @@ def update_coordinates_with_gain(
     which is ``x + K nu`` and ``(I - K H) P (I - K H)^T + K R K^T`` with the joint gain of M and R'.
 
     Args:
-        mean: predicted, ``(n, N)``.
-        covariance: predicted, packed, ``(n (n + 1) / 2, N)``.
+        mean: predicted mean, ``(n, N)``.
+        covariance: predicted covariance, packed, ``(n (n + 1) / 2, N)``.
         z: readings, ``(m, N)``; where not available any finite number.
-        coordinates: which coordinate each sensor reads, m of them.
+        coordinates: index of the coordinate that each sensor measures.
         R: variances of the readings, ``(m, N)``.
         available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
         gain_model: M and R'.

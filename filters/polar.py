@@ -1,24 +1,24 @@
-"""Errors of a range-and-azimuth radar seen along Cartesian axes."""
+"""Errors of a range-and-azimuth radar in Cartesian coordinates."""
 
 from .array_namespace import Array, namespace
 
 SMALLEST_RANGE = 1.0
-"""Metres; nearer than this the azimuth is undefined and the variances are evaluated here."""
+"""Range below which variances are evaluated at this range, m, since the azimuth is undefined at zero."""
 
 
 def cartesian_variances(position: Array, range_sigma: Array, bearing_sigma: Array) -> Array:
-    """Return the variances along x and y of a polar measurement, equations (22) and (23) of the IMM paper.
+    """Return the variances along x and y of a polar measurement, ``(2, ...)``, m^2.
+
+    Equations (22) and (23) of the IMM paper.
 
     ``sigma_x^2 = cos^2(b) sigma_r^2 + r^2 sin^2(b) sigma_b^2`` and the same with sine and cosine exchanged
     for y, where ``cos(b) = x / r``. The covariance of x and y is not part of the paper's model.
 
     Args:
-        position: x and y where the variances are evaluated, ``(2, ...)``, m.
+        position: x and y at which the variances are evaluated, ``(2, ...)``, m.
         range_sigma: standard deviation of the range, m; a number or ``(...)``.
         bearing_sigma: standard deviation of the azimuth, rad, same shape.
 
-    Returns:
-        ``(2, ...)``, m^2.
     """
     xp = namespace(position)
     squares = position * position

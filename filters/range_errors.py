@@ -1,4 +1,4 @@
-r"""Errors of pseudoranges that last, as states beside those of :mod:`.gnss_ins`.
+r"""Slowly varying errors of pseudoranges as additional states of :mod:`.gnss_ins`.
 
 A pseudorange is off by e_j beside its white noise, one such error for each of S satellites. The state is
 ``[lambda (17), e_1 ... e_S]``. An error is a first-order Gauss-Markov process (multipath, atmosphere, ephemerides),
@@ -40,17 +40,17 @@ from .extended_kalman import JacobianRow
 from .receiver_faults import weigh_levels
 
 LARGEST_PROBABILITY = 1.0 - 1e-12
-"""Of a renewal: its odds stay finite."""
+"""Largest probability of a renewal, so that its odds are finite."""
 
 
 def start(mean: Array, covariance: Array, satellites: int, variance: Array) -> tuple[Array, Array]:
-    """Return the state with the range errors, which are zero but for a variance.
+    """Return mean and covariance augmented by the range errors, which have mean zero and a variance.
 
     Args:
-        mean: of the first 17 states, ``(17, N)``.
-        covariance: of the same state, ``(17, 17, N)``.
-        satellites: S.
-        variance: of each error, m^2, ``(N,)``.
+        mean: mean of the first 17 states, ``(17, N)``.
+        covariance: their covariance, ``(17, 17, N)``.
+        satellites: number S of satellites.
+        variance: variance of each range error, m^2, ``(N,)``.
     """
     xp, none = namespace(mean), 0.0 * mean[0]
     size = gnss_ins.SIZE + satellites
@@ -61,21 +61,21 @@ def start(mean: Array, covariance: Array, satellites: int, variance: Array) -> t
     return xp.concat([mean, empty[:satellites]]), xp.stack(rows)
 
 
-def advance(state: Array, axis: Array, T: float, decay: float, kept: Array | list[Array]) -> Array:
-    """Multiply by the transition matrix from the left, as :func:`.gnss_ins.advance`.
+def advance(state: Array, axis: Array, T: float, decay: float, persistence: Array | list[Array]) -> Array:
+    """Return the product of the transition matrix with a vector or matrix, ``F x`` or ``F P``.
 
     Args:
-        state: ``(17 + S, ...)``.
-        axis: transition of (x, v, a), ``(3, 3, ...)``.
+        state: x or P, ``(17 + S, ...)``.
+        axis: transition matrix of (x, v, a), ``(3, 3, ...)``, see :func:`.gnss_ins.advance`.
         T: step, s.
         decay: factor of the attitude rates.
-        kept: psi, factor on a range error in a step, broadcasts against ``(...)``; or a list of one for each.
+        persistence: psi, factor on a range error in a step, broadcast against ``(...)``; or a list of one for each.
     """
     known = gnss_ins.SIZE
-    if isinstance(kept, list):
-        errors = namespace(state).stack([psi * state[known + j] for j, psi in enumerate(kept)])
+    if isinstance(persistence, list):
+        errors = namespace(state).stack([psi * state[known + j] for j, psi in enumerate(persistence)])
     else:
-        errors = kept * state[known:]
+        errors = persistence * state[known:]
     return namespace(state).concat([gnss_ins.advance(state, axis, T, decay), errors], axis=0)
 
 
@@ -86,34 +86,37 @@ def predict(
     T: float,
     decay: float,
     Q: Array,
-    kept: Array | list[Array],
-    gained: Array | list[Array],
+    persistence: Array | list[Array],
+    noise_variance: Array | list[Array],
 ) -> tuple[Array, Array]:
-    """Apply the time update, ``F x`` and ``F P F^T + Q``.
+    """Return the predicted means ``F x`` and covariances ``F P F^T + Q`` of M hypotheses.
 
     Args:
-        mean: ``(17 + S, M, N)``.
-        covariance: ``(17 + S, 17 + S, M, N)``.
-        axis: ``(3, 3, M, 1)``.
+        mean: means, ``(17 + S, M, N)``.
+        covariance: covariances, ``(17 + S, 17 + S, M, N)``.
+        axis: transition matrices of (x, v, a), ``(3, 3, M, 1)``.
         T: step, s.
         decay: factor of the attitude rates.
         Q: covariance of the process noise of the first 17 states, with zeros beyond, ``(17 + S, 17 + S, M, 1)``.
-        kept: psi, ``(N,)`` or a number; or a list of one for each error.
-        gained: variance of w, m^2, same shape.
+        persistence: psi, factor on a range error, ``(N,)`` or a number; or a list of one for each error.
+        noise_variance: variance of w, m^2, same shape.
     """
     xp = namespace(mean)
-    moved = advance(covariance, axis, T, decay, kept)
-    both = advance(xp.moveaxis(moved, 0, 1), axis, T, decay, kept) + Q
+    moved = advance(covariance, axis, T, decay, persistence)
+    both = advance(xp.moveaxis(moved, 0, 1), axis, T, decay, persistence) + Q
     for j in range(gnss_ins.SIZE, mean.shape[0]):
-        own = gained[j - gnss_ins.SIZE] if isinstance(gained, list) else gained
+        own = noise_variance[j - gnss_ins.SIZE] if isinstance(noise_variance, list) else noise_variance
         both = _replace(both, j, both[j], both[j, j] + own)
-    return advance(mean, axis, T, decay, kept), both
+    return advance(mean, axis, T, decay, persistence), both
 
 
 def observe(
     state: Array, satellite_position: Array, satellite_velocity: Array, ins_angles: Array, gravity: float
 ) -> tuple[Array, list[JacobianRow]]:
-    """Return the observations of a state and the rows of their Jacobian; pseudoranges with their errors."""
+    """Return the predicted observations of a state, with range errors in the pseudoranges, and their Jacobian rows.
+
+    Arguments as of :func:`.gnss_ins.observe`.
+    """
     expected, rows = gnss_ins.observe(state, satellite_position, satellite_velocity, ins_angles, gravity)
     errors = state[gnss_ins.SIZE :]
     S = errors.shape[0]
@@ -124,32 +127,33 @@ def observe(
 
 
 class SequentialUpdate(NamedTuple):
-    """State while the observations of one measurement are taken in, one after the other."""
+    """State during an update by one scalar observation after the other."""
 
     shift: Array
     """Mean minus predicted mean, ``(n, ...)``."""
     covariance: Array
-    """``(n, n, ...)``."""
+    """Covariance after the observations so far, ``(n, n, ...)``."""
     log_likelihood: Array
-    """Log-density of what was taken in, given the prediction, ``(...)``."""
+    """Log-density of the observations so far, given the prediction, ``(...)``."""
     squared_distance: Array
-    """Normalised innovation squared of the same, ``(...)``."""
+    """Normalised innovation squared of the observations so far, ``(...)``."""
 
 
 def begin(mean: Array, covariance: Array) -> SequentialUpdate:
-    """Return the state before the first observation."""
+    """Return the state of a sequential update before its first observation."""
     none = 0.0 * mean[0]
     return SequentialUpdate(0.0 * mean, covariance, none, none)
 
 
 def innovation_of(state: SequentialUpdate, residual: Array, row: JacobianRow) -> tuple[Array, Array, Array]:
-    """Return the innovation given what was taken in, its covariance with the state ``P h^T``, ``(n, ...)``, and ``h P
-    h^T``.
+    """Return the innovation of an observation given those before, its covariance ``P h^T``, and ``h P h^T``.
+
+    The covariance is that with the state, ``(n, ...)``.
 
     Args:
-        state: before the observation.
-        residual: at the predicted mean, ``(...)``.
-        row: of the Jacobian there.
+        state: state before the observation.
+        residual: residual at the predicted mean, ``(...)``.
+        row: row of the Jacobian at the predicted mean.
     """
     cross: Array = 0.0
     for column, value in zip(*row, strict=True):
@@ -169,19 +173,19 @@ def take_reading(
     probabilities: Array,
     available: Array,
 ) -> tuple[SequentialUpdate, Array]:
-    """Take in a scalar observation whose noise is a Gaussian sum.
+    """Return the state updated with a scalar observation whose noise is a Gaussian sum, and the levels' weights.
 
     Args:
-        state: before it.
-        residual: at the predicted mean, ``(...)``; any finite number where it is not available.
-        row: of the Jacobian there.
+        state: state before the observation.
+        residual: residual at the predicted mean, ``(...)``; any finite number where it is not available.
+        row: row of the Jacobian at the predicted mean.
         levels: variances in ascending order, ``(L, ...)`` that broadcast.
-        probabilities: of the levels, same shape; that of the highest one above zero.
-        available: one where there is the observation, zero where there is none.
+        probabilities: probabilities of the levels, same shape; that of the highest one above zero.
+        available: one with an observation, zero without.
 
     Returns:
-        The state after it, and the responsibilities of the levels, ``(L, ...)``; those of an observation that is not
-        available mean nothing.
+        The state after it, and the responsibilities of the levels, ``(L, ...)``, which are meaningless without an
+        observation.
     """
     error, cross, variance = innovation_of(state, residual, row)
     square = error * error
@@ -200,11 +204,11 @@ class Renewal(NamedTuple):
     """Distribution of a range error that may have been drawn anew; arrays that broadcast against ``(...)``."""
 
     probability: Array
-    """p."""
+    """Probability p of a renewal."""
     mean: Array
-    """m, m."""
+    """Mean m of a new error, m."""
     variance: Array
-    """v, m^2."""
+    """Variance v of a new error, m^2."""
 
 
 def take_pseudorange(
@@ -217,17 +221,17 @@ def take_pseudorange(
     renewal: Renewal,
     available: Array,
 ) -> SequentialUpdate:
-    """Take in a pseudorange whose error may have been drawn anew, equations (2) and (3).
+    """Return the state updated with a pseudorange whose error may have been drawn anew, (2) and (3).
 
     Args:
-        state: before it.
-        predicted: mean of its error in the prediction, ``(...)``.
-        place: of its error among the states.
-        residual: at the predicted mean, ``(...)``.
-        row: of the Jacobian there; the derivative by the error is one.
-        variance: of the white noise, m^2.
-        renewal: of the error.
-        available: one where there is the pseudorange, zero where there is none.
+        state: state before the observation.
+        predicted: predicted mean of the range error, ``(...)``.
+        place: index of the range error among the states.
+        residual: residual at the predicted mean, ``(...)``.
+        row: row of the Jacobian at the predicted mean; the derivative by the range error is one.
+        variance: variance of the white noise, m^2.
+        renewal: distribution of a new error.
+        available: one with a pseudorange, zero without.
     """
     xp = namespace(predicted)
     error, cross, known = innovation_of(state, residual, row)
@@ -263,7 +267,7 @@ def take_pseudorange(
 
 
 def _replace(covariance: Array, place: int, values: Sequence[Array], own: Array) -> Array:
-    """Return the covariance with another row and column of one state, and another variance of it."""
+    """Return the covariance with the row, column and variance of one state replaced."""
     xp = namespace(covariance)
     row = xp.concat([values[:place], own[None], values[place + 1 :]])
     covariance = xp.concat([covariance[:place], row[None], covariance[place + 1 :]])

@@ -1,4 +1,4 @@
-r"""Faults of a satellite receiver beside an INS: an error that the receiver adds, and noise of unknown level.
+r"""Faults of a satellite receiver beside an INS: slowly varying errors of the receiver, and noise of unknown level.
 
 The INS error (delta, beta, eta) of :mod:`.loosely_coupled` is followed by the receiver's own errors e,
 
@@ -35,28 +35,28 @@ from .ordered_sums import ordered_sum
 
 
 class FaultCovariance(NamedTuple):
-    """Covariance of (delta, beta, eta) and of E errors of the receiver."""
+    """Covariance of the INS error (delta, beta, eta) and of E errors of the receiver."""
 
     ins: AugmentedCovariance
-    """Of the INS error, ``(...)`` each."""
+    """Covariance of the INS error, arrays ``(...)``."""
     cross: Array
-    """Of delta, beta and eta with each error of the receiver, ``(3, E, ...)``."""
+    """Covariances of delta, beta and eta with each error of the receiver, ``(3, E, ...)``."""
     faults: Array
-    """Of the errors of the receiver, ``(E, E, ...)``."""
+    """Covariance of the receiver's errors, ``(E, E, ...)``."""
 
 
 def predict_fault(
-    P: FaultCovariance, s: Sampling, coloured: Array, white: Array, decay: Array, gained: Array
+    P: FaultCovariance, s: Sampling, coloured: Array, white: Array, decay: Array, noise_variance: Array
 ) -> FaultCovariance:
     """Return the covariance after one step without a measurement, ``F P F^T + Qd``.
 
     Args:
-        P: after the previous measurement.
+        P: covariance after the previous measurement.
         s: sampling of the INS error.
-        coloured: variance that the coloured rate error gains in a step, m^2/s^2.
-        white: variance of the displacement in a step that this gain does not explain, m^2.
+        coloured: increase of the coloured rate error's variance in a step, m^2/s^2.
+        white: variance of the displacement in a step that this increase does not explain, m^2.
         decay: psi, factor on each error of the receiver in a step, ``(E, ...)``.
-        gained: variance that each of them gains in a step, ``(E, ...)``.
+        noise_variance: increase of the variance of each of them in a step, ``(E, ...)``.
     """
     xp = namespace(P.cross)
     position, drift, rate = P.cross
@@ -64,7 +64,7 @@ def predict_fault(
     E = P.faults.shape[0]
     faults = [[decay[i] * decay[k] * P.faults[i, k] for k in range(E)] for i in range(E)]
     for i in range(E):
-        faults[i][i] = faults[i][i] + gained[i]
+        faults[i][i] = faults[i][i] + noise_variance[i]
     return FaultCovariance(
         predict_augmented(P.ins, s, coloured, white),
         xp.stack([decay * along, decay * drift, decay * s.decay * rate]),
@@ -76,8 +76,8 @@ def add_fault(P: FaultCovariance, variance: Array) -> FaultCovariance:
     """Return the covariance with one more error of the receiver, independent of all others.
 
     Args:
-        P: without it.
-        variance: of it, ``(...)``.
+        P: covariance without it.
+        variance: variance of the added error, ``(...)``.
     """
     xp, none = namespace(variance), 0.0 * variance
     E = P.faults.shape[0]
@@ -90,7 +90,7 @@ def add_fault(P: FaultCovariance, variance: Array) -> FaultCovariance:
 
 
 def matrix(P: FaultCovariance) -> Array:
-    """Return the covariance of (delta, beta, eta, e), ``(3 + E, 3 + E, ...)``."""
+    """Return the covariance of (delta, beta, eta, e) as one array, ``(3 + E, 3 + E, ...)``."""
     xp, ins = namespace(P.faults), P.ins
     first = [
         [ins.position, ins.position_drift, ins.position_coloured],
@@ -102,29 +102,29 @@ def matrix(P: FaultCovariance) -> Array:
 
 
 def from_matrix(P: Array) -> FaultCovariance:
-    """Undo :func:`matrix`."""
+    """Return the covariance in parts from one array ``(3 + E, 3 + E, ...)``."""
     ins = (P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
     return FaultCovariance(AugmentedCovariance(*ins), P[:3, 3:], P[3:, 3:])
 
 
 class Direction(NamedTuple):
-    """``P H^T`` of a measurement ``delta - h e``, and the variance ``H P H^T`` that is predicted for it."""
+    """Covariance ``P H^T`` of the state with a measurement ``delta - h e``, and its predicted variance ``H P H^T``."""
 
     position: Array
     drift: Array
     coloured: Array
     faults: Array
-    """``(E, ...)``."""
+    """Covariances of the receiver's errors with the measurement, ``(E, ...)``."""
     variance: Array
-    """m^2."""
+    """``H P H^T``, m^2."""
 
 
 def measured_direction(P: FaultCovariance, h: Array) -> Direction:
-    """Return the direction along which a measurement changes the estimate.
+    """Return ``P H^T`` and ``H P H^T`` of a measurement ``delta - h e``.
 
     Args:
-        P: of the prediction.
-        h: share of each error of the receiver in the measurement, ``(E, ...)``.
+        P: predicted covariance.
+        h: factor of each error of the receiver in the measurement, ``(E, ...)``.
     """
     ins, E = P.ins, range(P.faults.shape[0])
 
@@ -146,8 +146,8 @@ def update_fault(P: FaultCovariance, along: Direction, weight: Array) -> FaultCo
     """Return the covariance after an update, ``P - P H^T weight H P``.
 
     Args:
-        P: of the prediction.
-        along: of :func:`measured_direction`.
+        P: predicted covariance.
+        along: ``P H^T``, from :func:`measured_direction`.
         weight: ``1 / S`` of a Kalman filter, ``g - c nu^2`` of a Gaussian sum, zero without a measurement, 1/m^2.
     """
     xp = namespace(weight)
@@ -168,22 +168,22 @@ def update_fault(P: FaultCovariance, along: Direction, weight: Array) -> FaultCo
 
 
 class NoiseMixture(NamedTuple):
-    """Statistics of an innovation under noise that is a Gaussian sum."""
+    """Statistics of an innovation whose noise is a Gaussian sum."""
 
     log_density: Array
-    """Of the innovation on all axes, ``(...)``."""
+    """Log-density of the innovation on all axes, ``(...)``."""
     responsibilities: Array
     """``w_l`` of the L levels, which sum to one, ``(L, ...)``."""
     score: Array
-    """g, 1/m^2."""
+    """Score g, 1/m^2."""
     spread: Array
-    """c, 1/m^4."""
+    """Derivative c of the score, 1/m^4."""
 
 
 def weigh_levels(
     squares: Array, axes: int, variance: Array, levels: Array, probabilities: Array
 ) -> NoiseMixture:
-    """Weigh the levels of a measurement's noise by its innovation.
+    """Return responsibilities of the noise levels, log-density and score of an innovation.
 
     The terms are scaled by the exponential of the highest level, which is the largest of them, so that no innovation,
     however large, makes all of them vanish.

@@ -1,4 +1,4 @@
-r"""A nominal Walker constellation seen from a site: orbits, look angles, dilution of precision.
+r"""Nominal Walker constellation seen from a site: orbits, azimuth and elevation, dilution of precision.
 
 A satellite on a circular orbit of radius a, inclination i, with its ascending node at the right ascension W
 and argument of latitude ``u(t) = u_0 + n t``, ``n = sqrt(mu / a^3)``, stands in the inertial frame at
@@ -30,7 +30,7 @@ from .geodesy import EARTH_RATE, GRAVITATIONAL_PARAMETER, earth_fixed, east_nort
 PERIOD = 40544.0
 """Orbital period of GLONASS, s."""
 INCLINATION = numpy.deg2rad(64.8)
-"""Of every plane, rad."""
+"""Inclination of every plane, rad."""
 PLANES = 3
 SLOTS_PER_PLANE = 8
 PLANE_SHIFT = numpy.deg2rad(15.0)
@@ -38,22 +38,22 @@ PLANE_SHIFT = numpy.deg2rad(15.0)
 
 
 def orbit_radius() -> float:
-    """Return the radius of a circular orbit of the nominal period, ``(mu (P / 2 pi)^2)^(1/3)``, m."""
+    """Return the radius of the circular orbits, ``(mu (P / 2 pi)^2)^(1/3)``, m."""
     return (GRAVITATIONAL_PARAMETER * (PERIOD / (2.0 * numpy.pi)) ** 2) ** (1.0 / 3.0)
 
 
 def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]:
-    """Return the Earth-fixed positions and velocities of satellites.
+    """Return the Earth-fixed positions, m, and velocities, m/s, of satellites over time, ``(3, S, K)`` each.
 
     Args:
-        slots: S numbers from 1 to 24.
-        time: seconds since t = 0, ``(K,)``.
+        slots: S slot numbers from 1 to 24.
+        time: time since t = 0, s, ``(K,)``.
 
     Returns:
-        Position, m, and velocity relative to the turning Earth, m/s, each ``(3, S, K)``.
+        Position, m, and velocity relative to the rotating Earth, m/s, each ``(3, S, K)``.
 
     Raises:
-        ValueError: a slot is not one of the constellation.
+        ValueError: if a slot is not in the constellation.
     """
     for slot in slots:
         if slot not in range(1, PLANES * SLOTS_PER_PLANE + 1):
@@ -78,14 +78,14 @@ def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]
 def local_orbits(
     slots: Sequence[int], time: Array, latitude: float, longitude: float, height: float
 ) -> tuple[Array, Array]:
-    """Return the positions and velocities of satellites in the east-north-up frame of a site.
+    """Return positions and velocities of satellites over time in the east-north-up frame of a site.
 
     Args:
-        slots: S numbers from 1 to 24.
-        time: seconds since t = 0, ``(K,)``.
-        latitude: of the site, rad.
-        longitude: of the site, rad.
-        height: of the site, m.
+        slots: S slot numbers from 1 to 24.
+        time: time since t = 0, s, ``(K,)``.
+        latitude: latitude of the site, rad.
+        longitude: longitude of the site, rad.
+        height: height of the site, m.
 
     Returns:
         Position, m, and velocity, m/s, each ``(3, S, K)``.
@@ -98,7 +98,7 @@ def local_orbits(
 
 
 def look_angles(local: Array) -> tuple[Array, Array]:
-    """Return the azimuth from north over east, and elevation, rad, of local positions ``(3, ...)``."""
+    """Return azimuth (from north over east) and elevation, rad, of east-north-up positions ``(3, ...)``."""
     azimuth = numpy.arctan2(local[0], local[1]) % (2.0 * numpy.pi)
     return azimuth, numpy.arctan2(local[2], numpy.hypot(local[0], local[1]))
 
@@ -115,13 +115,13 @@ class DilutionOfPrecision(NamedTuple):
 
 
 def dilution_of_precision(unit_vectors: Array) -> DilutionOfPrecision:
-    """Return the dilutions of precision of one epoch.
+    """Return the dilutions of precision of a position and clock fix from S satellites.
 
     Args:
-        unit_vectors: from the user to S satellites, east-north-up, ``(3, S)``.
+        unit_vectors: unit vectors from the user to the satellites, east-north-up, ``(3, S)``.
 
     Raises:
-        ValueError: fewer than four satellites, or a geometry in which they do not determine the fix.
+        ValueError: for fewer than four satellites, or a geometry in which they do not determine the fix.
     """
     count = unit_vectors.shape[1]
     if count < 4:

@@ -1,7 +1,7 @@
-"""A track as arrays of all its scans, and recursions over it, some scans after the others.
+"""Backward recursions over the scans of a track, compiled for NumPy arrays.
 
-A long recursion on NumPy's arrays is compiled: one native call takes many scans, without going back to Python between
-them. What lies in memory beside the given track and the answer does not grow with the track.
+A long recursion on NumPy arrays is compiled: one native call processes many scans. Apart from the track and the result
+memory does not grow with the number of scans.
 
 Shapes: a time axis of K scans stands before the batch, ``(..., K, N)``.
 """
@@ -20,15 +20,17 @@ from .array_namespace import Array, map_nested, namespace
 
 Carried = TypeVar("Carried", bound=tuple[Any, ...])
 Step = Callable[..., Any]
-"""Function of the input of a scan and of the value carried from the next one, without a time axis."""
+"""Function from the input of a scan and the value carried from the next scan to the value of this scan, without a time
+axis.
+"""
 LEAST = 64
-"""Scans from which on a recursion is compiled; a shorter one ends before its step is traced."""
+"""Least number of scans for which a recursion is compiled; a shorter one takes less time than tracing."""
 TOGETHER = 8192
-"""Lanes times scans of a stretch: enough that a stretch costs little beside its numbers."""
+"""Number of lanes times scans in one stretch, large enough that the overhead of a stretch is small."""
 
 
 class Scans(Sequence[Any]):
-    """Scans of a track, each computed on first use.
+    """Sequence of the scans of a track, each as arrays ``(..., N)`` made on first use.
 
     Args:
         arrays: nested tuples of arrays ``(K, ..., N)``.
@@ -54,31 +56,31 @@ class Scans(Sequence[Any]):
 
 
 def stack_scans(scans: Sequence[Any]) -> Any:
-    """Put a time axis into nested tuples of arrays ``(..., N)``, one for each scan: ``(..., K, N)``."""
+    """Return nested arrays ``(..., N)`` of each scan stacked along a time axis, ``(..., K, N)``."""
     if isinstance(scans, Scans):
         return map_nested(lambda values: numpy.moveaxis(values, 0, -2), scans.arrays)
     return map_nested(lambda *arrays: namespace(arrays[0]).stack(arrays, axis=-2), *scans)
 
 
 def join(stretches: Sequence[Any]) -> Any:
-    """Put nested tuples of arrays ``(..., scans, N)`` one after the other."""
+    """Return nested arrays ``(..., scans, N)`` concatenated along the time axis."""
     return map_nested(lambda *arrays: namespace(arrays[0]).concat(arrays, axis=-2), *stretches)
 
 
 def take_scans(part: Any, scans: slice) -> Any:
-    """Return some scans of nested tuples of arrays ``(..., K, N)``."""
+    """Return a slice of the scans of nested arrays ``(..., K, N)``."""
     return map_nested(lambda values: values[..., scans, :], part)
 
 
 def over_time(function: Step, *parts: Any) -> Any:
-    """Call a function without a time axis once for all scans.
+    """Return the results of a function at all scans of a track, from one call with the scans in the batch axis.
 
     Args:
-        function: of nested tuples of arrays ``(..., N)``, each episode for itself.
-        *parts: the same with a time axis, ``(..., K, N)``.
+        function: function of nested arrays ``(..., N)`` that treats each episode separately.
+        *parts: its arguments at K scans, ``(..., K, N)``.
 
     Returns:
-        Its result, with a time axis.
+        Its results, with a time axis.
     """
     last = leaves(parts)[0].shape[-2:]
     found = function(*map_nested(_flatten_time, parts))
@@ -86,17 +88,17 @@ def over_time(function: Step, *parts: Any) -> Any:
 
 
 def by_stretches(function: Step, *parts: Any) -> Callable[[slice], Any]:
-    """Return what calls :func:`over_time` for some scans of ``parts`` alone."""
+    """Return a function that calls :func:`over_time` for a slice of the scans of ``parts``."""
     return lambda stretch: over_time(function, *(take_scans(part, stretch) for part in parts))
 
 
 def _flatten_time(values: Array) -> Array:
-    """Return the scans side by side in the batch."""
+    """Return arrays ``(..., K, N)`` as ``(..., K N)``."""
     return namespace(values).reshape(values, (*values.shape[:-2], values.shape[-2] * values.shape[-1]))
 
 
 def repeat(part: Any, last: tuple[int, int]) -> Any:
-    """Give nested tuples of arrays the last two axes, where they have axes of one."""
+    """Return nested arrays broadcast to these sizes of the last two axes, which may be one."""
     return map_nested(
         lambda values: namespace(values).broadcast_to(values, (*values.shape[:-2], *last)), part
     )
@@ -106,14 +108,16 @@ def repeat(part: Any, last: tuple[int, int]) -> Any:
 
 
 class Track(NamedTuple):
-    """Input of a recursion, a stretch of scans after the other."""
+    """Input of a backward recursion, made for a slice of the scans at a time."""
 
     scans: int
-    """K."""
+    """Number of scans K."""
     episodes: int
-    """N."""
+    """Number of episodes N."""
     given: Callable[[slice], Sequence[Any]]
-    """Nested tuples of arrays ``(..., scans, N)`` of some scans, of which the step is given one by one."""
+    """Function from a slice of the scans to their inputs, nested arrays ``(..., scans, N)``, the arguments of the
+    step.
+    """
 
 
 def backward(
@@ -123,13 +127,13 @@ def backward(
     lag: int | None = None,
     keep: Callable[[Carried], Any] = lambda carried: carried,
 ) -> Any:
-    """Run a recursion from the end of a track.
+    """Run a recursion from the last scan of a track to the first; return the carried values of all K scans.
 
     Args:
-        step: the same object in every call, since its compiled form is stored by it.
+        step: step of the recursion; the same object in every call, since its compiled form is cached.
         track: input of the first K - 1 scans.
-        nothing_later: value carried from some of K scans if no later measurement is used.
-        lag: how many later scans are used; default: all.
+        nothing_later: function from a slice of the K scans to the carried value without later measurements.
+        lag: number of later scans that each scan uses; default: all.
         keep: function that selects the stored part of the carried values, scan by scan.
 
     Returns:
@@ -165,7 +169,7 @@ def _scan(part: Any, place: int) -> Any:
 def _run_lagged(
     step: Step, track: Track, nothing_later: Callable[[slice], Carried], lag: int, scans: slice
 ) -> Carried:
-    """Return the carried values of some scans with a lag: all take one step together, ``lag`` times over."""
+    """Return the carried values of some scans with a fixed lag, by ``lag`` steps of all these scans together."""
     last = min(scans.stop - 1 + lag, track.scans)  # of the scans that these depend on
     given, carried = track.given(slice(scans.start, last)), nothing_later(slice(scans.start, last + 1))
     end = take_scans(carried, slice(-1, None))
@@ -175,7 +179,7 @@ def _run_lagged(
 
 
 def _run(step: Step, given: Sequence[Any], carried: Carried) -> Carried:
-    """Carry from scan to scan in Python."""
+    """Return the carried values of some scans, from a loop in Python."""
     found = []
     for k in reversed(range(leaves(tuple(given))[0].shape[-2])):
         carried = step(*(_scan(part, k) for part in given), carried)
@@ -188,7 +192,7 @@ _traced = functools.lru_cache(16)(lambda step: CompiledFunction(step, Graph(), u
 
 
 def _compiled(step: Step, carried: Any) -> CompiledFunction | None:
-    """Return the step on NumPy arrays, to be compiled; None for other arrays."""
+    """Return the compiled form of a step on NumPy arrays; None for other arrays."""
     if not AVAILABLE or any(type(values) is not numpy.ndarray for values in leaves(carried)):
         return None
     compiled: CompiledFunction = _traced(step)
@@ -196,7 +200,7 @@ def _compiled(step: Step, carried: Any) -> CompiledFunction | None:
 
 
 def _run_compiled(compiled: CompiledFunction, given: Sequence[Any], start: Carried) -> Carried:
-    """Carry from scan to scan in native code."""
+    """Return the carried values of some scans, from a loop in native code."""
     N = leaves(start)[0].shape[-1]
     width = round_up_lanes(N)
     special = compiled.specialise(*(_scan(part, 0) for part in given), start)
@@ -217,7 +221,7 @@ def _run_compiled(compiled: CompiledFunction, given: Sequence[Any], start: Carri
 
 
 def _rows_of_scans(values: Array, width: int) -> numpy.ndarray:
-    """Return the arrays ``(..., K, N)`` as ``(K, ..., width)``, the last episode again in the lanes beyond."""
+    """Return arrays ``(..., K, N)`` as ``(K, ..., width)``, with the last episode repeated in further lanes."""
     rows = numpy.moveaxis(values, -2, 0)
     found = numpy.empty((*rows.shape[:-1], width))
     found[..., : rows.shape[-1]], found[..., rows.shape[-1] :] = rows, rows[..., -1:]

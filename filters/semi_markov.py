@@ -1,4 +1,4 @@
-r"""Gaussian sums over hypotheses of kind and age: switching that depends on how long a mode has lasted.
+r"""Gaussian sums for semi-Markov switching: hypotheses by kind and age of a mode.
 
 A Markov chain forgets how long its mode has lasted, so that dwell times are geometric. In a semi-Markov chain they
 have any distribution f(d), d = 1, 2, ... steps, and a mode of age d ends with its **hazard**
@@ -33,42 +33,42 @@ from .array_namespace import Array, namespace
 from .ordered_sums import ordered_sum
 
 LEAST_PROBABILITY = 1e-30
-"""Of a hypothesis: it can always come back, and the weights of a merge never are zero by zero."""
+"""Least probability of a hypothesis, so that it can return and no weight is zero by zero."""
 
 
 class AgedHypotheses(NamedTuple):
-    """Hypotheses of one kind, by age."""
+    """Estimates and probabilities of H hypotheses of one kind, by the age of the mode."""
 
     mean: Array
-    """``(n, H, N)``."""
+    """Means, ``(n, H, N)``."""
     covariance: Array
-    """``(n, n, H, N)``."""
+    """Covariances, ``(n, n, H, N)``."""
     probability: Array
-    """``(H, N)``."""
+    """Probabilities, ``(H, N)``."""
 
     def take(self, ages: slice, state: int | None = None) -> "AgedHypotheses":
-        """Return those of some ages, with the first components of their states."""
+        """Return the hypotheses of a slice of ages, with the first ``state`` components of their states."""
         return AgedHypotheses(
             self.mean[:state, ages], self.covariance[:state, :state, ages], self.probability[ages]
         )
 
     def pack(self) -> "AgedHypotheses":
-        """Return them with the lower triangles of their covariances, as memory keeps them."""
+        """Return the hypotheses with their covariances packed as lower triangles."""
         return self._replace(covariance=packed_covariance.pack(self.covariance))
 
     def unpack(self) -> "AgedHypotheses":
-        """Undo :meth:`pack`."""
+        """Return the hypotheses with their packed covariances as full matrices."""
         return self._replace(covariance=packed_covariance.unpack(self.covariance, self.mean.shape[0]))
 
 
 def hazards(durations: Sequence[float], ages: int) -> list[float]:
-    """Return the probabilities (1) that a mode ends after each age of a table.
+    """Return a list of the probabilities (1) that a mode ends after each age of a table.
 
-    The last age stands for all beyond it: dwell times go on geometrically with the mean that they have from there.
+    The last age stands for all beyond it: dwell times are geometric from there, with the same mean.
 
     Args:
-        durations: f(1), f(2), ..., relative to each other, more than ``ages``.
-        ages: hypotheses of the table.
+        durations: relative probabilities f(1), f(2), ... of dwell times, more than ``ages``.
+        ages: number of ages in the table.
     """
     exact = [durations[d] / sum(durations[d:]) for d in range(ages - 1)]
     rest = durations[ages - 1 :]
@@ -76,7 +76,7 @@ def hazards(durations: Sequence[float], ages: int) -> list[float]:
 
 
 def join(tables: Sequence[AgedHypotheses]) -> AgedHypotheses:
-    """Return the hypotheses of several tables, whose states are of the same size, one table after another."""
+    """Return the hypotheses of several tables as one table; their states must have the same size."""
     xp = namespace(tables[0].mean)
     return AgedHypotheses(
         xp.concat([table.mean for table in tables], axis=1),
@@ -86,41 +86,41 @@ def join(tables: Sequence[AgedHypotheses]) -> AgedHypotheses:
 
 
 def merge(hypotheses: AgedHypotheses) -> AgedHypotheses:
-    """Return one hypothesis with the probability, mean and covariance of several together."""
+    """Return one hypothesis with the total probability, mean and covariance of several."""
     total = ordered_sum(hypotheses.probability)
     mean, covariance = imm.combine(hypotheses.mean, hypotheses.covariance, hypotheses.probability / total)
     return AgedHypotheses(mean[:, None], covariance[:, :, None], total[None])
 
 
-def grow_older(table: AgedHypotheses, begun: AgedHypotheses) -> AgedHypotheses:
-    """Return the table one step later: each hypothesis is of the next age, and the last two together are of the last.
+def grow_older(table: AgedHypotheses, new: AgedHypotheses) -> AgedHypotheses:
+    """Return the table one step later: every age increases by one, and the last two are merged.
 
     Args:
-        table: before.
-        begun: the hypothesis of the first age.
+        table: table before.
+        new: new hypothesis of the first age.
     """
     if table.probability.shape[0] == 1:
-        return merge(join([begun, table]))
-    return join([begun, table.take(slice(None, -2)), merge(table.take(slice(-2, None)))])
+        return merge(join([new, table]))
+    return join([new, table.take(slice(None, -2)), merge(table.take(slice(-2, None)))])
 
 
 class Mode(NamedTuple):
-    """A kind of mode and its hypotheses."""
+    """Hypotheses of one kind of mode, and the probabilities with which it begins and ends."""
 
     table: AgedHypotheses
     hazard: Array
-    """(1), ``(H, 1)``."""
+    """Probability (1) of an end after each age, ``(H, 1)``."""
     begin: float
-    """Probability (4) that one begins before a step."""
+    """Probability (4) that a mode begins before a step."""
     augment: Callable[[Array, Array], tuple[Array, Array]]
-    """From mean ``(4, N)`` and covariance of the state at rest to those of the mode that begins."""
+    """Function from mean ``(4, N)`` and covariance of the state at rest to those of a mode that begins."""
 
 
 def switch(rest: AgedHypotheses, modes: Sequence[Mode]) -> tuple[AgedHypotheses, list[AgedHypotheses]]:
-    """End modes, begin new ones and increase their ages, equations (2) to (5).
+    """Return the tables of rest and of all modes after possible begins and ends of modes, equations (2) to (5).
 
     Args:
-        rest: hypotheses of what the target does between modes.
+        rest: hypotheses of the motion between modes.
         modes: kinds of modes; the first components of their states are those at rest.
 
     Returns:
@@ -151,6 +151,6 @@ def switch(rest: AgedHypotheses, modes: Sequence[Mode]) -> tuple[AgedHypotheses,
 
 
 def _keep_possible(table: AgedHypotheses) -> AgedHypotheses:
-    """Give every hypothesis the least probability, whether a measurement or the hazard has ruled it out."""
+    """Return the hypotheses with probabilities of at least ``LEAST_PROBABILITY``."""
     probability = namespace(table.mean).clip(table.probability, LEAST_PROBABILITY, None)
     return table._replace(probability=probability)

@@ -1,4 +1,4 @@
-r"""Singer's model: an acceleration that forgets itself exponentially.
+r"""Singer's model: an exponentially correlated acceleration.
 
 The state (position, velocity, acceleration) of one coordinate, in continuous time and over an interval T:
 
@@ -23,9 +23,9 @@ import math
 import numpy
 
 _SERIES_TERMS = 18
-"""1 / 20! is below the rounding of 1 / 2."""
+"""Number of terms of the series: 1 / 20! is below the rounding of 1 / 2."""
 _NODES, _WEIGHTS = numpy.polynomial.legendre.leggauss(16)
-"""Exact to rounding for the integrand of Q up to alpha T = 1."""
+"""Quadrature points and weights, exact to rounding for the integrand of Q up to alpha T = 1."""
 
 
 def _check(alpha: float, T: float) -> None:
@@ -36,8 +36,9 @@ def _check(alpha: float, T: float) -> None:
 
 
 def acceleration_response(alpha: float, T: float) -> numpy.ndarray:
-    """Return the position, velocity and acceleration after T of a unit acceleration at 0: last column of Phi,
-    ``(3,)``.
+    """Return position, velocity and acceleration after T of a unit acceleration at 0, ``(3,)``.
+
+    It is the last column of Phi.
 
     Args:
         alpha: inverse correlation time of the acceleration, 1/s; 0 is a constant acceleration.
@@ -64,7 +65,7 @@ def transition(alpha: float, T: float) -> numpy.ndarray:
         T: interval, s.
 
     Raises:
-        ValueError: an argument is negative or not finite.
+        ValueError: if an argument is negative or not finite.
     """
     response = acceleration_response(alpha, T)
     Phi = numpy.array([[1.0, T, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]], dtype=response.dtype)
@@ -81,7 +82,7 @@ def process_noise(alpha: float, sigma: float, T: float) -> numpy.ndarray:
         T: interval, s.
 
     Raises:
-        ValueError: an argument is negative or not finite.
+        ValueError: if an argument is negative or not finite.
     """
     _check(alpha, T)
     if not (math.isfinite(sigma) and sigma >= 0.0):
@@ -110,7 +111,7 @@ def acceleration_sigma(maximum: float, maximum_probability: float, zero_probabil
     uniform between otherwise: ``sigma^2 = maximum^2 (1 + 4 P_max - P_0) / 3``.
 
     Raises:
-        ValueError: the probabilities are negative or ``2 P_max + P_0`` exceeds 1.
+        ValueError: if a probability is negative or ``2 P_max + P_0`` exceeds 1.
     """
     p, p0 = maximum_probability, zero_probability
     if p < 0.0 or p0 < 0.0 or 2.0 * p + p0 > 1.0:

@@ -1,4 +1,4 @@
-"""Products, factors and quadratic forms of many small matrices, batch on the last axes.
+"""Products, factors and solutions of many small matrices, batch on the last axes.
 
 A matrix of 2 to 4 rows is too small for one BLAS call each; written as elementwise work over a contiguous
 batch axis the same products run 4 to 10 times faster, and their rounding does not depend on the batch width.
@@ -8,14 +8,14 @@ from .array_namespace import Array, namespace
 
 
 def product(A: Array, B: Array) -> Array:
-    """Multiply matrices: ``C[i, k] = sum_j A[i, j] B[j, k]``.
+    """Return the matrix product ``C[i, k] = sum_j A[i, j] B[j, k]`` for a batch on the last axes.
 
     Args:
-        A: ``(n, m, ...)``.
-        B: ``(m, p, ...)``, with trailing axes that broadcast against those of ``A``.
+        A: matrices, ``(n, m, ...)``.
+        B: matrices, ``(m, p, ...)``, with trailing axes that broadcast against those of ``A``.
 
     Returns:
-        ``(n, p, ...)``.
+        Products, ``(n, p, ...)``.
     """
     total = A[:, 0, None] * B[0]
     for j in range(1, B.shape[0]):
@@ -24,14 +24,11 @@ def product(A: Array, B: Array) -> Array:
 
 
 def apply(A: Array, x: Array) -> Array:
-    """Multiply vectors by matrices: ``y[i] = sum_j A[i, j] x[j]``.
+    """Return the vectors ``y[i] = sum_j A[i, j] x[j]``, ``(n, ...)``, for a batch of matrices on the last axes.
 
     Args:
-        A: ``(n, m, ...)``.
-        x: ``(m, ...)``, with trailing axes that broadcast against those of ``A``.
-
-    Returns:
-        ``(n, ...)``.
+        A: matrices, ``(n, m, ...)``.
+        x: vectors, ``(m, ...)``, with trailing axes that broadcast against those of ``A``.
     """
     total = A[:, 0] * x[0]
     for j in range(1, x.shape[0]):
@@ -40,25 +37,23 @@ def apply(A: Array, x: Array) -> Array:
 
 
 def transpose(A: Array) -> Array:
-    """Swap the two leading axes."""
+    """Return the array with its two first axes swapped."""
     return namespace(A).moveaxis(A, 0, 1)
 
 
 def mirror_lower(A: Array) -> Array:
-    """Return the symmetric matrix, ``(n, n, ...)``, of the lower triangle of another: rounding makes products
-    differ in both.
-    """
+    """Return the symmetric matrix ``(n, n, ...)`` that has the lower triangle of another."""
     xp, rows = namespace(A), range(A.shape[0])
     return xp.stack([xp.stack([A[max(i, j), min(i, j)] for j in rows]) for i in rows])
 
 
 def outer(x: Array, y: Array) -> Array:
-    """Return ``x y^T``, ``(n, m, ...)``, of vectors ``(n, ...)`` and ``(m, ...)``."""
+    """Return the outer product ``x y^T``, ``(n, m, ...)``, of vectors ``(n, ...)`` and ``(m, ...)``."""
     return x[:, None] * y[None]
 
 
 def cholesky(A: Array) -> list[list[Array]]:
-    """Return the factor ``A = L L^T``.
+    """Return the rows of the lower triangular Cholesky factor L, ``A = L L^T``.
 
     Args:
         A: symmetric positive definite, ``(n, n, ...)``; its lower triangle is read.
@@ -79,7 +74,7 @@ def cholesky(A: Array) -> list[list[Array]]:
 
 
 def solve_lower(L: list[list[Array]], b: Array) -> list[Array]:
-    """Solve ``L y = b`` for the factor of :func:`cholesky` and ``b`` of shape ``(n, ...)``, row by row."""
+    """Return y with ``L y = b``, row by row, for the rows of L from :func:`cholesky` and b ``(n, ...)``."""
     y: list[Array] = []
     for i, row in enumerate(L):
         entry = b[i]
@@ -90,7 +85,7 @@ def solve_lower(L: list[list[Array]], b: Array) -> list[Array]:
 
 
 def solve_definite(A: Array, B: Array) -> Array:
-    """Solve ``A X = B`` for symmetric positive definite ``A``, ``(n, n, ...)``, and ``B`` of shape ``(n, m, ...)``."""
+    """Return X with ``A X = B`` for symmetric positive definite A ``(n, n, ...)`` and B ``(n, m, ...)``."""
     L = cholesky(A)
     y = solve_lower(L, B)
     n = len(L)

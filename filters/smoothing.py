@@ -1,4 +1,4 @@
-r"""Smoothing: estimates that use later measurements too, from the stored steps of a filter.
+r"""Smoothing: estimates with later measurements, computed backward from the stored steps of a filter.
 
 **One model.** Rauch, Tung and Striebel, AIAA Journal 3 (1965), 1445-1450; Särkkä, Bayesian Filtering and Smoothing
 (2013), theorem 8.2, equations (8.6). With x, P after the update at a scan, x' = F x + b and P' = F P F^T + Q before
@@ -48,19 +48,19 @@ from .small_matrices import apply, product, transpose
 
 
 class Gaussian(NamedTuple):
-    """Mean and covariance."""
+    """Mean and covariance of a Gaussian distribution."""
 
     mean: Array
-    """``(n, ...)``."""
+    """Mean, ``(n, ...)``."""
     covariance: Array
-    """``(n, n, ...)``."""
+    """Covariance, ``(n, n, ...)``."""
 
 
 class Motion(NamedTuple):
-    """Motion of the state from a scan to the next one."""
+    """Linearised motion of the state from one scan to the next."""
 
     F: Array
-    """Transition matrix, or the Jacobian at the estimate, ``(n, n, ...)``."""
+    """Transition matrix or Jacobian at the estimate, ``(n, n, ...)``."""
     Q: Array
     """Covariance of the process noise, ``(n, n, ...)``."""
     predicted: Array
@@ -71,12 +71,12 @@ class Motion(NamedTuple):
 
 
 def rauch_tung_striebel_step(filtered: Gaussian, motion: Motion, later: Gaussian) -> Gaussian:
-    """Smooth one scan.
+    """Return the smoothed estimate of one scan, from the filtered one and the smoothed one of the next scan.
 
     Args:
-        filtered: after the update at this scan, ``(n, N)`` and ``(n, n, N)``.
-        motion: from it to the next one.
-        later: smoothed at the next one; the filtered estimate there smooths with one more measurement.
+        filtered: estimate after the update at this scan, ``(n, N)`` and ``(n, n, N)``.
+        motion: motion from this scan to the next.
+        later: smoothed estimate at the next scan; the filtered one there smooths with one more measurement.
     """
     F, Q = motion.F, motion.Q
     FP = product(F, filtered.covariance)
@@ -91,14 +91,14 @@ def rauch_tung_striebel_step(filtered: Gaussian, motion: Motion, later: Gaussian
 def smooth(
     filtered: Gaussian, motion: Motion | Callable[[slice], Motion], lag: int | None = None
 ) -> Gaussian:
-    """Smooth a track of one Kalman filter, or extended Kalman filter.
+    """Return the smoothed estimates of a track, from those of a Kalman or extended Kalman filter.
 
     Args:
-        filtered: after the update at each of K scans, ``(n, K, N)`` and ``(n, n, K, N)``.
-        motion: from each of the first K - 1 scans to the next one, ``(n, n, K - 1, N)`` and ``(n, K - 1, N)``; or a
-            function that makes that of some scans, so that not all lie in memory together.
-        lag: how many later scans each estimate uses, fewer where the track ends before; default: all of them.
-            Zero gives the filter's estimates.
+        filtered: estimates after the update at each of K scans, ``(n, K, N)`` and ``(n, n, K, N)``.
+        motion: motion from each of the first K - 1 scans to the next, ``(n, n, K - 1, N)`` and ``(n, K - 1, N)``; or a
+            function that returns that of a slice of scans, to save memory.
+        lag: number of later scans that each estimate uses, fewer at the end of the track; default: all. Zero gives the
+            filter's estimates.
 
     Returns:
         The smoothed estimates, in the same shapes.
@@ -113,10 +113,10 @@ def smooth(
 
 
 def _track(filtered: Any, motion: Any) -> Track:
-    """Return the input of a backward recursion.
+    """Return the input of a backward recursion, from filtered estimates and motion.
 
-    ``motion`` is that of all scans, or a function of some scans; an axis of one stands for equal values at all scans or
-    in the whole batch.
+    ``motion`` is that of all scans, or a function of a slice of scans; an axis of one stands for equal values at all
+    scans or in the whole batch.
     """
     K, N = filtered.mean.shape[-2:]
     whole = None if callable(motion) else repeat(motion, (K - 1, N))
@@ -133,60 +133,60 @@ def _track(filtered: Any, motion: Any) -> Track:
 
 
 class GaussianMixture(NamedTuple):
-    """Estimates of M models, with the probabilities of their modes."""
+    """Estimates and probabilities of M modes."""
 
     mean: Array
-    """``(n, M, ...)``."""
+    """Means, ``(n, M, ...)``."""
     covariance: Array
-    """``(n, n, M, ...)``."""
+    """Covariances, ``(n, n, M, ...)``."""
     probabilities: Array
-    """``(M, ...)``."""
+    """Mode probabilities, ``(M, ...)``."""
 
 
 class Arrival(NamedTuple):
-    """Motion of M models from a scan to the next one, and the measurement there."""
+    """Motion of M models from one scan to the next, and the measurement there."""
 
     motion: Motion
-    """Of each model, ``(n, n, M, ...)`` and ``(n, M, ...)``, predicted from its mixed mean as the IMM does."""
+    """Motion of each model, ``(n, n, M, ...)`` and ``(n, M, ...)``, predicted from its mixed mean as in the IMM."""
     H: Array
     """Measurement matrix, ``(m, n, ...)``."""
     precision: Array
-    """Inverse covariance of the measurement noise, zero where nothing was received, ``(m, m, ...)``."""
+    """Inverse covariance of the measurement noise, ``(m, m, ...)``; zero without a measurement."""
     position: Array
-    """Measurement, ``(m, ...)``; anything finite where nothing was received."""
+    """Measurement, ``(m, ...)``; any finite number without one."""
 
 
 class QuadraticLikelihood(NamedTuple):
-    """Logarithm of a likelihood, ``value + gradient^T d - d^T curvature d / 2`` with ``d = x - centre``."""
+    """Log-likelihood as a quadratic form, ``value + gradient^T d - d^T curvature d / 2`` with ``d = x - centre``."""
 
     centre: Array
-    """``(n, ...)``."""
+    """Centre of the expansion, ``(n, ...)``."""
     value: Array
-    """``(...)``."""
+    """Log-likelihood at the centre, ``(...)``."""
     gradient: Array
-    """``(n, ...)``."""
+    """Gradient at the centre, ``(n, ...)``."""
     curvature: Array
-    """Not negative, ``(n, n, ...)``."""
+    """Negative second derivative, positive semidefinite, ``(n, n, ...)``."""
 
 
 class SmoothedBank(NamedTuple):
-    """Smoothed estimates, and the likelihood of everything later that they have used."""
+    """Smoothed estimates of all modes at a scan, and the likelihood of all later measurements."""
 
     bank: GaussianMixture
     later: QuadraticLikelihood
-    """Of each mode, about the filtered mean."""
+    """Likelihood of the later measurements given each mode, about the filtered mean."""
 
 
 def imm_step(
     filtered: GaussianMixture, arrival: Arrival, next_scan: SmoothedBank, transition: Array
 ) -> SmoothedBank:
-    """Smooth one scan of an IMM.
+    """Return the smoothed estimates of an IMM at one scan, from its filtered and the next scan's smoothed ones.
 
     Args:
-        filtered: after the update at this scan.
-        arrival: at the next one.
-        next_scan: smoothed there.
-        transition: of the modes, row = from, column = to, ``(M, M)``.
+        filtered: estimates after the update at this scan.
+        arrival: motion to the next scan, and measurement there.
+        next_scan: smoothed estimates at the next scan.
+        transition: transition matrix of the modes, row = from, column = to, ``(M, M)``.
     """
     xp = namespace(filtered.mean)
     prediction = imm.predict_mode_probabilities(transition, filtered.probabilities)
@@ -216,13 +216,15 @@ def smooth_imm(
     lag: int | None = None,
     keep: Callable[[GaussianMixture], Any] = lambda bank: bank,
 ) -> Any:
-    """Smooth a track of an IMM; :func:`.imm.combine` makes one estimate of each scan.
+    """Return the smoothed estimates of each mode of a track, from those of an IMM.
+
+    :func:`.imm.combine` merges those of each scan.
 
     Args:
-        filtered: after the update at each of K scans, ``(n, M, K, N)``, ``(n, n, M, K, N)`` and ``(M, K, N)``.
-        arrival: at all scans but the first, K - 1 of them before the batch; or a function that makes some of them.
-        transition: of the modes, row = from, column = to, ``(M, M)``.
-        lag: as of :func:`smooth`.
+        filtered: estimates after the update at K scans, ``(n, M, K, N)``, ``(n, n, M, K, N)`` and ``(M, K, N)``.
+        arrival: motion to and measurement at the K - 1 later scans; or a function that returns those of a slice.
+        transition: transition matrix of the modes, row = from, column = to, ``(M, M)``.
+        lag: number of later scans that each estimate uses; default: all.
         keep: function that selects the stored part of the smoothed estimates of some scans; default: all of them.
 
     Returns:
@@ -250,7 +252,7 @@ def smooth_imm(
 
 
 def _imm_step_of(transition: Array) -> Step:
-    """Return the step of an IMM with a transition matrix; one object for equal numbers, so that it is compiled once."""
+    """Return the step of an IMM smoother with a transition matrix; equal matrices give the same object."""
     if isinstance(transition, numpy.ndarray):
         return _imm_step_of_numbers(transition.tobytes(), len(transition))
     return functools.partial(imm_step, transition=transition)
@@ -265,7 +267,7 @@ def _imm_step_of_numbers(numbers: bytes, modes: int) -> Step:
 
 
 def _expand_about(likelihood: QuadraticLikelihood, centre: Array) -> QuadraticLikelihood:
-    """Write a likelihood about another centre."""
+    """Return the same likelihood expanded about another centre."""
     step = centre - likelihood.centre
     bent = apply(likelihood.curvature, step)
     value = likelihood.value + _dot(likelihood.gradient - 0.5 * bent, step)
@@ -273,7 +275,7 @@ def _expand_about(likelihood: QuadraticLikelihood, centre: Array) -> QuadraticLi
 
 
 def _add_measurement(later: QuadraticLikelihood, arrival: Arrival) -> QuadraticLikelihood:
-    """Add the measurement of a scan to the likelihood of the later ones, about the predicted means."""
+    """Return the likelihood of a scan's measurement and the later ones, about the predicted means."""
     likelihood = _expand_about(later, arrival.motion.predicted)
     H, precision = (_insert_axis(matrix, -2) for matrix in (arrival.H, arrival.precision))
     weighted = product(transpose(H), precision)
@@ -286,9 +288,7 @@ def _add_measurement(later: QuadraticLikelihood, arrival: Arrival) -> QuadraticL
 
 
 def _pull_back(likelihood: QuadraticLikelihood, motion: Motion, centre: Array) -> QuadraticLikelihood:
-    """Integrate over the process noise: the likelihood of a state one scan before, about ``centre``, from which the
-    centre of the given one is predicted.
-    """
+    """Return the likelihood as a function of the state one scan before, without the process noise, about ``centre``."""
     root = semidefinite_root(motion.Q)
     bent = product(likelihood.curvature, root)
     inner = semidefinite_root(_identity(centre) + product(transpose(root), bent))
@@ -306,11 +306,7 @@ def _pull_back(likelihood: QuadraticLikelihood, motion: Motion, centre: Array) -
 
 
 def _posterior(likelihood: QuadraticLikelihood, root: Array) -> tuple[Gaussian, Array]:
-    """Apply Bayes' rule to ``x = centre + root e`` with ``e ~ N(0, I)``.
-
-    Returns:
-        Mean and covariance of e, and the logarithm of the evidence.
-    """
+    """Return the posterior mean and covariance of e ~ N(0, I), ``x = centre + root e``, and the log evidence."""
     back = transpose(root)
     inner = semidefinite_root(_identity(likelihood.centre) + _congruence(back, likelihood.curvature))
     pull = apply(back, likelihood.gradient)
@@ -323,8 +319,7 @@ def _posterior(likelihood: QuadraticLikelihood, root: Array) -> tuple[Gaussian, 
 def _likelihood_from_moments(
     centre: Array, root: Array, error: Gaussian, log_evidence: Array
 ) -> QuadraticLikelihood:
-    """Return the likelihood that leads from ``e ~ N(0, I)`` to an error with this mean and covariance, ``x = centre +
-    root e``.
+    """Return the likelihood with which ``e ~ N(0, I)`` has this posterior; ``x = centre + root e``.
 
     In a direction in which the variance is not below one it carries no information.
     """
@@ -349,12 +344,13 @@ def _likelihood_from_moments(
 # --- matrices
 
 SWEEPS = 7
-"""Of Jacobi's rotations: every one squares the error, and six leave rounding of matrices up to eight rows."""
+"""Number of sweeps of Jacobi's rotations: each squares the error, and six reach rounding for up to eight rows."""
 
 
 def eigenvectors(A: Array) -> tuple[Array, Array]:
-    """Return the eigenvalues ``(n, ...)`` and eigenvectors, the columns of ``(n, n, ...)``, of symmetric matrices:
-    of LAPACK, or in a trace by Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
+    """Return eigenvalues ``(n, ...)`` and eigenvectors, columns of ``(n, n, ...)``, of symmetric matrices.
+
+    By LAPACK, or in a trace by Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
     """
     xp, n = namespace(A), A.shape[0]
     if hasattr(xp, "linalg"):
@@ -371,7 +367,7 @@ def eigenvectors(A: Array) -> tuple[Array, Array]:
 
 
 def _rotate(rows: list[list[Array]], columns: list[list[Array]], p: int, q: int) -> None:
-    """Rotate entry (p, q) of a symmetric matrix away, and its eigenvectors with it."""
+    """Apply a Jacobi rotation in place that makes entry (p, q) of a symmetric matrix zero, also to its eigenvectors."""
     xp, between = namespace(rows[p][q]), rows[p][q]
     there = between != 0.0
     ratio = (rows[q][q] - rows[p][p]) / xp.where(there, 2.0 * between, 1.0)
@@ -392,10 +388,10 @@ def _rotate(rows: list[list[Array]], columns: list[list[Array]], p: int, q: int)
 
 
 def semidefinite_root(A: Array) -> Array:
-    """Return the lower triangular L with ``A = L L^T``; where a pivot is rounding, its column is zero.
+    """Return the lower triangular L with ``A = L L^T`` of a semidefinite matrix; columns with a zero pivot are zero.
 
     Args:
-        A: symmetric and not negative, ``(n, n, ...)``.
+        A: symmetric positive semidefinite matrix, ``(n, n, ...)``; a pivot within rounding counts as zero.
     """
     xp = namespace(A)
     n = A.shape[0]
@@ -413,7 +409,7 @@ def semidefinite_root(A: Array) -> Array:
 
 
 def _solve_lower(L: Array, b: Array) -> Array:
-    """Solve ``L y = b`` by rows; zero where the pivot is."""
+    """Return y with ``L y = b``; zero where the pivot is zero."""
     xp = namespace(b)
     y: list[Array] = []
     for i in range(L.shape[0]):
@@ -425,7 +421,7 @@ def _solve_lower(L: Array, b: Array) -> Array:
 
 
 def _solve_upper(L: Array, b: Array) -> Array:
-    """Solve ``L^T x = b`` by rows; zero where the pivot is."""
+    """Return x with ``L^T x = b``; zero where the pivot is zero."""
     n = L.shape[0]
     x: list[Array] = [None] * n
     for i in reversed(range(n)):
@@ -443,7 +439,7 @@ def _divide(entry: Array, pivot: Array) -> Array:
 
 
 def _solve(L: Array, b: Array) -> Array:
-    """Solve ``L L^T x = b`` for vectors ``(n, ...)`` or matrices ``(n, p, ...)``."""
+    """Return x with ``L L^T x = b``, for vectors ``(n, ...)`` or matrices ``(n, p, ...)``."""
     return _solve_upper(L, _solve_lower(L, b))
 
 
@@ -459,7 +455,6 @@ def _congruence(A: Array, P: Array) -> Array:
 
 
 def _symmetrize(P: Array) -> Array:
-    """Remove the asymmetry of rounding."""
     return 0.5 * (P + transpose(P))
 
 
@@ -475,5 +470,5 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _insert_axis(values: Array, axis: int) -> Array:
-    """Put an axis of one before the batch."""
+    """Return the array with an axis of one inserted."""
     return namespace(values).expand_dims(values, axis=axis)

@@ -1,7 +1,9 @@
-"""Solutions of matrix equations with the numbers of the shipped environments, so that none of them starts with SciPy:
-to import ``scipy.linalg`` takes a quarter of a second, longer than all else before a first step.
+"""Stored solutions of matrix equations for the shipped environments, so that they start without SciPy.
 
-``stored_solutions.json`` holds them to the last bit, with what they are solutions of. Other numbers are solved anew.
+To import ``scipy.linalg`` takes a quarter of a second, longer than all else before a first step.
+
+``stored_solutions.json`` contains them to the last bit, with the equations' arguments. For other arguments the
+equations are solved.
 """
 
 import functools
@@ -16,11 +18,11 @@ Solve = TypeVar("Solve", bound=Callable[..., Any])
 FILE = Path(__file__).with_suffix(".json")
 
 
-def stored(solve: Solve) -> Solve:
-    """Decorate a function to read its result from the file of stored solutions, where present.
+def use_stored_solution(solve: Solve) -> Solve:
+    """Decorate a function that solves an equation, so that it returns the stored solution if there is one.
 
     Args:
-        solve: of words, numbers and matrices; it returns a matrix or a tuple of them.
+        solve: function of strings, numbers and matrices that returns a matrix or a tuple of matrices.
     """
 
     @functools.wraps(solve)
@@ -35,7 +37,7 @@ def stored(solve: Solve) -> Solve:
 
 
 def key_of(name: str, *arguments: Any) -> str:
-    """Return the text of a function and its arguments, every digit of them."""
+    """Return the key of a stored solution: function name and arguments, to all digits, as text."""
     return json.dumps(
         [name, *(a if isinstance(a, str) else numpy.asarray(a, float).tolist() for a in arguments)]
     )

@@ -1,4 +1,4 @@
-r"""The scaled unscented transform: mean and covariance of a function of a Gaussian variable.
+r"""Scaled unscented transform: mean and covariance of a function of a Gaussian variable.
 
 2n + 1 sigma points carry mean and covariance through the function, which is never differentiated:
 
@@ -18,7 +18,7 @@ so P_y stays positive semidefinite for every alpha up to sqrt(beta).
 Shapes: means ``(n, ...)``, covariances ``(n, n, ...)``, batch last.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from .array_namespace import Array, namespace
@@ -27,12 +27,12 @@ from .small_matrices import apply, cholesky, outer
 
 
 class Spread(NamedTuple):
-    """Parameters of the transform."""
+    """Parameters of the unscented transform."""
 
     alpha: float | Array = 1.0
-    """How far the points lie from the mean; a number, or one of each lane, ``(...)``."""
+    """Scale of the distance of the points from the mean; a number, or ``(...)``."""
     beta: float = 2.0
-    """Knowledge of the fourth moments; 2 is best for a Gaussian variable."""
+    """Parameter of the fourth moments; 2 is best for a Gaussian variable."""
     kappa: float = 0.0
     """Second scaling; 3 - n is Julier's first choice."""
 
@@ -41,12 +41,11 @@ GAUSSIAN = Spread()
 
 
 def sigma_points(mean: Array, covariance: Array, spread: Spread = GAUSSIAN) -> Array:
-    """Return the sigma points in order: the mean, then the columns of the root added, then subtracted, ``(n, 2n + 1,
-    ...)``.
+    """Return the sigma points, ``(n, 2n + 1, ...)``: mean, mean plus and mean minus the columns of the root.
 
     Args:
-        mean: ``(n, ...)``.
-        covariance: ``(n, n, ...)``, positive definite.
+        mean: mean, ``(n, ...)``.
+        covariance: covariance, ``(n, n, ...)``, positive definite.
         spread: parameters of the transform.
     """
     xp = namespace(mean)
@@ -60,7 +59,7 @@ def sigma_points(mean: Array, covariance: Array, spread: Spread = GAUSSIAN) -> A
 
 
 def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[Any], list[Any]]:
-    """Return the weights of the points for the mean and for the covariance, 2n + 1 each.
+    """Return two lists of the weights of the 2n + 1 sigma points: for the mean and for the covariance.
 
     Args:
         n: dimension of the variable.
@@ -72,16 +71,16 @@ def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[Any], list[Any]]:
     return [first, *others], [first + 1.0 - spread.alpha**2 + spread.beta, *others]
 
 
-def narrow(jacobian: Array, covariance: Array, limit: float) -> Spread:
-    """Return a spread whose sigma points move a function of the mean by no more than a limit, to first order.
+def limit_spread(jacobian: Array, covariance: Array, limit: float) -> Spread:
+    """Return parameters whose sigma points move a function by no more than a limit, to first order.
 
     The columns of the scaled root of P move a row H of the function by at most alpha sqrt(n H P H^T). Angles are
     measured up to whole turns, so points that move one by half a turn or more have no difference of known sign.
 
     Args:
         jacobian: rows H of the function at the mean, ``(m, n, ...)``.
-        covariance: ``(n, n, ...)``.
-        limit: greatest difference of a row.
+        covariance: covariance, ``(n, n, ...)``.
+        limit: largest change of each row of the function.
     """
     n, xp = covariance.shape[0], namespace(covariance)
     variances = [
@@ -96,19 +95,28 @@ def narrow(jacobian: Array, covariance: Array, limit: float) -> Spread:
 def transform(
     mean: Array, covariance: Array, function: Callable[[Array], Array], spread: Spread = GAUSSIAN
 ) -> tuple[Array, Array]:
-    """Return the mean and covariance of a function of a Gaussian variable.
+    """Return mean ``(m, ...)`` and covariance ``(m, m, ...)`` of a function of a Gaussian variable.
 
     Args:
-        mean: ``(n, ...)``.
-        covariance: ``(n, n, ...)``, positive definite.
-        function: from points ``(n, 2n + 1, ...)`` to ``(m, 2n + 1, ...)``.
+        mean: mean, ``(n, ...)``.
+        covariance: covariance, ``(n, n, ...)``, positive definite.
+        function: function from points ``(n, 2n + 1, ...)`` to ``(m, 2n + 1, ...)``.
         spread: parameters of the transform.
+    """
+    return combine(function(sigma_points(mean, covariance, spread)), *weights(mean.shape[0], spread))
+
+
+def combine(points: Array, for_mean: Sequence[Any], for_covariance: Sequence[Any]) -> tuple[Array, Array]:
+    """Return the weighted mean and covariance of points.
+
+    Args:
+        points: ``(m, p, ...)``, that of the mean first.
+        for_mean: weights of the points for the mean, which sum to one, p numbers or arrays ``(...)``.
+        for_covariance: those for the covariance.
 
     Returns:
         ``(m, ...)`` and ``(m, m, ...)``.
     """
-    points = function(sigma_points(mean, covariance, spread))
-    for_mean, for_covariance = weights(mean.shape[0], spread)
     first = points[:, 0]
     # The weights sum to one, and with a small alpha they are large: differences lose fewer digits than points.
     shift = ordered_sum(w * (points[:, i] - first) for i, w in enumerate(for_mean) if i)

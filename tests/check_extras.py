@@ -168,16 +168,16 @@ def run(programs: Path, need: Need, extra: str, present: bool) -> str:
             [programs / program, *words], cwd=folder, capture_output=True, text=True, check=False
         )
         written = not need.written or any(Path(folder).glob(need.written))
-    said = ended.stderr.strip()
+    message = ended.stderr.strip()
     if present:
-        return "" if ended.returncode == 0 and written else f"exit {ended.returncode}: {said[-500:]}"
+        return "" if ended.returncode == 0 and written else f"exit {ended.returncode}: {message[-500:]}"
     if need.written:  # an addition, which the command does without
-        return "" if ended.returncode == 0 and not written else f"exit {ended.returncode}: {said[-500:]}"
+        return "" if ended.returncode == 0 and not written else f"exit {ended.returncode}: {message[-500:]}"
     sentence = need.refusal or rf"filtergym\[([a-z]+,)*{extra}\]"
-    last = said.rpartition("\n")[2]
-    if ended.returncode and re.search(sentence, last) and (need.refusal or last == said):
+    last = message.rpartition("\n")[2]
+    if ended.returncode and re.search(sentence, last) and (need.refusal or last == message):
         return ""
-    return f"does not refuse in one sentence with {sentence}: exit {ended.returncode}, {said[-500:]!r}"
+    return f"does not refuse in one sentence with {sentence}: exit {ended.returncode}, {message[-500:]!r}"
 
 
 def lowest() -> list[str]:

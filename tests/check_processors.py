@@ -34,7 +34,7 @@ SETTINGS = {
 """Environment variables by what they do; of x86 only."""
 CHOSEN = "not TightlyCoupledNavigation or ((evidence or rewards) and not gradients)"
 """Of the tests that are marked: code of TightlyCoupledNavigation takes long to compile, gradients longest, and one
-control tells."""
+control reports."""
 
 
 def main() -> None:

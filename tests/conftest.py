@@ -24,7 +24,7 @@ from filtergym.commands.terminal import console, output_width
 from filtergym.envs.engine import compiled
 from filtergym.envs.engine.catalogue import catalogue
 
-# The process that spreads the tests has imported readline, which tells its children how wide its terminal is.
+# The process that spreads the tests has imported readline, which exports the width of its terminal to its children.
 os.environ.pop("COLUMNS", None)
 console.width = output_width()
 
@@ -164,7 +164,6 @@ def short(env_id):
 
 @pytest.fixture(name="random_actions")
 def _random_actions():
-    """Draw actions for a batch."""
     return random_actions
 
 
@@ -189,6 +188,30 @@ def command(monkeypatch, capsys):
         with pytest.raises(SystemExit) as ended:
             program()
         return ended.value.code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def success(command):
+    """Run the command line, which must succeed; returns its output."""
+
+    def run(*words, **keywords):
+        code, shown, errors = command(*words, **keywords)
+        assert code == 0, errors
+        return shown
+
+    return run
+
+
+@pytest.fixture
+def refusal(command):
+    """Run the command line, which must refuse the words in one sentence; returns the sentence."""
+
+    def run(*words, **keywords):
+        code, _, errors = command(*words, **keywords)
+        assert (code, errors.count("\n")) == (2, 1), errors
+        return errors
 
     return run
 

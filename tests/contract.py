@@ -40,7 +40,6 @@ class Subject:
         return 0 if self.control is None else list(task_class(self.id).controls).index(self.control)
 
     def single(self, **keywords: Any) -> gym.Env:
-        """Make one environment."""
         return gym.make(self.id, disable_env_checker=True, **self.keywords | keywords)
 
     def native(self, count: int, **keywords: Any) -> gym.vector.VectorEnv:
@@ -53,7 +52,6 @@ class Subject:
         return gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
 
     def model(self, **keywords: Any) -> Model:
-        """Make its model."""
         return make_model(self.id, self.control, **short_episodes(self.id) | keywords)
 
     def actions(self, env: Any, count: int, steps: Iterable[int]) -> list[Any]:
@@ -63,7 +61,6 @@ class Subject:
 
 
 def continued(env: Any, actions: Iterable[Any]) -> list[np.ndarray]:
-    """Everything that some steps return."""
     return [np.asarray(part) for action in actions for part in env.step(action)[:4]]
 
 
@@ -94,7 +91,7 @@ def assert_equals_its_vector(
 
 
 Property = Callable[[Any], None]
-"""Function that raises where its subject has not what the function's name says."""
+"""Function that raises where its subject lacks what its name states."""
 
 
 def assert_properties(subject: Any, properties: Iterable[Property]) -> None:

@@ -270,11 +270,12 @@ def change_structure(reader: str, content: bytes, rng: random.Random) -> bytes:
     if reader == "safetensors":
         size = int.from_bytes(content[:8], "little")
         header = json.loads(content[8 : 8 + size])
-        told = header["__metadata__"]
-        name = rng.choice([*told])
-        told[name] = json.dumps(test_fuzz.replaced(json.loads(told[name]), rng)) if name in ("run", "fields") else (
-            rng.choice(test_fuzz.ODD)
-        )  # fmt: skip
+        metadata = header["__metadata__"]
+        name = rng.choice([*metadata])
+        if name in ("run", "fields"):
+            metadata[name] = json.dumps(test_fuzz.replaced(json.loads(metadata[name]), rng))
+        else:
+            metadata[name] = rng.choice(test_fuzz.ODD)
         text = json.dumps(header).encode()
         return len(text).to_bytes(8, "little") + text + content[8 + size :]
     if reader.endswith(".json.gz"):

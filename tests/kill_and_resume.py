@@ -188,8 +188,8 @@ def main(seconds: float, rng: random.Random, names: list[str]) -> int:
                 left |= {p.name for p in torn.rglob("*") if p.name.startswith(".") or "partial" in p.name}
                 differing |= {file for file in results if content(whole / file) != content(torn / file)}
             wrong += bool(left or differing)
-            told = ", ".join(f"{number.name} {kills[number]}" for number in SIGNALS)
-            print(f"{name}: ended {trials} times, killed by {told}", end="; ")
+            signals = ", ".join(f"{number.name} {kills[number]}" for number in SIGNALS)
+            print(f"{name}: ended {trials} times, killed by {signals}", end="; ")
             print(f"differing {sorted(differing)}; left {sorted(left)}", flush=True)
     return wrong
 

@@ -14,7 +14,6 @@ from filtergym.reports.tables.worst import find_worst
 
 
 def without_times(file):
-    """Return the text of a file of records without its times, which no run repeats."""
     text = file.read_text(encoding="utf-8")
     kept, count = re.subn(r'("metric": "nanoseconds"[^{}]*?"value": )[^,]+', r"\1null", text)
     assert count

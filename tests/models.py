@@ -40,12 +40,10 @@ def load_module(file: Path, name: str | None = None) -> Iterator[Any]:
 
 
 def make_model(id: str, control: str | None = None, scenario: Any = None, **keywords: Any) -> Model:
-    """Make a model as :func:`filtergym.envs.engine.backend.make_model` does."""
     return backend.make_model(task_class(id), control, scenario, **keywords)
 
 
 def begin(model: Model, rng: np.random.Generator, count: int) -> Any:
-    """Begin episodes side by side, from numbers of a generator."""
     noise = model.task.noise
     return model.begin(rng.random((noise.uniforms, count)), rng.normal(size=(noise.initial_normals, count)))
 
@@ -54,6 +52,15 @@ def next_row(model: Model, rng: np.random.Generator, count: int) -> np.ndarray:
     """Numbers of the next measurement."""
     noise = model.task.noise
     return np.concatenate([rng.normal(size=(noise.normals, count)), rng.random((noise.row_uniforms, count))])
+
+
+def draw(
+    model: Model, count: int, seed: int, steps: int
+) -> tuple[np.ndarray, np.ndarray, Iterator[np.ndarray]]:
+    """Draw what episodes side by side take: uniforms, initial normals, and a row of each step."""
+    rng, noise = np.random.default_rng(seed), model.task.noise
+    start = rng.random((noise.uniforms, count)), rng.standard_normal((noise.initial_normals, count))
+    return *start, (next_row(model, rng, count) for _ in range(steps))
 
 
 def short_episodes(id: str) -> dict[str, Any]:
@@ -77,8 +84,8 @@ class Asked:
 
     def update(self, memory: Any, measurement: Any) -> tuple[Any, ...]:
         own, state = self.filter, self.filter.step(memory, FilterInput(measurement))
-        told = Likelihood.of_records(own.records(state, measurement))
-        return own.mean(state), own.covariance(state), state, told
+        likelihood = Likelihood.of_records(own.records(state, measurement))
+        return own.mean(state), own.covariance(state), state, likelihood
 
 
 LANES = 8

@@ -29,6 +29,20 @@ def episode_numbers(seed, normals, uniforms, row_normals, row_uniforms, rows):
     return start[:normals], start[normals:], later[:, :row_normals], later[:, row_normals:]
 
 
+def positive_definite(rng, n, *batch):
+    """Random matrices ``(n, n, *batch)`` with eigenvalues of at least 0.1."""
+    root = rng.normal(size=(*batch, n, n))
+    return numpy.moveaxis(root @ root.swapaxes(-2, -1) + 0.1 * numpy.eye(n), (-2, -1), (0, 1))
+
+
+def kalman_update(x, P, nu, H, R):
+    """Kalman's update with NumPy's inverse; the innovation is NaN where nothing was received."""
+    there = numpy.isfinite(nu)
+    H = H[there]
+    K = P @ H.T @ numpy.linalg.inv(H @ P @ H.T + R[numpy.ix_(there, there)])
+    return x + K @ nu[there], (numpy.eye(len(x)) - K @ H) @ P
+
+
 # --- the radar and the bank of ManeuveringTarget
 
 T, RANGE_SIGMA, BEARING_SIGMA = 6.0, 100.0, math.radians(0.25)

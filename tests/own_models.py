@@ -23,6 +23,18 @@ def make_models(common):
         forget(id)
 
 
+def compare_lanes(start, kept, follow):
+    """Compare the last estimate of every lane with the one that ``follow(mean, covariance, lane)`` makes of the first.
+
+    Rounding alone is between them.
+    """
+    first, (_, _, means, covariances) = start.measurement, kept[-1]
+    for lane in range(means.shape[1]):
+        mean, P = follow(first.mean[:, lane], first.covariance[:, :, lane], lane)
+        np.testing.assert_allclose(means[:, lane], mean, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(covariances[:, :, lane], P, rtol=1e-12, atol=1e-12)
+
+
 def forget(id):
     for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
         table.pop(id, None)

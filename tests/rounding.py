@@ -24,7 +24,7 @@ many in two orders. Four, because the largest of a few changes falls short of th
 REPETITIONS = (0, 1)
 """Numbers of the repetitions that a test makes of several lanes."""
 LOOSEST = 1e-4
-"""A result, or one, times this is the largest tolerance: what rounding takes further, a test says nothing about."""
+"""A result, or one, times this is the largest tolerance: results that rounding moves further are not compared."""
 PARTS = {"world": ("begin", "advance"), "filter": ("start", "predict", "act")}
 """Methods of the parts of a task that are called within a step."""
 
@@ -70,7 +70,7 @@ def move_roundings(env, repetition=0):
     """
     lanes = env.unwrapped.fleet.only
     pattern = 1000 * repetition + np.arange(lanes.width)
-    beside = lanes.beside.model if lanes.beside else lanes.model
+    beside = lanes.baseline.model if lanes.baseline else lanes.model
     for model in {id(model): model for model in (lanes.model, beside)}.values():
         parts = ((model.task.world, "world"), (model.filter, "filter"))
         for owner, names in (

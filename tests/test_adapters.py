@@ -16,8 +16,8 @@ import filtergym
 from filtergym import adapters
 from filtergym.adapters import SingleTrackEstimator
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.maneuvering_target.estimators import KalmanModel
 from filtergym.envs.contract.filter import Initial
+from filtergym.envs.maneuvering_target.constant_velocity import KalmanModel
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.filters import kalman
 
@@ -28,7 +28,6 @@ LIBRARIES = {"filterpy_filters": "filterpy", "autopilot_kalman": "filterpy", "st
 
 
 def example(name):
-    """Module of docs/examples."""
     if name in LIBRARIES:
         pytest.importorskip(LIBRARIES[name], reason=f"{LIBRARIES[name]} is in filtergym[adapters]")
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
@@ -167,7 +166,7 @@ def test_filterpy_closes_the_loop_like_the_papers_filter(plant):
 
 
 class Permuted(SingleTrackEstimator):
-    """Keeps the start, in an order of its own and with a number that nobody asks for."""
+    """Keeps the start, in an order of its own and with an unused number."""
 
     state = ("turn_rate", "velocity_y", "position_x", "position_y", "velocity_x")
 

@@ -13,7 +13,6 @@ import browser
 import numpy as np
 import pytest
 
-from filtergym.__main__ import main
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.maneuvering_target.log_families import log_families
@@ -82,7 +81,7 @@ def test_the_sentence_comes_first_and_tables_hold_what_was_fitted(advice, page):
         assert sentence.replace("'", "&#39;") in text
     assert "10 missed measurements: these have no row" in text
     assert "read 158 measurements after the start of 1 track, 10 of them missed" in text
-    assert re.search(r"that are fitted, that choose, that judge: \d+ / \d+ / \d+\.", text)
+    assert re.search(r"for fit, choice and judgement: \d+ / \d+ / \d+\.", text)
     assert "filtergym advise log.csv" in text
 
 
@@ -140,7 +139,7 @@ def test_profiles_are_zero_at_the_best_value_and_pass_the_ends_of_the_interval(a
             assert drops[values >= high * (1.0 - 1e-5)].max() > 1.9
 
 
-def test_nothing_that_a_log_says_runs(advice):
+def test_no_text_of_a_log_is_executed(advice):
     """Names and notes are text, and the page fetches nothing."""
     hostile = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
     recording = dataclasses.replace(advice.recording, name=hostile, notes=(hostile,), names=(hostile,))
@@ -190,10 +189,6 @@ def test_a_sensor_that_is_no_component_has_a_report_without_a_track(tmp_path):
     assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_report_without_its_extra_is_refused_before_anything_is_read(monkeypatch, capsys):
+def test_a_report_without_its_extra_is_refused_before_anything_is_read(monkeypatch, refusal):
     monkeypatch.setitem(sys.modules, "filtergym.reports.pages.html_report", None)
-    monkeypatch.setattr(sys, "argv", ["filtergym", "advise", "missing.csv", "--report", "advice.html"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    assert "reports need more packages" in capsys.readouterr().err
+    assert "reports need more packages" in refusal("advise", "missing.csv", "--report", "advice.html")

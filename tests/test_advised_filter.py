@@ -130,7 +130,7 @@ def test_a_shipped_filter_is_saved_by_its_name(tmp_path):
             find_competitor(PROBLEM, path)
 
 
-def test_without_deviations_the_file_says_which(tmp_path):
+def test_without_deviations_the_file_states_which(tmp_path):
     log = write_log(tmp_path / "log.csv", PLANE[:2], sigma=30.0)
     setup = find_competitor(PROBLEM, _saved(tmp_path, log)).log
     assert 20.0 < setup.deviations["sigma_x"] < 90.0

@@ -62,7 +62,7 @@ def product_in_another_order(seed):
 
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
 @pytest.mark.claims
-def test_shipped_agent_scores_what_its_record_says(file, monkeypatch):
+def test_shipped_agent_has_the_score_of_its_record(file, monkeypatch):
     record = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
     check = record["exported"]
 

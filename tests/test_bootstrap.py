@@ -38,7 +38,7 @@ def test_statistics_of_one_bootstrap_are_paired():
     assert difference.high == pytest.approx(0.5)
 
 
-def test_interval_covers_as_often_as_it_says():
+def test_interval_has_its_stated_coverage():
     generator = np.random.default_rng(1)
     bootstrap = Bootstrap(100, resamples=400)
     hits = 0

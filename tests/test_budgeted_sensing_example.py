@@ -15,7 +15,6 @@ ID = "mine/BudgetedSensing-v0"
 
 @pytest.fixture(scope="module")
 def example():
-    """The module, registered."""
     yield from load_module(ROOT / "docs" / "examples" / "budgeted_sensing.py")
 
 
@@ -83,7 +82,7 @@ def test_a_look_is_planned_as_by_trying_all(example):
     model, kept = run(example, 6, 1)
     _, m, predicted, _ = kept[-1]
     rollout, P, R = example.Rollout(model), predicted.covariance, m.sigma**2
-    said, best = {"agility": m.agility}, []
+    context, best = {"agility": m.agility}, []
     for first in range(4):
         totals = []
         for second in range(4):
@@ -96,7 +95,7 @@ def test_a_look_is_planned_as_by_trying_all(example):
                 state = example.later(state, m.agility)
             totals.append(total)
         best.append(-min(totals))
-    np.testing.assert_allclose(rollout.index(P, R, said)[:, 0], best, rtol=1e-9)
+    np.testing.assert_allclose(rollout.index(P, R, context)[:, 0], best, rtol=1e-9)
 
 
 def test_no_schedule_costs_less_than_the_bound(example):

@@ -40,7 +40,6 @@ EVIL = 'range */ #include "/etc/passwd" \n// \\ ??/ " \u202e /* m²'
 
 
 def compiled(folder: Path, text: str) -> ctypes.CDLL:
-    """Compile text of C and load it."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler here")

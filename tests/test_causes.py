@@ -21,7 +21,7 @@ from filtergym.evaluation.running.curves import BAND_RESAMPLES, cost_in_stretche
 from filtergym.evaluation.running.summary import Evaluation
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.statistics.cause_split import (
-    held_causes,
+    active_causes,
     opponent_of,
     phrases_of,
     reason_weight,
@@ -56,17 +56,19 @@ def value(records, policy, metric, window):
 
 
 def test_causes_follow_from_the_context_of_the_episode(dataset):
-    """What the environment tells of its episodes, measurement by measurement."""
+    """The causes in the episodes by the info of the environment, measurement by measurement."""
     env = gymnasium.make(ENV, context=True, detailed_info=True)
-    held = dict(held_causes(dataset.sel(policy="imm")))
+    held = dict(active_causes(dataset.sel(policy="imm")))
     for episode in range(4):
         env.reset(seed=int(dataset["episode_seed"].values[episode]))
         for k in range(dataset.sizes["time"]):
-            told = env.unwrapped.fleet.only.state  # before the action: of the measurement that it is taken on
-            turns = env.unwrapped.model.context(told)["maneuvering"][0] > 0.0
-            position = told.truth.position[:, 0]
+            state = (
+                env.unwrapped.fleet.only.state
+            )  # before the action: of the measurement that it is taken on
+            turns = env.unwrapped.model.context(state)["maneuvering"][0] > 0.0
+            position = state.truth.position[:, 0]
             assert held["manoeuvre"][episode, k] == turns
-            assert held["missed"][episode, k] == (told.measurement.available[0] < 0.5)
+            assert held["missed"][episode, k] == (state.measurement.available[0] < 0.5)
             assert held["range from 120 km on"][episode, k] == (np.hypot(*position) >= 120e3)
             assert held["start"][episode, k] == (k < 10)
             env.step(np.zeros(2))
@@ -76,7 +78,7 @@ def test_causes_follow_from_the_context_of_the_episode(dataset):
 def test_shares_costs_and_consistency_by_a_loop_over_episodes(policy, dataset, records):
     run = dataset.sel(policy=policy)
     weights = Bootstrap(EPISODES).weights
-    for name, held in held_causes(run):
+    for name, held in active_causes(run):
         count, cost, nees = np.zeros(EPISODES), np.zeros(EPISODES), np.zeros(EPISODES)
         for i in range(EPISODES):
             for k in range(dataset.sizes["time"]):
@@ -111,7 +113,7 @@ def test_the_opponent_is_met_on_the_same_episodes(dataset, records):
     sums = []
     for policy in ("imm", "kalman-imm-turn"):
         run = dataset.sel(policy=policy)
-        held = dict(held_causes(run))["manoeuvre"]
+        held = dict(active_causes(run))["manoeuvre"]
         sums.append(weights @ np.where(held, run["cost"].values, 0.0).sum(axis=1))
     ratios = sums[0] / sums[1]  # their counts are the same
     assert found.value == pytest.approx(ratios[0], rel=1e-12)
@@ -120,19 +122,19 @@ def test_the_opponent_is_met_on_the_same_episodes(dataset, records):
 
 
 def test_opponents():
-    costs = {"a": 2.0, "b": 1.0, "c": 3.0, "told": 0.1}
+    costs = {"a": 2.0, "b": 1.0, "c": 3.0, "reference": 0.1}
     assert opponent_of("a", costs, ["a", "b", "c"]) == "b"
     assert opponent_of("b", costs, ["a", "b", "c"]) == "a"
-    assert opponent_of("told", costs, ["a", "b", "c"]) == "b"
-    assert opponent_of("a", {"a": 2.0, "told": 0.1}, ["a"]) == "told"
+    assert opponent_of("reference", costs, ["a", "b", "c"]) == "b"
+    assert opponent_of("a", {"a": 2.0, "reference": 0.1}, ["a"]) == "reference"
     assert opponent_of("a", {"a": 2.0}, ["a"]) == ""
 
 
-def test_every_environment_says_what_its_causes_are(env_id):
+def test_every_environment_describes_its_causes(env_id):
     dataset = filtergym.evaluate(env_id, [problem_of(env_id).baselines.score_paper], None, 6)
     phrases = phrases_of(dataset)
     assert len(phrases) > 5
-    held = dict(held_causes(dataset.isel(policy=0)))
+    held = dict(active_causes(dataset.isel(policy=0)))
     assert set(held) == {"all", *phrases}
     assert sum(flags.any() for flags in held.values()) > 4
     # They complete "most of its cost falls".
@@ -140,11 +142,11 @@ def test_every_environment_says_what_its_causes_are(env_id):
         assert phrase.split()[0] in ("in", "on", "at", "where", "while", "under", "beside")
 
 
-def test_a_recording_tells_what_can_be_known_of_it(tmp_path):
+def test_a_recording_has_the_causes_that_can_be_known(tmp_path):
     recording = filtergym.record(ENV, "missed-detections", 4, seed=2)
     simulated = filtergym.evaluate(ENV, ["imm"], "missed-detections", 4, seed=2)
     replayed = filtergym.evaluate(ENV, ["imm"], recording)
-    own, other = (dict(held_causes(d.isel(policy=0))) for d in (simulated, replayed))
+    own, other = (dict(active_causes(d.isel(policy=0))) for d in (simulated, replayed))
     for name in ("missed", "outlier", "range of 30 to 60 km", "start"):
         assert own[name].sum() == other[name].sum()
     assert own["manoeuvre"].any()
@@ -178,7 +180,7 @@ def test_reasons_in_sentences(records):
         like = records[0]._replace(policy="mine", metric=metric, window=window, component=component)
         return like._replace(value=number, low=low, high=high)
 
-    told = [
+    reasons = [
         made("cause_measurement_share", "turn", 0.12),
         made("cause_cost_share", "turn", 0.61),
         made("cause_cost", "turn", 5.0),
@@ -187,14 +189,14 @@ def test_reasons_in_sentences(records):
         made("cause_cost_share", "straight", 0.39),
         made("cause_cost", "straight", 0.4),
     ]
-    [sentence] = reason_sentences(told, {"turn": "in turns"}, "mine")
+    [sentence] = reason_sentences(reasons, {"turn": "in turns"}, "mine")
     assert sentence == (
         "mine: 61 % of its cost falls in turns, 12 % of the measurements; there it costs 2.3 times theirs [1.9, 2.8]."
     )
-    assert reason_sentences(told[4:], {}, "mine") == [
+    assert reason_sentences(reasons[4:], {}, "mine") == [
         "mine: no cause holds much more of its cost than of the measurements."
     ]
-    assert reason_sentences(told, {}, "nobody") == []
+    assert reason_sentences(reasons, {}, "missing") == []
     for width in (40, 60, 80):
         lines = fill(sentence, width).splitlines()
         assert max(map(len, lines)) <= width
@@ -249,7 +251,7 @@ def test_the_worst_episodes_are_those_that_cost_most_and_are_flown_again_bit_for
 
 def test_main_causes_of_an_episode_by_a_loop(dataset):
     run = dataset.sel(policy="imm").isel(episode=slice(5))
-    held = dict(held_causes(run))
+    held = dict(active_causes(run))
     for i, causes in enumerate(main_causes(run)):
         cost = run["cost"].values[i]
         weights = {}

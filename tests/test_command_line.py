@@ -13,7 +13,7 @@ import commands
 import pytest
 from made_results import without_times
 
-from filtergym.__main__ import GROUPS, import_command, main
+from filtergym.__main__ import GROUPS, import_command
 from filtergym.agents.learned_policy import pretrained_path
 from filtergym.baselines.problem import problem_of
 from filtergym.commands import terminal
@@ -43,30 +43,22 @@ def run(command, monkeypatch, tmp_path):
     return ran
 
 
-def test_version_is_that_of_the_installed_package(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["filtergym", "--version"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 0
-    assert capsys.readouterr().out == f"filtergym {metadata.version('filtergym')}\n"
+def test_version_is_that_of_the_installed_package(success):
+    assert success("--version") == f"filtergym {metadata.version('filtergym')}\n"
 
 
 COMMANDS = {name: import_command(own) for group in GROUPS.values() for name, own in group.items()}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_every_command_ends_with_an_example(command, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["filtergym", command, "--help"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 0
-    shown, said = capsys.readouterr().out, inspect.getsource(COMMANDS[command])
-    assert f"Example: filtergym {command}" in shown
-    # The extras that a command says it takes are not swallowed as markup.
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_every_command_ends_with_an_example(name, success):
+    shown, source = success(name, "--help"), inspect.getsource(COMMANDS[name])
+    assert f"Example: filtergym {name}" in shown
+    # The extras that a command names are not swallowed as markup.
     extras = {
-        word for option in ("Backend", "Cluster") if f": {option}" in said for word in OF_OPTIONS[option]
+        word for option in ("Backend", "Cluster") if f": {option}" in source for word in OF_OPTIONS[option]
     }
-    extras |= set(re.findall(r"filtergym\[\w+\]", inspect.getdoc(COMMANDS[command])))
+    extras |= set(re.findall(r"filtergym\[\w+\]", inspect.getdoc(COMMANDS[name])))
     assert extras == set(re.findall(r"filtergym\[\w+\]", shown))
 
 
@@ -81,7 +73,7 @@ REFUSED = {
         ((ENV, "--scenario", "missing.csv"), "cannot read trajectory"),
     ],
     "record": [((ENV, "--episodes", "0", "--out", "new/plots.nc"), "episodes must be an integer")],
-    "offline": [((ENV, "--policy", "nobody", "--out", "new"), "unknown policy")],
+    "offline": [((ENV, "--policy", "missing", "--out", "new"), "unknown policy")],
     "benchmark": [(("--environment", ENV, "--split", "tset", "--out", "new"), "unknown split 'tset'")],
     "report": [(("missing.json", "--out", "new/report.html"), "cannot read the results")],
     "tune": [
@@ -100,9 +92,9 @@ REFUSED = {
         for words in (("--steps", 0), ("--envs", 0), ("--validate-every", 0), ("--set", "algo.n_envs=1.5"))
     ],
     "export": [(("missing", "--out", "new/agent.safetensors"), "missing")],
-    "submit": [((ENV, "nobody", "--out", "new/mine.json"), "unknown competitor to submit")],
+    "submit": [((ENV, "missing", "--out", "new/mine.json"), "unknown competitor to submit")],
 }
-"""Words that are refused by each command that writes, and what is said."""
+"""Words that are refused by each command that writes, and the message."""
 
 
 def test_every_command_with_out_is_among_those_that_are_refused():
@@ -138,9 +130,9 @@ def test_a_report_without_its_extra_is_refused_alone_and_left_out_beside_results
     assert not list(tmp_path.rglob("report.html"))
 
 
-@pytest.mark.parametrize(("said", "width"), [("80", None), ("", 100), ("0", 100), ("wide", 100)])
-def test_columns_says_how_wide_what_is_piped_may_be(said, width, monkeypatch):
-    monkeypatch.setenv("COLUMNS", said)
+@pytest.mark.parametrize(("columns", "width"), [("80", None), ("", 100), ("0", 100), ("wide", 100)])
+def test_columns_sets_the_width_of_piped_output(columns, width, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
     assert terminal.output_width() == width
 
 
@@ -163,14 +155,14 @@ def test_help_of_what_makes_the_pages_ends_with_an_example(name, make_page):
     assert f"Example: python docs/make {name}" in shown
 
 
-def test_progress_bar_says_nothing_where_nobody_looks(capsys):
+def test_progress_bar_is_silent_without_a_terminal(capsys):
     with progress_bar() as bar:
         bar.add_task("evaluating", total=None)
     assert capsys.readouterr().err == ""
 
 
 class Clock:
-    """Seconds that pass when it is told so."""
+    """Seconds that pass when it is called."""
 
     now = 0.0
 
@@ -178,7 +170,7 @@ class Clock:
         return self.now
 
 
-def test_progress_where_nobody_looks_is_few_lines_with_the_time_that_is_left():
+def test_progress_without_a_terminal_is_few_lines_with_the_remaining_time():
     lines, clock = [], Clock()
     with ProgressLines(lines.append, clock) as shown:
         task = shown.add_task("tuning imm", total=1000)
@@ -204,7 +196,7 @@ def test_progress_where_nobody_looks_is_few_lines_with_the_time_that_is_left():
     assert lines[0] == "training ppo: 0 % done after 1 min 0 s, 1666 h 39 min left"
 
 
-def test_what_has_been_finished_is_said_with_the_time_that_is_left():
+def test_finished_work_is_printed_with_the_remaining_time():
     lines, clock = [], Clock()
     shown = ProgressLines(lines.append, clock)
     shown.write_line("log.nc: 250 measurements")
@@ -229,7 +221,7 @@ def test_list_names_everything(run):
     assert shown.startswith(f"{ENV}\n")
     assert "UavAutopilot" not in shown
     assert max(map(len, shown.splitlines())) <= 100
-    # What a reader needs to judge a number, too: whose algorithm it is, and what a reference is told.
+    # What a reader needs to judge a number, too: whose algorithm it is, and what a reference receives.
     for word in (
         *("evidence", "descent", "adaptive-rearm", "imm-tuned", "bptt", "Bakulev"),
         *("knows when every manoeuvre begins and ends", "knows the acceleration in every scan"),
@@ -251,7 +243,7 @@ def test_a_listing_fits_two_screens(run, env_id):
     assert [line.split()[0] for line in lines[-len(scenarios) :]] == list(scenarios)
 
 
-def test_doctor_says_what_an_issue_needs(run, monkeypatch):
+def test_doctor_prints_what_an_issue_needs(run, monkeypatch):
     lines = dict(line.split(maxsplit=1) for line in run("doctor").stdout.splitlines())
     assert lines["filtergym"] == f"{metadata.version('filtergym')} on Python {platform.python_version()}"
     for name in ("numpy", "msgspec"):
@@ -301,7 +293,7 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
     assert {r["policy"] for r in records} == {"imm", "known-turn"}
     assert {r["seed"] for r in records} == {1}
     made = {path.name for path in (tmp_path / "out").iterdir()}
-    # The report takes an extra, which the core install lacks: it says so then.
+    # The report takes an extra, which the core install lacks: then an error names it.
     report = {"report.html"} if importlib.util.find_spec("plotly") else set()
     assert report or "no report: reports need more packages" in result.stdout
     assert made == report | {
@@ -365,7 +357,7 @@ def test_benchmark_runs_until_the_headline_is_narrow(tmp_path, monkeypatch):
     assert 100.0 * benchmark.headline_half_width(found[1]) <= width / 2.0
 
 
-def test_benchmark_says_how_a_filter_of_ones_own_is_run(tmp_path, monkeypatch, command):
+def test_benchmark_shows_how_to_run_a_filter_of_the_user(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     code, _, errors = command("benchmark", "--policy", "mine:Mine")
     assert (code, "evaluate --protocol filtergym-1 --policy mine:Mine" in errors) == (2, True)

@@ -33,13 +33,12 @@ def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
     kinds = (known.policies, known.estimators, known.smoothers, known.references, known.bounds, agents)
     names = [name for kind in kinds for name in list(kind)[:1]]
     monkeypatch.setattr(programs, "PROGRAM_CACHE_SIZE", len(names))  # what was traced once serves twice
-    everyone = evaluate(env_id, names, episodes=13, **short)
+    together = evaluate(env_id, names, episodes=13, **short)
     monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 12)  # and the last one alone
-    assert_same(evaluate(env_id, names, episodes=13, **short), everyone)
+    assert_same(evaluate(env_id, names, episodes=13, **short), together)
 
 
 def residual(model):
-    """Random corrections of random actions."""
     return ResidualPolicy(model, RandomPolicy(model), competitor(ID, "adaptive")(model))
 
 
@@ -49,12 +48,12 @@ residual.control = "gain"
 def test_random_actions_are_every_episodes_own(monkeypatch):
     makers = {"random": "random", "residual": residual}
     monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
-    everyone = evaluate(ID, makers, episodes=17, horizon=10)
-    assert_same(evaluate(ID, makers, episodes=3, horizon=10), everyone)
+    together = evaluate(ID, makers, episodes=17, horizon=10)
+    assert_same(evaluate(ID, makers, episodes=3, horizon=10), together)
     policy = RandomPolicy(make_model(ID, "gain"))
     observation = np.zeros((17, len(policy.model.fields)))
     actions, _ = policy.predict(
-        observation, policy.begin([int(seed) for seed in everyone["episode_seed"].values])
+        observation, policy.begin([int(seed) for seed in together["episode_seed"].values])
     )
     assert len(np.unique(actions)) == 17
 
@@ -79,6 +78,6 @@ def test_a_model_is_asked_about_as_many_always():
 
     env = gymnasium.make(ID, horizon=10)
     model = ALGORITHMS["recurrent-ppo"]("MlpLstmPolicy", env, seed=0, device="cpu", n_steps=8, batch_size=8)
-    everyone = evaluate(ID, {"model": model}, episodes=130, horizon=10)
+    together = evaluate(ID, {"model": model}, episodes=130, horizon=10)
     for count in (1, 3):
-        assert_same(evaluate(ID, {"model": model}, episodes=count, horizon=10), everyone)
+        assert_same(evaluate(ID, {"model": model}, episodes=count, horizon=10), together)

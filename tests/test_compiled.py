@@ -31,7 +31,6 @@ def compare(env_id, count, fly, **keywords):
 
 
 def flown(env, actions, **reset):
-    """Everything that episodes show."""
     found = [env.reset(seed=3, **reset)[0]]
     for action in actions:
         found += [np.asarray(part) for part in env.step(action)[:4]]
@@ -39,8 +38,6 @@ def flown(env, actions, **reset):
 
 
 def assert_same_episodes(env_id, count, actions, reset=None, **keywords):
-    """Compiled episodes are those of NumPy."""
-
     def fly(env):
         first, *steps = flown(env, sampled(env, actions), **(reset or {}))
         return [np.stack([first, *steps[::4]]), *(np.stack(steps[i::4]) for i in (1, 2, 3))]
@@ -65,7 +62,7 @@ WITHIN_OTHERS = {
 
 @pytest.mark.processors
 def test_every_scenario_is_that_of_numpy(env_id, short):
-    """Under one control; what each shows, is paid and tells is compared over a few decisions."""
+    """Under one control; what each shows, is rewarded and reports is compared over a few decisions."""
     for scenario in set(catalogue()[env_id].scenarios) - WITHIN_OTHERS.get(env_id, set()):
         assert_same_episodes(env_id, 7, 3, scenario=scenario, **short)
 
@@ -189,18 +186,18 @@ class Outlandish(RadarWorld):
 
 
 @pytest.mark.parametrize(
-    ("world", "told"),
+    ("world", "pattern"),
     [
         (Branching, r"depends on the numbers.*test_compiled\.py, line \d+: if truth\.scan"),
         (Outlandish, "cumsum"),
     ],
 )
-def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
+def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, pattern):
     monkeypatch.setattr(MANEUVERING, "World", world)
     compiled_tasks._trace_once.cache_clear()
-    with pytest.warns(UserWarning, match=told) as said:
+    with pytest.warns(UserWarning, match=pattern) as warned:
         env = gym.make(MANEUVERING.id, control="gain")
-    assert len([w for w in said if "runs with NumPy" in str(w.message)]) == 1
+    assert len([w for w in warned if "runs with NumPy" in str(w.message)]) == 1
     assert env.unwrapped.backend == "numpy"
     env.reset(seed=0)
     assert np.isfinite(env.step(np.zeros(1))[1])

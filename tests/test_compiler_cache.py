@@ -56,7 +56,7 @@ def test_the_next_process_need_not_compile(place, loaded):
     assert len(files(place)) == 1
     assert loaded() == 0
     assert len(files(place)) == 1
-    if os.name == "posix":  # nobody else may write what is going to be executed
+    if os.name == "posix":  # no other user may write what is going to be executed
         assert place.stat().st_mode & 0o777 == 0o700
 
 
@@ -172,9 +172,9 @@ def test_what_somebody_else_can_have_written_is_not_executed(place, loaded, of_f
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always")
         assert [loaded(), loaded()] == [1, int(of_folder)]  # which checks what comes out
-    said = [str(warning.message) for warning in noted]
-    assert len(said) == (reason is not None)
-    assert all(re.search(reason, text) and str(place) in text and cache.SWITCH in text for text in said)
+    messages = [str(warning.message) for warning in noted]
+    assert len(messages) == (reason is not None)
+    assert all(re.search(reason, text) and str(place) in text and cache.SWITCH in text for text in messages)
 
 
 def test_an_entry_that_cannot_be_touched_is_used(place, loaded, monkeypatch):

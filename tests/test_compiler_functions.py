@@ -64,21 +64,21 @@ def moved(bank, step):
 def test_structures_come_back_as_they_went_in():
     position, flags, count = numbers(2, 8), np.arange(8) % 2 == 0, np.arange(8)
     bank = Bank(Track(position, flags), None, {"count": count, "none": None, "pair": (position, flags)})
-    after, said, nothing = CompiledFunction(moved, Graph())(bank, np.full(8, 0.25))
+    after, reports, nothing = CompiledFunction(moved, Graph())(bank, np.full(8, 0.25))
     assert type(after) is Bank
     assert type(after.track) is Track
     assert after.nothing is None
     assert nothing is None
-    assert list(said) == ["speed", "flag", "bank"]
+    assert list(reports) == ["speed", "flag", "bank"]
     assert list(after.more) == ["count", "none", "pair"]
     np.testing.assert_array_equal(after.track.position, position + 0.25)
-    np.testing.assert_array_equal(said["speed"], np.full(8, 0.125))
-    np.testing.assert_array_equal(said["flag"], ~flags)
-    assert said["flag"].dtype == bool
+    np.testing.assert_array_equal(reports["speed"], np.full(8, 0.125))
+    np.testing.assert_array_equal(reports["flag"], ~flags)
+    assert reports["flag"].dtype == bool
     # What passes through is the given array.
     assert after.track.flags is flags
     assert after.more["count"] is count
-    assert said["bank"]["count"] is count
+    assert reports["bank"]["count"] is count
 
 
 def test_a_part_of_an_array_or_another_kind_of_it_is_a_new_one():
@@ -284,7 +284,7 @@ def test_a_forked_process_goes_on_and_compiles_what_is_new(compiled):
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize("work", ["tracing", "compilation"])
 def test_a_fork_waits_for_a_thread_that_traces_or_compiles(monkeypatch, work):
-    """What the thread holds nobody would give back in the child."""
+    """No thread in the child would release what the thread holds."""
     x, graph, begun = numbers(3, 8), Graph(), threading.Event()
 
     def pause():
@@ -321,7 +321,7 @@ def test_a_fork_waits_for_a_thread_that_traces_or_compiles(monkeypatch, work):
 # --- what is bound to memory
 
 
-def test_a_bound_function_reads_and_writes_other_memory_when_told():
+def test_a_bound_function_reads_and_writes_rebound_memory():
     special = Specialised(lambda x: x + 1.0, Graph(), [numbers(2, 8)])
     first, second, result = numbers(2, 8), numbers(2, 8, seed=1), np.empty((2, 8))
     call = special.bound([first], [result])
@@ -343,18 +343,18 @@ def test_a_sequence_runs_its_calls_over_all_steps(threads):
     x, y = numbers(width), np.stack([numbers(width, seed=k) for k in range(steps)])
     add = CompiledFunction(lambda x, y: (x + y,), Graph()).specialise(x, y[0])
     tell = CompiledFunction(lambda x: (2.0 * x,), Graph()).specialise(x)
-    memory, told = [x.copy(), np.empty(width)], np.empty((steps, width))
+    memory, reports = [x.copy(), np.empty(width)], np.empty((steps, width))
     turns, moving = [], []
     for now, then in (memory, memory[::-1]):
-        calls = [add.bound([now, y[0]], [then]), tell.bound([then], [told[0]])]
-        moving += [moving_array(calls[0], 1, y), moving_array(calls[1], 1, told)]
+        calls = [add.bound([now, y[0]], [then]), tell.bound([then], [reports[0]])]
+        moving += [moving_array(calls[0], 1, y), moving_array(calls[1], 1, reports)]
         turns.append(calls)
     tables = [call.table.copy() for calls in turns for call in calls]
     CallSequence(*turns, moving, steps, tile=40).run(width, threads)
     expected = [x]
     for row in y:
         expected.append(expected[-1] + row)
-    np.testing.assert_array_equal(told, 2.0 * np.array(expected[1:]))
+    np.testing.assert_array_equal(reports, 2.0 * np.array(expected[1:]))
     np.testing.assert_array_equal(memory[steps % 2], expected[-1])
     for call, table in zip((call for calls in turns for call in calls), tables, strict=True):
         np.testing.assert_array_equal(call.table, table)

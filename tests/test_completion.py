@@ -63,13 +63,13 @@ def test_few_words_and_nothing(complete):
     assert complete("evaluate", TARGET, "--format", "p") == ["png", "pdf"]
     assert complete("evaluate", TARGET, "--backend", "") == ["auto", "compiled", "numpy"]
     assert complete("reproduce", "imm") == ["imm-alpha-beta"]
-    assert complete("evaluate", TARGET, "--policy", "nobody") == []
-    # A module is a program, and nobody has asked to run it.
+    assert complete("evaluate", TARGET, "--policy", "missing") == []
+    # A module is a program, and the user has not asked to run it.
     assert complete("evaluate", "no_module:mine/Own-v0", "--scenario", "paper")[:1] == ["paper"]
 
 
 def test_the_script_for_a_shell():
-    """Asked for by name, as where the shell cannot be told from the processes."""
+    """Asked for by name, as where the shell cannot be found among the processes."""
     run = subprocess.run(
         [sys.executable, "-m", "filtergym", "--show-completion", "zsh"],
         capture_output=True,

@@ -1,4 +1,4 @@
-"""Whether covariances are believed: NEES and NIS, medians and wins, and what is said of who is best."""
+"""Whether covariances are believed: NEES and NIS, medians and wins, and the verdict on the best competitor."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_quantiles_are_those_of_the_chi_square_distribution():
     )
 
 
-def test_consistency_is_what_it_says(dataset, found):
+def test_consistency_equals_its_definition(dataset, found):
     for name in ("imm", "kalman-imm"):
         run = dataset.sel(policy=name)
         error, P = run["error"].values, run["covariance"].values
@@ -142,21 +142,21 @@ def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
     records = tidy_records(dataset)
     learned = ("bptt", "ppo")
 
-    def told(names, low=None):
+    def verdict(names, low=None):
         """Verdict on these competitors, the lower end of every difference to the best one set to ``low``."""
         kept = [record for record in records if record.policy in names]
         if low is not None:
             kept = [r._replace(low=low) if r.metric == "behind_best" else r for r in kept]
         return best_competitor(kept)
 
-    everyone = [place.policy for place in ranking(records)]
-    classical = [name for name in everyone if name not in learned]
-    assert told(everyone, low=0.01) == "learned best"
-    assert told(everyone, low=0.0) == told(everyone, low=-0.01) == "no significant difference"
-    assert told(learned) == "learned only"
-    assert told(classical) == "classical only"
-    # References are told what the others are not, and judge nothing.
-    assert told([*everyone, "known-turn"], low=0.01) == "learned best"
+    competitors = [place.policy for place in ranking(records)]
+    classical = [name for name in competitors if name not in learned]
+    assert verdict(competitors, low=0.01) == "learned best"
+    assert verdict(competitors, low=0.0) == verdict(competitors, low=-0.01) == "no significant difference"
+    assert verdict(learned) == "learned only"
+    assert verdict(classical) == "classical only"
+    # References know what the others do not, and judge nothing.
+    assert verdict([*competitors, "known-turn"], low=0.01) == "learned best"
     swapped = [
         r._replace(value=1e-9) if (r.policy, r.metric) == (classical[0], "geometric_cost") else r
         for r in records
@@ -184,7 +184,7 @@ def test_tracks_hold_what_a_track_is_drawn_from(dataset):
         (run["estimate"] - run["truth"]).values, run["error"].values, rtol=0, atol=1e-9
     )
     for name in ("measurement_position", "measurement_variance"):
-        values = run[name].values  # the same for everybody: nobody steers the radar
+        values = run[name].values  # the same for all competitors: none steers the radar
         assert values.shape == (3, EPISODES, 100, 2)
         np.testing.assert_array_equal(values[1:], values[:1].repeat(2, axis=0))
     assert "estimate" not in evaluate(ID, ["imm"], episodes=2)

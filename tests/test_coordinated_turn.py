@@ -18,7 +18,6 @@ def states():
 
 
 def rotation(rate):
-    """Matrix A of dx/dt = A x for position and velocity."""
     A = np.zeros((4, 4))
     A[:2, 2:] = np.eye(2)
     A[2:, 2:] = [[0.0, -rate], [rate, 0.0]]

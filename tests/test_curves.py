@@ -117,7 +117,7 @@ def test_probabilities(dataset, curves):
 
 
 def test_actions_and_gains(dataset, curves):
-    """``adaptive`` sets a gain, the paper's IMM the weights that become its probabilities; nobody else acts."""
+    """``adaptive`` sets a gain, the paper's IMM the weights that become its probabilities; no other competitor acts."""
     assert curves["action_name"].values.tolist() == ["weights: mode_1", "weights: mode_2", "gain: gain"]
     weights = dataset["action"].sel(policy="imm").values[..., :2]
     # In single precision, as the action space has them.
@@ -142,7 +142,7 @@ def test_actions_and_gains(dataset, curves):
     assert np.isnan(curves["gain"].sel(policy="imm")).all()
 
 
-def test_an_action_is_told_as_the_box_bounds_it():
+def test_an_action_is_recorded_as_the_box_bounds_it():
     class Bold:
         control = "gain"
 
@@ -201,7 +201,7 @@ def test_without_truth_there_are_no_errors():
     assert {"anis", "mode_probability", "action"} <= set(curves)
 
 
-def test_what_it_says_of_itself(dataset, curves, tmp_path):
+def test_the_description_of_the_curves(dataset, curves, tmp_path):
     assert windows_of(curves) == windows_of(dataset)
     assert curves["quantity"].values.tolist() == ["position", "velocity"]
     assert curves["unit"].values.tolist() == ["m", "m/s"]

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from naive import positive_definite
 from scipy.stats import multivariate_normal
-from test_kalman import positive_definite
 
 from filtergym.filters import data_association
 

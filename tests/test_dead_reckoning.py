@@ -1,4 +1,4 @@
-"""Positions with slow errors, anchored by a second sensor: filter, columns, fit, choice, and what is said of it."""
+"""Positions with slow errors, anchored by a second sensor: filter, columns, fit, choice, and the sentences about it."""
 
 import dataclasses
 import itertools
@@ -177,7 +177,7 @@ def test_odometry_that_cannot_be_is_refused(change, message, tmp_path):
         read(change(drive(count=40)), tmp_path)
 
 
-def test_nobody_else_is_shown_it(tmp_path):
+def test_no_other_filter_receives_the_second_sensor(tmp_path):
     """Every number of banks, estimators and agents is the same with it and without."""
     table = drive(count=80)
     names = ["imm", "kalman-imm-turn", "bptt"]
@@ -259,7 +259,7 @@ def test_the_anchored_filter_is_advised_and_nearer_to_the_truth(advice):
         assert interval.low <= math.log10(value) <= interval.high  # of this seed; coverage is a command
 
 
-def test_it_is_said_what_its_likelihood_is_of(advice):
+def test_the_report_names_the_data_of_the_likelihood(advice):
     text = "\n".join(advice_lines(advice, []))
     assert text.startswith("Take dead-reckoning, with the parameters below: ")
     assert "heading offset " in text
@@ -268,7 +268,7 @@ def test_it_is_said_what_its_likelihood_is_of(advice):
     assert "times as large as stated" not in text
 
 
-def test_a_second_sensor_that_does_not_help_is_said_so(advice):
+def test_a_second_sensor_that_does_not_help_is_reported(advice):
     """As where its displacements are of something else."""
     fitted = next(c for c in advice.competitors if c.name == "constant-velocity")
     anchor = advice.anchor._replace(gain=-0.5)

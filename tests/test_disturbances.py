@@ -25,7 +25,7 @@ class Shift(Disturbance):
     initial_normals, normals = 1, 2
 
     @classmethod
-    def is_in(cls, parameters):
+    def is_enabled(cls, parameters):
         return parameters.shifted
 
     def begin(self, draws, normals, zero):
@@ -48,7 +48,7 @@ class Scale(Disturbance):
     initial_normals, row_uniforms = 2, 1
 
     @classmethod
-    def is_in(cls, parameters):
+    def is_enabled(cls, parameters):
         return True
 
     def begin(self, draws, normals, zero):
@@ -74,7 +74,7 @@ def test_each_takes_its_own_numbers_and_acts_in_its_turn():
     drawn, start = np.array([[0.25, 0.5]]), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
     states = both.begin(Draws(drawn, np), start, np.array([100.0, 200.0]))
     np.testing.assert_array_equal(states["shift"], [101.25, 202.5])
-    steps = both.share(
+    steps = both.split_noise(
         np.array([1.0, 1.0]), 2.0, np.array([[7.0, 7.0], [8.0, 9.0]]), np.array([[0.1, 0.2]]), 10.0
     )
     states = both.advance(states, steps)
@@ -91,8 +91,6 @@ def test_each_takes_its_own_numbers_and_acts_in_its_turn():
 
 
 class Held(NamedTuple):
-    """State of :class:`Frozen`."""
-
     number: np.ndarray
     reading: np.ndarray
 
@@ -104,7 +102,7 @@ class Frozen(Disturbance):
     row_uniforms = 1
 
     @classmethod
-    def is_in(cls, parameters):
+    def is_enabled(cls, parameters):
         return True
 
     def begin(self, draws, normals, zero):

@@ -25,7 +25,7 @@ from filtergym.envs.engine.catalogue import bare_name, catalogue, parameter_name
 DOCS = Path(__file__).parent.parent / "docs"
 AUDIENCES = ("index.md", "filter_designer.md", "rl_researcher.md", "log_file.md")
 MOST_WORDS = 18_300  # 18,000, and the page on estimation in the loop
-"""Of prose by hand in ``docs/``: nobody reads more."""
+"""Of prose by hand in ``docs/``: the limit."""
 HEADINGS = (
     "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End", "Arguments",
     "Scenarios", "What to expect", "References", "Version History", "Not reproduced",
@@ -33,7 +33,7 @@ HEADINGS = (
 
 
 def page_file(id: str) -> Path:
-    """Return the page that is about an environment: it says so below its title."""
+    """Return the page about an environment, by the line below its title."""
     pages = (DOCS / "environments").glob("*.md")
     [own] = [p for p in pages if p.read_text(encoding="utf-8").splitlines()[2].startswith(f"`{id}`")]
     return own
@@ -110,7 +110,7 @@ def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch)
                 assert (code, bool(shown)) == (0, True), errors
 
 
-def test_page_of_the_command_line_holds_what_help_says(command):
+def test_page_of_the_command_line_holds_the_help(command):
     assert "```{command-line}\n" in (DOCS / "command_line.md").read_text(encoding="utf-8")
     sections = re.split(r"^## ", command_line.command_line_markdown(), flags=re.M)[1:]
     options = {
@@ -132,20 +132,19 @@ def test_the_page_of_the_contract_names_the_scenarios_that_are_there():
 
 
 @pytest.mark.parametrize("row", range(3))
-def test_gymnasium_refuses_what_the_page_of_recipes_says(row):
+def test_gymnasium_refuses_what_the_page_of_recipes_lists(row):
     table = (DOCS / "recipes.md").read_text(encoding="utf-8").partition("Gymnasium refuses:")[2]
-    call, said = re.findall(r'^\| `([^|]+)`: "([^|]+)" \|', table, re.M)[row]
+    call, message = re.findall(r'^\| `([^|]+)`: "([^|]+)" \|', table, re.M)[row]
     names = {
         "ID": "filtergym/ManeuveringTarget-v0",
         "make_vec": functools.partial(gymnasium.make_vec, num_envs=2),
         "NormalizeObservation": gymnasium.wrappers.vector.NormalizeObservation,
     }
-    with pytest.raises((ValueError, gymnasium.error.Error), match=re.escape(said)):
+    with pytest.raises((ValueError, gymnasium.error.Error), match=re.escape(message)):
         eval(call.replace("...", "None"), names)
 
 
 def words_by_hand(text: str) -> int:
-    """Count the words of a page outside blocks, tables and headings."""
     prose = re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S)
     return sum(len(line.split()) for line in prose.splitlines() if not line.lstrip().startswith(("|", "#")))
 

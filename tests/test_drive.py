@@ -88,6 +88,6 @@ def test_shipped_file_is_replayed_to_every_kind_of_filter():
     assert np.isfinite(found["error"].values).all()
     error = found["error"] ** 2
     root = np.sqrt(error.sum("component").mean(["episode", "time"]))
-    # Two axes of white noise of 1.41 m, and what the page says of the filter that estimates the rate errors.
+    # Two axes of white noise of 1.41 m, and the statement of the page on the filter that estimates the rate errors.
     assert float(root.sel(policy="gnss-only")) == pytest.approx(2.0, abs=0.1)
     assert float(root.sel(policy="augmented")) == pytest.approx(0.859, abs=1e-3)

@@ -35,18 +35,18 @@ if "own" in sys.argv:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         ((), ["False"]),
         # Importing the compiler takes seconds.
         pytest.param(("own",), ["False", "True"], marks=pytest.mark.slow),
     ],
 )
-def test_no_compiler_and_the_same_bits(words, said):
+def test_no_compiler_and_the_same_bits(words, expected):
     """In a process of its own, where nothing else has imported the compiler; torch's own optimiser comes second."""
     if not hasattr(torch.optim.Adam.step, "__wrapped__"):
         pytest.skip("this version of torch names its parts otherwise, and imports its compiler")
     found = subprocess.run(
         [sys.executable, "-c", DESCENT, *words], capture_output=True, text=True, check=True
     )
-    assert found.stdout.split() == said
+    assert found.stdout.split() == expected

@@ -20,7 +20,6 @@ RATES = [(0.3, 0.2, 0.6, 0.5), (0.1, 0.5, 0.3, 0.3), (0.0, 0.0, 1.0, 0.2)]
 
 
 def normal(x, sigma):
-    """Density over that at the mean."""
     return math.exp(-0.5 * (x / sigma) ** 2)
 
 
@@ -31,7 +30,7 @@ def test_the_table_is_the_sum_over_all_histories_of_silence_and_source():
     one = numpy.ones(1, bool)
     for k, (decision, apart) in enumerate(looks):
         if k:
-            table = emitter_association.fall_silent(table, grid, one)
+            table = emitter_association.predict_silence(table, grid, one)
         table = table * emitter_association.look_likelihood(
             grid,
             CONFUSION,
@@ -69,7 +68,7 @@ def test_without_a_look_nothing_changes():
     look = emitter_association.Look(none, numpy.array([3, 3]), numpy.zeros(2))
     factor = emitter_association.look_likelihood(grid, CONFUSION, CONFUSION, look, 3.0)
     assert (factor == 1.0).all()
-    assert (emitter_association.fall_silent(table, grid, none) == table).all()
+    assert (emitter_association.predict_silence(table, grid, none) == table).all()
     assert table[0].sum() == pytest.approx(2 * 3, rel=1e-12)  # two lanes, three types of the second emitter
 
 
@@ -86,7 +85,7 @@ def test_coloured_errors_are_added_and_taken_away():
             whole = augmented.Phi[..., s] @ whole @ augmented.Phi[..., s].T + augmented.Q[..., s]
             mean, x, e = augmented.Phi[..., s] @ mean, models.Phi[..., s] @ x, 0.9 * e
         assert mean[:2] == pytest.approx(x[:2] + e, rel=1e-12)
-        found, covariance = class_fusion.take_away_coloured_errors(mean[:, None], whole[..., None])
+        found, covariance = class_fusion.remove_coloured_errors(mean[:, None], whole[..., None])
         assert found[:, 0] == pytest.approx(x, rel=1e-12)
         # The coloured errors stay stationary; at the start the state holds them, and position their propagation.
         assert numpy.diagonal(whole)[3:] == pytest.approx(0.25 * numpy.diagonal(models.R), rel=1e-12)
@@ -229,7 +228,7 @@ def test_a_change_moves_the_weight_to_its_class():
 
 
 def test_ideal_is_consistent_where_errors_are_coloured_correlated_and_glint():
-    """Mean NEES over the dimension of a reference that is told all of it."""
+    """Mean NEES over the dimension of a reference that knows all of it."""
     for scenario, keywords in (
         ("random", {"radar_coloured": (0.5, 0.5), "radar_correlation": (-0.6, -0.6), "undisturbed": 0.0}),
         ("glint", {"radar_correlation": (0.7, 0.7)}),

@@ -69,7 +69,6 @@ def shows_what_lies_in_its_space(subject):
 
 
 def run(env, actions, seed=21):
-    """Observations and rewards of fixed actions."""
     shown, paid = [env.reset(seed=seed)[0]], []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
@@ -80,7 +79,7 @@ def run(env, actions, seed=21):
 
 
 def needs_nothing_but_the_measurements(subject):
-    """No truth: fed with what the world said, and with nothing else, the bank shows and estimates the same."""
+    """No truth: fed with the measurements alone, the bank shows and estimates the same."""
     model = subject.model()
     rng = np.random.default_rng(3)
     episode = begin(model, rng, 8)
@@ -138,8 +137,8 @@ def is_made_again_from_text_and_ends_at_its_horizon(subject):
     assert not run(env, actions[:4])[2]
 
 
-def estimate_made_outside_starts_where_everyone_starts(subject):
-    """The task without its bank: who says nothing reports the start for ever, in a loop of its own."""
+def estimate_made_outside_starts_at_the_common_start(subject):
+    """The task without its bank: a competitor without estimates reports the start for ever, in a loop of its own."""
     model = subject.model().with_filter(lambda other: NoFilter(other.task))
     noise = model.task.noise
     episode = model.begin(np.full((noise.uniforms, 8), 0.5), np.zeros((noise.initial_normals, 8)))
@@ -193,7 +192,7 @@ def evaluation_replays_what_gymnasium_shows(subject):
 
 BY_ENVIRONMENT = (
     is_made_again_from_text_and_ends_at_its_horizon,
-    estimate_made_outside_starts_where_everyone_starts,
+    estimate_made_outside_starts_at_the_common_start,
     parameters_survive_json,
     one_scenario_is_for_training,
     evaluation_replays_what_gymnasium_shows,

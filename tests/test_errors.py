@@ -166,8 +166,6 @@ def test_evaluation_arguments(arguments, message):
 
 
 class Answering:
-    """An estimator that answers with one mean."""
-
     def __init__(self, answer):
         self.answer = answer
 

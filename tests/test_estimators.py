@@ -35,17 +35,17 @@ class Start:
 
 
 class Recording(Start):
-    """Keeps what it was given and has said."""
+    """Keeps its inputs and its estimates."""
 
     def __init__(self, task):
-        self.task, self.said = task, []
+        self.task, self.estimates = task, []
 
     def estimate(self, measurement, memory):
         return memory[0]
 
     def update(self, memory, measurement):
         mean = self.estimate(measurement, memory)
-        self.said.append((measurement, mean))
+        self.estimates.append((measurement, mean))
         return mean, memory[1], memory
 
 
@@ -54,7 +54,7 @@ class Raw(Recording):
 
     def estimate(self, measurement, memory):
         mean, measured = np.zeros_like(memory[0]), list(self.task.measured)
-        held = self.said[-1][1][measured] if self.said else 0.0
+        held = self.estimates[-1][1][measured] if self.estimates else 0.0
         mean[measured] = np.where(measurement.available > 0, measurement.reading, held)
         return mean
 
@@ -70,16 +70,16 @@ def command(command, monkeypatch, tmp_path):
 @pytest.mark.parametrize("env_id", KINDS)
 def test_a_plain_estimator_works_everywhere(env_id, short):
     paper = baselines_of(env_id).score_paper
-    told = []
+    counts = []
     result = filtergym.evaluate(
-        env_id, {"class": Start, "object": Start(), paper: paper}, episodes=3, progress=told.append, **short
+        env_id, {"class": Start, "object": Start(), paper: paper}, episodes=3, progress=counts.append, **short
     )
     assert result.kind.values.tolist() == ["estimator", "estimator", "policy"]
     assert np.isfinite(result.error.values).all()
     assert np.isfinite(result.cost.values).all()
     assert np.isfinite(result.nees.values).all()
     np.testing.assert_array_equal(result.error.values[0], result.error.values[1])
-    assert sum(told) == 3 * 3 * short["horizon"]
+    assert sum(counts) == 3 * 3 * short["horizon"]
     measured = {r.metric for r in filtergym.tidy_records(result) if r.policy == "class"}
     assert {"cost", "anees", "relative_cost_difference"} <= measured
 
@@ -91,7 +91,7 @@ def test_in_a_closed_loop_an_estimate_flies_its_own_truth_on_the_same_noise():
     result = filtergym.evaluate(env, competitors, episodes=episodes, horizon=100)
     measured, noise, truths = list(model.task.measured), [], []
     for name, recording in competitors.items():
-        measurements, means = zip(*recording.said, strict=True)
+        measurements, means = zip(*recording.estimates, strict=True)
         errors = result.error.sel(policy=name).transpose("time", "component", "episode").values
         truth = np.stack(means) - errors
         there = np.stack([m.available for m in measurements])
@@ -99,8 +99,8 @@ def test_in_a_closed_loop_an_estimate_flies_its_own_truth_on_the_same_noise():
         noise.append(np.where(there > 0, readings - truth[:, measured], 0.0))
         truths.append(truth)
         # What it estimates is flown: the control that follows is in force until the next measurement.
-        commanded = [model.task.autopilot(mean, m.command) for m, mean in recording.said]
-        np.testing.assert_array_equal([m.control for m, _ in recording.said[1:]], commanded[:-1])
+        commanded = [model.task.autopilot(mean, m.command) for m, mean in recording.estimates]
+        np.testing.assert_array_equal([m.control for m, _ in recording.estimates[1:]], commanded[:-1])
     assert abs(truths[0] - truths[1]).max() > 1.0
     # Rounding of truths of some hundred degrees.
     np.testing.assert_allclose(noise[0], noise[1], rtol=0, atol=1e-11)
@@ -116,10 +116,10 @@ def wrong_at(step, lane, change):
         def update(self, memory, measurement):
             mean, covariance, k = memory
             k += 1
-            said = mean.copy(), covariance.copy()
+            estimate = mean.copy(), covariance.copy()
             if k == step:
-                said = change(*said, lane) or said
-            return *said, (mean, covariance, k)
+                estimate = change(*estimate, lane) or estimate
+            return *estimate, (mean, covariance, k)
 
     return Wrong
 
@@ -203,7 +203,9 @@ class Losing:
 """
 
 
-def test_lost_episodes_stand_in_table_records_and_results(command, without_figures, monkeypatch, tmp_path):
+def test_lost_episodes_stand_in_table_records_and_results(
+    command, success, without_figures, monkeypatch, tmp_path
+):
     """Two of twenty, in two pieces of work; what others have finished is not lost."""
     monkeypatch.delitem(sys.modules, "losing", raising=False)
     monkeypatch.chdir(tmp_path)
@@ -223,20 +225,21 @@ def test_lost_episodes_stand_in_table_records_and_results(command, without_figur
     code, output, errors = command(*words, "--strict")
     assert (code, errors.count("\n")) == (2, 1)
     assert "losing:Losing': the covariance is not finite in episode 3 at measurement 1" in errors
-    told = "losing:Losing: 2 of 14 episodes lost: the covariance is not finite in episode 3 at measurement 1"
-    # Every number kept, and summaries alone, in pieces: the same is told.
+    message = (
+        "losing:Losing: 2 of 14 episodes lost: the covariance is not finite in episode 3 at measurement 1"
+    )
+    # Every number kept, and summaries alone, in pieces: the same message.
     for further in (("--out", "out"), ("--out", "small", "--no-netcdf")):
         monkeypatch.setattr("filtergym.evaluation.running.summary.TOGETHER", 8)
-        code, output, errors = command(*words, *further)
-        assert code == 0, errors
-        assert told in " ".join(output.split())
+        output = success(*words, *further)
+        assert message in " ".join(output.split())
         [record] = [
             record for record in json.loads(Path("records.json").read_text())
             if record["metric"] == "lost_episodes"
         ]  # fmt: skip
         assert (record["policy"], round(14 * record["value"])) == ("losing:Losing", 2)
         [result], _ = read_results(Path(further[1]))
-        assert [note for note in result.notes if note.startswith(told)]
+        assert [note for note in result.notes if note.startswith(message)]
 
 
 RAISING = """class AtUpdate:
@@ -263,7 +266,7 @@ class Nothing:
 """
 
 
-def test_what_an_estimator_raises_is_told_with_its_own_line(command, monkeypatch):
+def test_an_error_of_an_estimator_names_its_line(refusal, monkeypatch):
     monkeypatch.delitem(sys.modules, "raising", raising=False)
     Path("raising.py").write_text(RAISING)
     words = ("evaluate", ID, "--episodes", 2, "--set", "horizon=3", "--policy")
@@ -276,17 +279,14 @@ def test_what_an_estimator_raises_is_told_with_its_own_line(command, monkeypatch
         ("AtStart", "failed at the start of the track: KeyError: 'lost'", 12),
         ("AtBirth", "cannot be made: ZeroDivisionError: division by zero", 17),
     ):
-        code, _, errors = command(*words, f"raising:{name}")
-        assert (code, errors.count("\n")) == (2, 1), errors
+        errors = refusal(*words, f"raising:{name}")
         assert f"estimator 'raising:{name}' {message}" in errors
         assert errors.rstrip().endswith(f"(raising.py, line {line})")
     monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words), "raising:AtBirth", "--debug"])
     with pytest.raises(ValueError, match="AtBirth") as caught:
         main()
     assert caught.value.__cause__ is not None
-    code, _, errors = command(*words, "raising:Nothing")
-    assert (code, errors.count("\n")) == (2, 1)
-    assert "an estimator the methods start and update" in errors
+    assert "an estimator the methods start and update" in refusal(*words, "raising:Nothing")
 
 
 def test_a_name_that_is_taken_is_refused():
@@ -300,7 +300,7 @@ def test_a_constructor_gets_the_task_where_it_needs_one():
         def __init__(self, gain=0.5):
             self.gain = gain
 
-    class Told(Start):
+    class NeedsTask(Start):
         def __init__(self, task=None):
             self.task = task
 
@@ -310,7 +310,7 @@ def test_a_constructor_gets_the_task_where_it_needs_one():
 
     assert make_competitor(Setting, "task").gain == 0.5
     assert make_competitor(partial(Setting, gain=0.7), "task").gain == 0.7
-    assert make_competitor(Told, "task").task == "task"
+    assert make_competitor(NeedsTask, "task").task == "task"
     assert make_competitor(partial(Needing, gain=0.7), "task").__dict__ == {"task": "task", "gain": 0.7}
 
 
@@ -331,13 +331,12 @@ def test_the_papers_algorithm_is_known_by_another_name():
     assert compare({"another": "kalman-imm"}, "first reading")[0] == "first reading"
 
 
-def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkeypatch):
+def test_a_class_of_ones_own_is_found_from_the_working_directory(success, monkeypatch):
     """The example of the page, as the page runs it."""
     monkeypatch.delitem(sys.modules, "mine", raising=False)
     monkeypatch.chdir(EXAMPLES)
     words = [word for name in ("mine:Mine", "imm", "bptt", "known-turn") for word in ("--policy", name)]
-    code, output, errors = command("evaluate", ID, "--episodes", 3, "--set", "horizon=10", *words)
-    assert code == 0, errors
+    output = success("evaluate", ID, "--episodes", 3, "--set", "horizon=10", *words)
     assert [line for line in output.splitlines() if line.startswith("> mine:Mine  ")]
     assert output.count("mine:Mine: ") > 1  # why, in sentences: it is the first that is named
     assert re.match(r"mine:Mine: [\d.]+ ", output)  # the first sentence is about the user's own

@@ -18,7 +18,6 @@ ID = "mine/InvertedPendulum-v0"
 
 @pytest.fixture(scope="module", autouse=True)
 def example():
-    """The module, registered."""
     yield from load_module(FOLDER / "inverted_pendulum.py")
 
 

@@ -10,7 +10,6 @@ from rich.table import Table
 from rich.text import Text
 
 from filtergym import evaluate, record, tidy_records
-from filtergym.__main__ import main
 from filtergym.commands import evaluation
 from filtergym.evaluation.running.metrics import flight_records
 from filtergym.papers.grid import Grid
@@ -110,21 +109,14 @@ def test_what_latex_takes_for_commands_is_escaped():
     assert latex_text("σ λ ± 日 é") == r"$\sigma$ $\lambda$ $\pm$ [U+65E5] é"
 
 
-def run(monkeypatch, *words):
-    monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
-
-
-def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsys):
+def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, success, refusal):
     out = tmp_path / "out"
     words = f"evaluate {ENV} --scenario paper --policy imm --policy adaptive --episodes 4".split()
     options = ("--format", "svg", "--columns", 1)
     # All figures are drawn by a test of the command line.
     drawn = evaluation.evaluation_figures
     monkeypatch.setattr(evaluation, "evaluation_figures", lambda *a, **k: itertools.islice(drawn(*a, **k), 1))
-    assert run(monkeypatch, *words, "--set", "horizon=20", "--out", out, *options) == 0
+    success(*words, "--set", "horizon=20", "--out", out, *options)
     expected = {"records.json", "records.csv", "table.tex", "results.nc", "results.json", "report.html"}
     expected |= {"rmse_over_time.svg", "worst_episodes.svg"}
     assert {path.name for path in out.iterdir()} == expected
@@ -140,19 +132,15 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
         raise ValueError("no ink")
 
     monkeypatch.setattr("filtergym.commands.evaluation.save", spoilt)
-    assert run(monkeypatch, *words, "--out", tmp_path / "none") == 2
+    refusal(*words, "--out", tmp_path / "none")
+    for wrong, named in (("--format", "gif"), "got 'gif'"), (("--columns", 3), "columns"):
+        assert named in refusal(*words, "--out", tmp_path / "none", *wrong)
     assert not (tmp_path / "none").exists()
-    capsys.readouterr()
-    for wrong in (("--format", "gif"), ("--columns", 3)):
-        assert run(monkeypatch, *words, "--out", tmp_path / "refused", *wrong) == 2
-        assert not (tmp_path / "refused").exists()
-    assert "got 'gif'" in capsys.readouterr().err
 
 
-def test_results_that_do_not_fit_are_left_out_and_told(tmp_path, without_figures, monkeypatch, capsys):
+def test_results_that_do_not_fit_are_left_out_and_reported(tmp_path, without_figures, monkeypatch, success):
     monkeypatch.setattr("filtergym.commands.evaluation.MOST_BYTES", 1000)
     words = ("evaluate", ENV, "--scenario", "paper", "--policy", "imm", "--episodes", 4, "--out", tmp_path)
-    assert run(monkeypatch, *words) == 0
+    assert "results.nc is left out" in success(*words)
     assert not (tmp_path / "results.nc").exists()
     assert (tmp_path / "records.csv").exists()
-    assert "results.nc is left out" in capsys.readouterr().out

@@ -55,7 +55,7 @@ def test_shipped_agents_act_as_they_do_here(env, name, tmp_path):
 
 
 def random_network(unit, output, activation, control):
-    """Arrays of a small network that nobody has trained, for a bank of the radar."""
+    """Arrays of a small network that is not trained, for a bank of the radar."""
     random = numpy.random.default_rng(2)
     model = make_model(import_problem(RADAR).task, control)
     fields = [field.name for field in model.fields][::-1]
@@ -108,14 +108,14 @@ def test_metadata_names_what_goes_in_and_out(tmp_path):
     path = tmp_path / "agent.onnx"
     export_onnx(request_export(import_problem("filtergym/TightlyCoupledNavigation-v0"), "bptt"), path)
     session = session_of(str(path))
-    said = session.get_modelmeta().custom_metadata_map
-    fields = json.loads(said["fields"])
-    assert said["environment"] == "filtergym/TightlyCoupledNavigation-v0"
+    metadata = session.get_modelmeta().custom_metadata_map
+    fields = json.loads(metadata["fields"])
+    assert metadata["environment"] == "filtergym/TightlyCoupledNavigation-v0"
     assert session.get_inputs()[0].shape == ["N", len(fields)]
-    assert len(json.loads(said["units"])) == len(json.loads(said["descriptions"])) == len(fields)
+    assert len(json.loads(metadata["units"])) == len(json.loads(metadata["descriptions"])) == len(fields)
     assert "accelerometer_forward" in fields
-    assert said["around"] == "acts behind a gate"
-    assert said["decision_interval"] == "10"
+    assert metadata["around"] == "acts behind a gate"
+    assert metadata["decision_interval"] == "10"
 
 
 def test_what_has_no_network_is_refused(tmp_path):

@@ -5,7 +5,7 @@ import subprocess
 import numpy as np
 import pytest
 from own_models import make_models
-from test_exports_c import SANITIZERS, compiler
+from test_exports_c import built
 
 from filtergym.baselines.problem import problem_of
 from filtergym.compiler.c_text import DOUBLE, FLOAT
@@ -16,9 +16,9 @@ from filtergym.evaluation.competitors.filters import as_filter
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds
-from filtergym.exports.c_source import FLAGS, Writer, export_c, files_of
+from filtergym.exports.c_source import Writer, export_c
 from filtergym.exports.replay import replay, run_filter
-from filtergym.exports.request import ExportRequest
+from filtergym.exports.request import request_export
 from filtergym.exports.traced_filter import FilterSteps, trace_filter
 from filtergym.names import find_competitor
 
@@ -61,7 +61,6 @@ int main(int argc, char **argv) {{
 
 @pytest.fixture
 def state_space():
-    """Make an environment of a model of one's own."""
     yield from make_models({})
 
 
@@ -69,17 +68,14 @@ class Exported:
     """A competitor as C, compiled with the sanitizers, and what it is given."""
 
     def __init__(self, folder, problem, name, scalar=DOUBLE):
-        self.problem, self.name, self.folder, self.scalar = problem, name, folder, scalar
+        self.problem, self.name, self.scalar = problem, name, scalar
         self.maker = find_competitor(problem, name).maker
-        self.request = ExportRequest(problem, name, self.maker)
+        self.request = request_export(problem, name)
         self.traced, self.given = replay(self.request, 1, MEASUREMENTS)
         writer = Writer(name, self.traced, scalar, self.given.components)
         own = DRIVER.format(own=writer.name, upper=writer.name.upper())
-        for file, text in {**files_of(writer, self.given), "driver.c": own}.items():
-            (folder / file).write_text(text, encoding="ascii")
+        self.driver = built(folder, writer, self.given, own)
         self.header = (folder / f"{writer.name}.h").read_text()
-        words = [compiler(), *FLAGS, *SANITIZERS, "driver.c", f"{writer.name}.c", "-lm", "-o", "driver"]
-        subprocess.run(words, cwd=folder, check=True)
 
     @property
     def declared(self):
@@ -88,19 +84,19 @@ class Exported:
     def answers(self, rows, *arguments):
         """Statuses of sets ``(S, numbers)``, and estimates ``(sets that are taken, T, numbers)``."""
         given = np.asarray(rows, dtype=self.scalar.dtype).tobytes()
-        said = subprocess.run(
-            [self.folder / "driver", *arguments], input=given, capture_output=True, check=True
+        output = subprocess.run(
+            [self.driver, *arguments], input=given, capture_output=True, check=True
         ).stdout
         statuses, estimates, size = [], [], len(self.traced.estimate)
-        while said:
-            statuses.append(np.frombuffer(said[:8])[0])
-            said = said[8:]
+        while output:
+            statuses.append(np.frombuffer(output[:8])[0])
+            output = output[8:]
             if statuses[-1] == 0.0:
                 count = MEASUREMENTS * size * self.scalar.dtype().itemsize
                 estimates.append(
-                    np.frombuffer(said[:count], dtype=self.scalar.dtype).reshape(MEASUREMENTS, size)
+                    np.frombuffer(output[:count], dtype=self.scalar.dtype).reshape(MEASUREMENTS, size)
                 )
-                said = said[count:]
+                output = output[count:]
         return np.array(statuses), np.array(estimates)
 
     def structure(self, template, rows):
@@ -126,8 +122,8 @@ class Exported:
         state = own.start(self.structure(started[0], self.given.initial[:, 0]))
         found = []
         for row in self.given.measurements[:, :, 0]:
-            state, told = steps.update(state, self.structure(lanes.state.measurement, row))
-            found.append(np.concatenate([np.reshape(part, (-1, SETS)) for part in told.values()]))
+            state, records = steps.update(state, self.structure(lanes.state.measurement, row))
+            found.append(np.concatenate([np.reshape(part, (-1, SETS)) for part in records.values()]))
         return np.moveaxis(np.array(found), -1, 0)
 
     def made_anew(self, keywords):
@@ -248,7 +244,7 @@ def test_without_a_choice_the_bits_are_those_of_the_filter(name, tmp_path):
 
 def test_what_cannot_be_set_is_named(tmp_path):
     problem = problem_of("filtergym/UavAutopilot-v0")
-    export_c(ExportRequest(problem, "mehra", find_competitor(problem, "mehra").maker), tmp_path)
+    export_c(request_export(problem, "mehra"), tmp_path)
     text = " ".join((tmp_path / "mehra.h").read_text().split())
     assert "Parameters: this filter has none." in text
     assert "Constant here" in text

@@ -1,5 +1,6 @@
 """Filters as C99: they are what was judged, compile without a warning, and nothing gets in that is no number."""
 
+import io
 import json
 import re
 import shutil
@@ -27,13 +28,6 @@ from filtergym.names import find_competitor
 
 EVIL = 'x */ #include "/etc/passwd" \n// \\ ??/ "; system("true"); /* µ\u202e'
 SANITIZERS = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-
-
-@pytest.fixture
-def run(command, monkeypatch, tmp_path):
-    """Run the command line in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return command
 
 
 def replayed(environment, name, keywords=None, scenario=None, **options):
@@ -67,7 +61,7 @@ def test_programs_of_a_filter_answer_what_it_answers(environment, name, keywords
 
 
 class Symmetric:
-    """An estimator whose memory holds numbers twice, constants, and what nobody reads."""
+    """An estimator whose memory holds numbers twice, constants, and unread values."""
 
     kind, traceable = "estimator", True
 
@@ -156,6 +150,15 @@ def compiler():
     return found
 
 
+def built(folder, writer, given, program="", flags=SANITIZERS):
+    """Write the files of a filter, and a program of its own in place of theirs; compile it and return its path."""
+    for file, text in {**files_of(writer, given), **({"main.c": program} if program else {})}.items():
+        (folder / file).write_text(text, encoding="ascii")
+    words = [compiler(), *FLAGS, *flags, "main.c", f"{writer.name}.c", "-lm", "-o", "run"]
+    subprocess.run(words, cwd=folder, check=True)
+    return folder / "run"
+
+
 @pytest.mark.parametrize(
     ("environment", "name", "scalar"),
     [
@@ -168,25 +171,19 @@ def test_c_compiles_without_a_warning_and_answers_what_the_filter_answers(
     environment, name, scalar, tmp_path
 ):
     writer, given = writer_of(environment, name, scalar)
-    said = compile_and_test(writer, given, compiler(), (*FLAGS, "-O0"))
+    output = compile_and_test(writer, given, compiler(), (*FLAGS, "-O0"))
     # Measured 4e-13 of all agents, their networks in double; the other figure is that of float.
-    assert float(said.split()[2]) < (1e-9 if scalar is c_source.DOUBLE else 1e-2)
-    for file, text in files_of(writer, given).items():
-        (tmp_path / file).write_text(text, encoding="ascii")
-    words = [compiler(), *FLAGS, *SANITIZERS, "main.c", f"{writer.name}.c", "-lm", "-o", "run"]
-    subprocess.run(words, cwd=tmp_path, check=True)
-    table = subprocess.run(
-        [tmp_path / "run", "measurements.csv"], cwd=tmp_path, check=True, capture_output=True
-    )
-    (tmp_path / "estimates.csv").write_bytes(table.stdout)
-    estimates = pd.read_csv(tmp_path / "estimates.csv")
+    assert float(output.split()[2]) < (1e-9 if scalar is c_source.DOUBLE else 1e-2)
+    program = built(tmp_path, writer, given)
+    table = subprocess.run([program, "measurements.csv"], cwd=tmp_path, check=True, capture_output=True)
+    estimates = pd.read_csv(io.BytesIO(table.stdout))
     assert estimates[["track", "measurement"]].iloc[-1].tolist() == [3, 30]
     own = estimates.filter(like="estimate_").to_numpy().reshape(3, 30, -1)
     assert given.largest_difference(np.moveaxis(own, 0, -1)) < 1e-2
     sigma = estimates.filter(like="sigma_").to_numpy().reshape(3, 30, -1)
     np.testing.assert_allclose(np.moveaxis(sigma, 0, -1), given.sigma, rtol=1e-3)
     # The same program; a table has nine digits of a float.
-    np.testing.assert_allclose(converse(tmp_path / "run", given), np.moveaxis(own, 0, -1), rtol=1e-8)
+    np.testing.assert_allclose(converse(program, given), np.moveaxis(own, 0, -1), rtol=1e-8)
 
 
 def converse(program, given):
@@ -202,8 +199,8 @@ def converse(program, given):
     rows = [given.initial.T, *np.moveaxis(given.measurements, -1, 1)]
     frames = b"".join(np.ascontiguousarray(row, dtype="<f8").tobytes() for row in rows)
     spoken = json.dumps(hello).encode() + b"\n"
-    said = subprocess.run([program], input=spoken + frames, capture_output=True, check=True).stdout
-    answer, _, content = said.partition(b"\n")
+    output = subprocess.run([program], input=spoken + frames, capture_output=True, check=True).stdout
+    answer, _, content = output.partition(b"\n")
     assert json.loads(answer) == {"filtergym": 1, "format": "float64"}
     refused = subprocess.run(
         [program], input=spoken.replace(b": 1,", b": 2,"), capture_output=True, check=False
@@ -233,7 +230,7 @@ def test_at_the_ends_of_parameters_c_differs_by_the_last_digit(environment, name
     ("environment", "name", "scenario", "horizon"),
     [
         ("UavAutopilot", "bptt-small", None, 120),  # is shown readings that sensors hold in dropouts
-        # Bearings are told where an emitter is heard.
+        # Bearings are given where an emitter is heard.
         ("RadarEsmTracking", "forgetting-joint-type", None, 60),
     ],
 )
@@ -245,7 +242,7 @@ def test_an_exported_policy_competes_as_what_it_was(environment, name, scenario,
 def costs_of(environment, name, folder, scenario=None, **keywords):
     """Costs of the episodes of a policy, and of the program that it is exported as, ``(2, episodes)``."""
     problem = problem_of(f"filtergym/{environment}-v0")
-    export_c(ExportRequest(problem, name, find_competitor(problem, name).maker, scenario, keywords), folder)
+    export_c(request_export(problem, name, scenario, **keywords), folder)
     words = [compiler(), "-std=c99", "-O0", "main.c", f"{file_stem(name)}.c", "-lm", "-o", "run"]
     subprocess.run(words, cwd=folder, check=True)
     both = {"own": name, "program": Program(str(folder / "run"))}
@@ -266,7 +263,7 @@ def test_an_exported_bank_steers_the_tracking_loops(tmp_path, monkeypatch):
     keywords = {"aperture_probability": 1.0, "rate_aperture": 2.0, "horizon": 60}
     own, program = costs_of("TightlyCoupledNavigation", "multi-hypothesis", tmp_path, **keywords)
     np.testing.assert_allclose(program, own, rtol=1e-9)
-    # The loops lose rates here: with what the estimate says alone others, and the costs are others.
+    # The loops lose rates here: by the estimate alone others, and the costs are others.
     monkeypatch.setattr(HypothesisBank, "feedback", lambda *given: None)
     name = "multi-hypothesis"
     other = evaluate("filtergym/TightlyCoupledNavigation-v0", name, None, 16, backend="numpy", **keywords)
@@ -340,19 +337,12 @@ int main(void) {{
 def test_a_measurement_that_makes_the_estimate_no_number_leaves_the_state_alone(tmp_path):
     writer, given = writer_of("ManeuveringTarget", "kalman-imm")
     own = REJECTION.format(own=writer.name, upper=writer.name.upper())
-    for file, text in {**files_of(writer, given), "own.c": own}.items():
-        (tmp_path / file).write_text(text, encoding="ascii")
-    words = [compiler(), *FLAGS, *SANITIZERS, "own.c", f"{writer.name}.c", "-lm", "-o", "own"]
-    subprocess.run(words, cwd=tmp_path, check=True)
-    assert subprocess.run([tmp_path / "own"], check=False).returncode == 0
+    assert subprocess.run([built(tmp_path, writer, given, own)], check=False).returncode == 0
 
 
 def test_a_table_of_another_form_is_refused(tmp_path):
     writer, given = writer_of("ManeuveringTarget", "fixed-low")
-    for file, text in files_of(writer, given).items():
-        (tmp_path / file).write_text(text, encoding="ascii")
-    words = [compiler(), *FLAGS, *SANITIZERS, "main.c", f"{writer.name}.c", "-lm", "-o", "run"]
-    subprocess.run(words, cwd=tmp_path, check=True)
+    program = built(tmp_path, writer, given)
     header, first, *_ = (tmp_path / "measurements.csv").read_text().splitlines()
     for table, sentence in (
         ("x,y\n1,2\n", "the first line must be initial_mean_0"),
@@ -360,11 +350,11 @@ def test_a_table_of_another_form_is_refused(tmp_path):
         (f"{header}\n{',' * header.count(',')}\n", "must begin a track"),
         ("", "the first line must be"),
     ):
-        done = subprocess.run([tmp_path / "run"], input=table, capture_output=True, text=True, check=False)
+        done = subprocess.run([program], input=table, capture_output=True, text=True, check=False)
         assert done.returncode == 2
         assert sentence in done.stderr
     windows = subprocess.run(
-        [tmp_path / "run"], input=f"{header}\r\n{first}\r\n\r\n", capture_output=True, text=True, check=True
+        [program], input=f"{header}\r\n{first}\r\n\r\n", capture_output=True, text=True, check=True
     )
     assert len(windows.stdout.splitlines()) == 2
 
@@ -373,12 +363,9 @@ def test_the_program_of_the_page_follows_a_track(tmp_path):
     page = (Path(__file__).parent.parent / "docs" / "device.md").read_text(encoding="utf-8")
     own = re.search(r"```c\n(.*?)```", page, re.DOTALL)[1]
     writer, given = writer_of("ManeuveringTarget", "kalman-imm-tuned")
-    for file, text in {**files_of(writer, given), "own.c": own}.items():
-        (tmp_path / file).write_text(text, encoding="ascii")
-    words = [compiler(), *FLAGS, "-O0", "own.c", f"{writer.name}.c", "-lm", "-o", "own"]
-    subprocess.run(words, cwd=tmp_path, check=True)
+    program = built(tmp_path, writer, given, own, ["-O0"])
     plots = "".join(f"{6 * k},{40000 - 900 * k},{12000 + 120 * k}\n" for k in range(1, 20))
-    done = subprocess.run([tmp_path / "own"], input=plots, capture_output=True, text=True, check=True)
+    done = subprocess.run([program], input=plots, capture_output=True, text=True, check=True)
     last = [float(x) for x in re.findall(r"-?[\d.]+(?= m)", done.stdout.splitlines()[-1])]
     np.testing.assert_allclose(last, [40000 - 900 * 19, 12000 + 120 * 19, -150.0, 20.0], rtol=0.02)
 
@@ -435,12 +422,11 @@ def test_a_strangers_words_cannot_get_into_the_text(tmp_path):
 # --- the export
 
 
-def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch):
+def test_an_export_is_described_also_without_a_compiler(tmp_path, monkeypatch):
     monkeypatch.setattr(c_source.shutil, "which", lambda _: None)
     problem = problem_of("filtergym/ManeuveringTarget-v0")
-    maker = find_competitor(problem, "kalman-imm").maker
     folder = tmp_path / "new" / "imm"
-    request = ExportRequest(problem, "kalman-imm", maker, keywords={"horizon": 20})
+    request = request_export(problem, "kalman-imm", horizon=20)
     figures = export_c(request, folder, "float", "as typed")
     assert figures.test == ""
     assert figures.replaced == (1e-300,)
@@ -458,7 +444,7 @@ def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch
     assert "double" not in (folder / "kalman_imm.c").read_text()
 
 
-def test_the_time_of_an_update_is_that_of_optimised_code_and_says_so(tmp_path, monkeypatch):
+def test_the_time_of_an_update_is_of_optimised_code_and_labelled(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(
         c_source, "compile_and_test", lambda *_, flags: seen.append(flags[-1]) or "5 ns an update"
@@ -471,7 +457,7 @@ def test_the_time_of_an_update_is_that_of_optimised_code_and_says_so(tmp_path, m
     assert [short.test, long.test] == [f"5 ns an update with cc {level}" for level in seen]
 
 
-def test_the_operations_of_a_network_are_told_beside_those_of_the_filter(tmp_path, monkeypatch):
+def test_the_operations_of_a_network_stand_beside_those_of_the_filter(tmp_path, monkeypatch):
     monkeypatch.setattr(c_source.shutil, "which", lambda _: None)
     problem = problem_of("filtergym/ManeuveringTarget-v0")
     # 14 numbers are shown, 6 units, 2 answers: a product and a sum for each weight, and the biases.
@@ -495,20 +481,14 @@ def test_a_precision_in_which_a_filter_is_wrong_is_refused(tmp_path, monkeypatch
     with pytest.raises(
         ValueError, match=r"'fixed-low' in float is off by .*more than 1e-09.*export it in double"
     ):
-        export_c(
-            ExportRequest(problem, "fixed-low", find_competitor(problem, "fixed-low").maker),
-            tmp_path / "new",
-            "float",
-        )
+        export_c(request_export(problem, "fixed-low"), tmp_path / "new", "float")
     assert not (tmp_path / "new").exists()
 
 
-def test_the_command_writes_a_filter(run, tmp_path):
-    code, said, errors = run(
-        "export", "filtergym/ManeuveringTarget-v0", "fixed-low", "--to", "c", "--set", "horizon=12"
-    )
-    assert code == 0, errors
-    assert "fixed_low.h" in said
+def test_the_command_writes_a_filter(success, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ("filtergym/ManeuveringTarget-v0", "fixed-low", "--to", "c", "--set", "horizon=12")
+    assert "fixed_low.h" in success("export", *words)
     assert {path.name for path in (tmp_path / "fixed_low").iterdir()} == {
         "fixed_low.h", "fixed_low.c", "rows.h", "main.c", "vectors.h", "test.c", "measurements.csv",
     }  # fmt: skip
@@ -529,12 +509,11 @@ def test_the_command_writes_a_filter(run, tmp_path):
             ("filtergym/ManeuveringTarget-v0", "bptt", "--to", "onnx", "--set", "horizon=9"),
             "--set is not for --to onnx",
         ),
-        (("filtergym/ManeuveringTarget-v0", "nobody", "--to", "c"), "unknown policy 'nobody'"),
+        (("filtergym/ManeuveringTarget-v0", "missing", "--to", "c"), "unknown policy 'missing'"),
         (("filtergym/ManeuveringTarget-v0", "imm", "--to", "c", "--set", "gians=1"), "gains"),
     ],
 )
-def test_what_the_command_refuses(words, sentence, run, tmp_path):
-    code, _, errors = run("export", *words)
-    assert code == 2
-    assert sentence in errors
+def test_what_the_command_refuses(words, sentence, refusal, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert sentence in refusal("export", *words)
     assert list(tmp_path.iterdir()) == []

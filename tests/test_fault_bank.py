@@ -78,17 +78,17 @@ def enumerated(bank, task, seen):
         for sequence in itertools.product(range(L), repeat=steps):
             log, x, P = weight, np.zeros(5), np.zeros((5, 5))
             P[:3, :3], P[3, 3] = P0, wandering[j] ** 2
-            for k, said in enumerate(seen, 1):
+            for k, measurement in enumerate(seen, 1):
                 log += math.log(first[sequence[0]] if k == 1 else change[sequence[k - 2], sequence[k - 1]])
                 if k == onset:
                     P[4, 4] = prior.rate**2
                 x, P = F @ x, F @ P @ F.T + Q
                 pulled = onset is not None and onset <= k and (end is None or k < end)
                 h = T * (k - onset + 0.5 * (bank.spacing + 1)) if pulled else 0.0
-                if said.available[0]:
+                if measurement.available[0]:
                     H = np.array([1.0, 0.0, 0.0, -1.0, -h])
-                    S = H @ P @ H + levels[sequence[k - 1]] * said.reported_deviation[0] ** 2
-                    nu = said.ins[0, 0] - said.fix[0, 0] - H @ x
+                    S = H @ P @ H + levels[sequence[k - 1]] * measurement.reported_deviation[0] ** 2
+                    nu = measurement.ins[0, 0] - measurement.fix[0, 0] - H @ x
                     log += -0.5 * (nu**2 / S + math.log(2.0 * math.pi * S))
                     x, P = x + P @ H * nu / S, P - np.outer(P @ H, P @ H) / S
             total.append(log)
@@ -106,8 +106,8 @@ def of_bank(bank, seen):
     """The same of the bank."""
     state = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))))
     total = 0.0
-    for said in seen:
-        state = bank.step(state, FilterInput(said))
+    for measurement in seen:
+        state = bank.step(state, FilterInput(measurement))
         total += np.nan_to_num(state.likelihood.log_likelihood[0])
     return total, state.mean[0, 0], state.covariance[0, 0, 0]
 
@@ -164,7 +164,7 @@ def test_the_first_fix_gives_the_exact_mixture():
     found = bank.step(state, FilterInput(first)).likelihood
     p, nu = task.parameters, first.ins[0, 0] - first.fix[0, 0]
     density = 0.0
-    mixed = np.array([0.8, 0.2])  # a report that is new says more than what was known before
+    mixed = np.array([0.8, 0.2])  # a new report outweighs what was known before
     for weight, *noises in zip(*(np.ravel(x) for x in (bank.noise_weights, *bank.noises)), strict=True):
         drift, coloured, _, white, wandering, _ = noises
         s = p.sampling

@@ -87,8 +87,8 @@ def every_fault(monkeypatch, kind, prepare, write, check):
         with monkeypatch.context() as patch:
             faults = Faults(patch, at + 1, kind)
             with contextlib.suppress(CrashError):
-                told = refusal(write, place)
-                assert not told or ("cannot write" in told and "No space left on device" in told)
+                message = refusal(write, place)
+                assert not message or ("cannot write" in message and "No space left on device" in message)
         check(place)
         if faults.calls <= at:
             return at

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: who is told apart, how kinds look, what the files hold, and what stands on the axes."""
+"""Figures of an evaluation: distinguished competitors, looks of kinds, contents of files, and labels of axes."""
 
 import itertools
 import re
@@ -71,7 +71,7 @@ def texts(figure):
     return [text.get_text() for axis in figure.axes for text in axis.texts]
 
 
-def test_six_lines_are_told_apart_the_most_important_first(curves):
+def test_six_lines_are_distinguished_the_most_important_first(curves):
     chosen = choose_highlights(curves, learned=["bptt"])
     assert len(chosen) == MOST_HIGHLIGHTED
     assert chosen[:4] == ["imm", "known-turn", "known-input-bound", "bptt"]
@@ -84,8 +84,8 @@ def test_six_lines_are_told_apart_the_most_important_first(curves):
     assert "known-turn" not in ranked
     figure = draw_error_over_time(curves, looks(curves, learned=["bptt"]))
     for axis in figure.axes[:2]:
-        told = named(axis)
-        assert len(told) == MOST_HIGHLIGHTED
+        labels = named(axis)
+        assert len(labels) == MOST_HIGHLIGHTED
         grey = [line for line in lines(axis) if to_hex(line.get_color()) == to_hex("0.72")]
         # Every line once, and fewer than there are policies, since two are the same; all but six grey, without a name.
         different = len(np.unique(curves["rmse"].values.reshape(len(NAMES), -1).round(6), axis=0))
@@ -114,7 +114,7 @@ def test_kinds_always_look_the_same(curves):
     assert len({*zip(colours, dashes.values(), strict=True)}) == len(dashes)
     assert look["imm"]["color"] == COLOURS[0]
     assert look["bptt"]["linewidth"] > look["imm"]["linewidth"]
-    # Whoever else is there, the paper's algorithm, references and bounds keep their looks.
+    # With any other competitors, the paper's algorithm, references and bounds keep their looks.
     for other in (["adaptive", "known-turn", "imm"], ["known-input-bound", "imm", "adaptive-rearm"]):
         assert all(
             looks(curves, other)[name][key] == look[name][key]
@@ -140,7 +140,7 @@ def test_what_a_user_brings_has_a_colour_and_the_first_place(curves):
     assert "cost_and_time" not in dict(evaluation_figures(curves))
 
 
-def test_who_is_told_apart_may_be_asked_for(curves):
+def test_distinguished_competitors_may_be_chosen(curves):
     assert choose_highlights(curves, ["adaptive", "imm"]) == ["adaptive", "imm"]
     with pytest.raises(ValueError, match="cannot highlight 'mine': there are fixed-low"):
         choose_highlights(curves, ["mine"])
@@ -190,14 +190,16 @@ def test_labels_stand_at_the_ends_of_lines_and_never_on_each_other(curves):
     figure.draw_without_rendering()
     renderer = figure.canvas.get_renderer()
     for axis in figure.axes[:2]:
-        told = named(axis)
-        boxes = {t.get_text(): t.get_window_extent(renderer) for t in axis.texts if t.get_text() in told}
-        assert set(boxes) == set(told)
+        distinguished = named(axis)
+        boxes = {
+            t.get_text(): t.get_window_extent(renderer) for t in axis.texts if t.get_text() in distinguished
+        }
+        assert set(boxes) == set(distinguished)
         ordered = sorted(boxes.values(), key=lambda box: box.y0)
         assert all(low.y1 <= high.y0 + 0.5 for low, high in itertools.pairwise(ordered))
         for text in axis.texts:
-            if text.get_text() in told:
-                assert text.get_color() == told[text.get_text()].get_color()
+            if text.get_text() in distinguished:
+                assert text.get_color() == distinguished[text.get_text()].get_color()
     # Long names leave too little of a narrow figure: a legend then, and nothing beside the lines.
     long = curves.assign_coords(policy=[f"{name}-with-very-much-to-tell" for name in curves["policy"].values])
     figure = draw_error_over_time(long, columns=1)

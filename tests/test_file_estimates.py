@@ -47,7 +47,7 @@ def test_what_is_written_costs_what_it_has_cost(files, form):
     # Trajectories have nine decimals.
     np.testing.assert_allclose(found["cost"], whole["cost"], rtol=0.0 if form != "tum" else 1e-9)
     assert records["missing", ""] == records["lost_episodes", ""] == 0.0
-    if form == "tum":  # no velocity, and nothing is said of the errors
+    if form == "tum":  # no velocity, and no errors are stated
         assert records["rmse", "velocity"] is None
         assert ("anees", "state") not in records
     else:
@@ -55,7 +55,7 @@ def test_what_is_written_costs_what_it_has_cost(files, form):
         np.testing.assert_array_equal(found["nis"], whole["nis"])
 
 
-def test_a_covariance_is_taken_as_it_is_stated_beside_whoever_states_it(files):
+def test_a_covariance_is_read_in_the_frame_it_is_stated_in(files):
     folder, whole = files
     table = pandas.read_csv(folder / "imm.csv").drop(columns=["policy", "nis", "nis_degrees"])
     names = whole["component"].values.tolist()
@@ -108,7 +108,7 @@ def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
         found = evaluate(TARGET, f"file:{tmp_path / name}.csv", recording, tracks=True)
         np.testing.assert_array_equal(found["cost"], whole["cost"])
         assert not found["missing"].any()
-    # Of the same moments by another clock nothing says that they are the same.
+    # Nothing shows that moments of another clock are the same ones.
     times = table["log_time"].str.partition("T")[2]
     table.drop(columns=["seconds"]).assign(log_time=times).to_csv(tmp_path / "times.csv", index=False)
     with pytest.raises(ValueError, match="are times of day, and those of the log dates"):
@@ -116,7 +116,7 @@ def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("a,b\n1,2\n", "contains no estimate of position_x"),
         ("track,seconds,position_x,position_y\nfoo,1,2,3\n", "tracks foo, and those of the evaluation are 0, 1"),
@@ -129,11 +129,11 @@ def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
         (None, "there is no such file"),
     ],
 )  # fmt: skip
-def test_what_belongs_to_no_track_is_refused(tmp_path, text, said):
+def test_what_belongs_to_no_track_is_refused(tmp_path, text, message):
     if text is not None:
         (tmp_path / "mine.csv").write_text(text)
     task = problem_of(TARGET).experiment(None).make_task()
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         FileEstimates(tmp_path / "mine.csv").of_tracks(task, {11: "0", 12: "1"})
 
 

@@ -134,7 +134,7 @@ def test_what_a_dead_writer_left_is_swept_and_a_living_one_is_left_alone(tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["table"]
 
 
-def test_two_writers_of_a_file_or_a_folder_are_told_apart(tmp_path, writer):
+def test_two_writers_of_a_file_or_a_folder_do_not_mix(tmp_path, writer):
     process = writer(ONE_FILE)
     with pytest.raises(
         ValueError, match="another process writes table now: wait until it ends, or write elsewhere"
@@ -155,7 +155,7 @@ def test_two_writers_of_a_file_or_a_folder_are_told_apart(tmp_path, writer):
     claim_folder(tmp_path)  # its own already
 
 
-def test_a_command_that_is_told_to_end_takes_away_what_is_unfinished(tmp_path, writer):
+def test_a_terminated_command_removes_what_is_unfinished(tmp_path, writer):
     program = FILES.replace(
         "import sys, time, pathlib", "import sys, time, pathlib\nfrom filtergym.__main__ import main"
     )

@@ -21,7 +21,7 @@ SHORT = {"filtergym/TightlyCoupledNavigation-v0": {"horizon": 20}}
 
 
 class Kalman:
-    """A user's constant-velocity filter, from its equations alone; it says how likely each scan was."""
+    """A user's constant-velocity filter, from its equations alone; it returns the likelihood of each scan."""
 
     traceable = True
 
@@ -51,15 +51,13 @@ class Kalman:
             density = density - 0.5 * (innovation * innovation / S + xp.log(2.0 * math.pi * S))
             m, P = m + K * innovation, P - K[:, None] * P[i][None]
             P = 0.5 * (P + xp.moveaxis(P, 0, 1))
-        told = Likelihood(
+        likelihood = Likelihood(
             xp.where(there, density, math.nan), xp.where(there, nis, math.nan), 2.0 * measurement.available
         )
-        return m, P, (m, P), told
+        return m, P, (m, P), likelihood
 
 
 class InPython(Kalman):
-    """The same, asked in Python."""
-
     traceable = False
 
 
@@ -77,7 +75,7 @@ def test_shipped_filters_are_traced(env_id):
             assert fast.backend == "compiled", name
 
 
-def test_a_traceable_class_is_compiled_and_says_what_it_says_in_python():
+def test_a_traceable_class_is_compiled_with_the_results_of_python():
     arguments = {"scenario": "missed-detections", "episodes": 12, "seed": 1}
     found = filtergym.evaluate(TARGET, {"traced": Kalman, "asked": InPython}, **arguments, horizon=50)
     for name in ("error", "cost", "nees", "nis", "nis_degrees", "log_likelihood", "lost"):
@@ -89,11 +87,11 @@ def test_a_traceable_class_is_compiled_and_says_what_it_says_in_python():
     model = make_model(TARGET, backend="compiled")
     assert not close_loop(model, Kalman, "estimator", "mine", 8).filter.in_python
     assert close_loop(model, InPython, "estimator", "mine", 8).filter.in_python
-    # An object was made for arrays of NumPy, whatever its class says.
+    # An object was made for arrays of NumPy, whatever its class declares.
     assert close_loop(model, Kalman(model.task), "estimator", "mine", 8).filter.in_python
 
 
-def test_what_cannot_be_traced_though_it_says_so_runs_in_python_with_a_warning():
+def test_a_class_that_wrongly_claims_to_be_traceable_runs_in_python_with_a_warning():
     class Branches(InPython):
         traceable = True
 
@@ -145,18 +143,18 @@ def test_log_likelihood_of_the_autopilots_filter_is_that_of_the_readings_that_ar
         P = packed_covariance.unpack(
             state.covariance + state.scale * bank.process_noise, len(model.task.components)
         )
-        told = bank.records(state, measurement)["log_likelihood"]
+        found = bank.records(state, measurement)["log_likelihood"]
         for lane in range(8):
             there = np.flatnonzero(measurement.available[:, lane])
             counts.add(len(there))
             if not len(there):
-                assert math.isnan(told[lane])
+                assert math.isnan(found[lane])
                 continue
             rows = [model.task.measured[k] for k in there]
             S = P[np.ix_(rows, rows)][..., lane] + R[np.ix_(there, there)]
             innovation = measurement.reading[there, lane] - state.mean[rows, lane]
             # Sums and roots of a few numbers: 1e-12 of their size.
-            assert told[lane] == pytest.approx(
+            assert found[lane] == pytest.approx(
                 multivariate_normal.logpdf(innovation, cov=S), rel=1e-10, abs=1e-10
             )
         lanes.decide(np.zeros((8, 1)))
@@ -166,8 +164,8 @@ def test_log_likelihood_of_the_autopilots_filter_is_that_of_the_readings_that_ar
 def test_a_user_may_return_the_log_likelihood_alone():
     class Constant(InPython):
         def update(self, memory, measurement):
-            mean, covariance, memory, told = super().update(memory, measurement)
-            return mean, covariance, memory, told.log_likelihood
+            mean, covariance, memory, likelihood = super().update(memory, measurement)
+            return mean, covariance, memory, likelihood.log_likelihood
 
     found = filtergym.evaluate(TARGET, {"all": InPython, "alone": Constant}, episodes=8, horizon=10)
     one, other = (found["log_likelihood"].sel(policy=name).values for name in ("all", "alone"))
@@ -196,9 +194,9 @@ def test_a_traced_filter_that_loses_an_episode_holds_its_last_valid_answer():
 
         def update(self, memory, measurement):
             xp, step = self.xp, memory[2] + 1.0
-            mean, covariance, kept, told = super().update(memory[:2], measurement)
+            mean, covariance, kept, likelihood = super().update(memory[:2], measurement)
             negative = xp.where(step == 4.0, -1.0, 1.0)
-            return mean, covariance * negative, (*kept, step), told
+            return mean, covariance * negative, (*kept, step), likelihood
 
     found = filtergym.evaluate(
         TARGET, {"right": Kalman, "wrong": Wrong}, episodes=8, horizon=8, backend="compiled", tracks=True

@@ -206,11 +206,11 @@ def test_details_of_a_mixture_are_those_of_its_scenarios():
     env = gymnasium.make(ID, scenario=MIXTURE, detailed_info=True, **SHORT)
     many = gymnasium.make_vec(ID, num_envs=9, scenario=MIXTURE, detailed_info=True, **SHORT)
     many.reset(seed=0)
-    told = many.step(np.full((9, 1), 0.1))[4]
+    records = many.step(np.full((9, 1), 0.1))[4]
     for lane in range(9):
         env.reset(seed=lane)
         for name, values in env.step(np.full(1, 0.1))[4].items():
-            np.testing.assert_array_equal(values, told[name][lane])
+            np.testing.assert_array_equal(values, records[name][lane])
 
 
 @pytest.mark.parametrize(
@@ -239,7 +239,7 @@ def test_mixtures_in_words_and_as_dictionaries(scenario, weights):
         ("random:half,paper:0.5", "a mixture in words is scenario:weight"),
     ],
 )
-def test_wrong_mixtures_are_told(scenario, message):
+def test_wrong_mixtures_are_refused(scenario, message):
     with pytest.raises(ValueError, match=message):
         gymnasium.make(ID, scenario=scenario)
 
@@ -255,7 +255,7 @@ def test_wrong_mixtures_are_told(scenario, message):
         ({"scenarios": "paper"}, "unknown option of a reset"),
     ],
 )
-def test_wrong_options_are_told_and_change_nothing(options, message):
+def test_wrong_options_are_refused_and_change_nothing(options, message):
     for env in (gymnasium.make(ID, **SHORT), gymnasium.make_vec(ID, num_envs=2, **SHORT)):
         shown, _ = env.reset(seed=0)
         action = np.zeros(env.action_space.shape)

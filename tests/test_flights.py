@@ -5,7 +5,6 @@ import gzip
 import importlib
 import json
 import runpy
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,7 +16,6 @@ from gymnasium.vector import AutoresetMode
 from models import make_model
 
 from filtergym import Flights, Trajectory, evaluate, tidy_records
-from filtergym.__main__ import main
 from filtergym.envs.logs import flight_tables
 from filtergym.envs.logs.flight_cleaning import fit_parabolas
 from filtergym.envs.logs.flights import read_flights
@@ -32,12 +30,10 @@ FIVE = np.arange(0.0, 200.0, 5.0)
 
 
 def weave(time, start=(2e4, 1e4), speed=120.0):
-    """Position, m, ``(n, 2)``."""
     return np.stack([start[0] + speed * time, start[1] + 500.0 * np.sin(time / 40.0)], axis=1)
 
 
 def table(file, **columns):
-    """Write a CSV file."""
     rows = zip(*columns.values(), strict=True)
     file.write_text("\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)]) + "\n")
     return file
@@ -49,7 +45,6 @@ def flight_file(file, time=FIVE, **of_weave):
 
 
 def as_json(file, **columns):
-    """Write a list of rows."""
     values = [np.array(column).tolist() for column in columns.values()]
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
     text = json.dumps(rows).encode()
@@ -133,7 +128,7 @@ def test_columns_of_opensky_and_traffic(tmp_path):
         assert found.name == name
 
 
-def test_flights_of_one_file_are_told_apart_and_stale_positions_go(tmp_path):
+def test_flights_of_one_file_are_separated_and_stale_positions_go(tmp_path):
     _, latitude, longitude, _ = geodetic()
     latitude[7], longitude[7] = latitude[6], longitude[6]
     latitude[9] = np.nan
@@ -288,10 +283,10 @@ WRONG = [
 @pytest.mark.parametrize(("columns", "message"), WRONG, ids=[message for _, message in WRONG])
 def test_a_wrong_file_is_refused_in_one_sentence(columns, message, tmp_path):
     file = table(tmp_path / "wrong.csv", **columns)
-    with pytest.raises(ValueError, match=message) as told:
+    with pytest.raises(ValueError, match=message) as caught:
         make_model(ID, scenario=file)
-    assert "wrong.csv" in str(told.value)
-    assert "\n" not in str(told.value)
+    assert "wrong.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -536,30 +531,17 @@ def test_means_are_of_what_is_there_where_flights_end():
 # --- the command
 
 
-def test_one_command_on_a_folder_with_two_broken_files(tmp_path, monkeypatch, capsys):
+def test_one_command_on_a_folder_with_two_broken_files(tmp_path, success):
     runpy.run_path(str(DOCS / "examples" / "flights.py"))["write_flights"](tmp_path)
-    words = ["evaluate", ID, "--scenario", str(tmp_path / "*.csv"), "--policy", "imm", "--policy", "adaptive"]
-    monkeypatch.setattr(
-        sys, "argv", ["filtergym", *words, "--episodes", "19", "--json", str(tmp_path / "all.json")]
-    )
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 0
-    out = capsys.readouterr().out
-    told = (DOCS / "own_data.md").read_text(encoding="utf-8")
-    assert out[out.index("ory_07.csv:") :] in told
+    words = ["evaluate", ID, "--scenario", tmp_path / "*.csv", "--policy", "imm", "--policy", "adaptive"]
+    out = success(*words, "--episodes", 19, "--json", tmp_path / "all.json")
+    page = (DOCS / "own_data.md").read_text(encoding="utf-8")
+    assert out[out.index("ory_07.csv:") :] in page
     left_out = (11, 15)
     assert "18 flights" in out
     assert all((f"ory_{i:02} " in out) is (i not in left_out) for i in range(20))
     scenarios = {record["scenario"] for record in json.loads((tmp_path / "all.json").read_text())}
     assert len(scenarios) == 19
-
-
-def test_the_example_of_the_page_prints_what_it_says(capsys):
-    page = (DOCS / "own_data.md").read_text(encoding="utf-8")
-    code = page.partition("```python\n")[2].partition("```")[0]
-    exec(code, {})
-    assert capsys.readouterr().out.strip() == code.strip().rpartition("# ")[2]
 
 
 def test_an_aircraft_that_has_landed_flies_another_flight(tmp_path):

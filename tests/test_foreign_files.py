@@ -1,4 +1,4 @@
-"""Small files that ask for much: each is refused in one sentence, which says what limit it breaks."""
+"""Small files that ask for much: each is refused in one sentence, which names the limit."""
 
 import gzip
 import json
@@ -136,7 +136,7 @@ def netcdf4(path, rows=60, dtype="f8", **more):
 def test_netcdf_of_values_that_were_never_written(tmp_path):
     path = netcdf4(tmp_path / "huge.nc", 2 * 10**9)
     assert path.stat().st_size < 20_000
-    refused(path, r"it holds 6,000,000,000 numbers, more than the 50,000,000 that it may: split it")
+    refused(path, r"it holds 6,000,000,000 numbers, more than the limit of 50,000,000: split it")
 
 
 def test_netcdf_of_long_words(tmp_path):
@@ -250,7 +250,7 @@ def test_yaml_is_counted_with_its_aliases(tmp_path):
     }
 
 
-def test_where_memory_has_no_limit_it_is_said_once(tmp_path, monkeypatch):
+def test_where_memory_has_no_limit_one_warning_states_it(tmp_path, monkeypatch):
     pytest.importorskip("yaml")
     (tmp_path / "a.yml").write_text("a: 1\n")
     monkeypatch.setattr(foreign_files.sys, "platform", "elsewhere")
@@ -263,7 +263,7 @@ def test_where_memory_has_no_limit_it_is_said_once(tmp_path, monkeypatch):
 
 
 def test_a_parser_starts_without_the_package(tmp_path, monkeypatch):
-    """A library that looks for the package where it is imported finds none, and says so by another error."""
+    """A library that looks for the package where it is imported finds none, and raises another error."""
     absent = "assert not any(name.startswith('filtergym') for name in sys.modules)"
     (tmp_path / "pyulog.py").write_text(f"import sys\n{absent}\nraise ImportError")
     monkeypatch.syspath_prepend(tmp_path)
@@ -277,11 +277,11 @@ def test_a_parser_starts_without_the_package(tmp_path, monkeypatch):
 
 def test_values_of_fitted_filters_keep_their_limits(tmp_path):
     path, problem = tmp_path / "a.filter.json", problem_of(TARGET)
-    said = r"log10_acceleration must be from -15\.5 to 13\.5|not the file of an advised filter"
+    message = r"log10_acceleration must be from -15\.5 to 13\.5|not the file of an advised filter"
     for value in (float("nan"), float("inf"), 100, -300, 10**400, "1", None, True):
         values = {"log10_acceleration": value}
         path.write_text(json.dumps({"environment": TARGET, "filter": "constant-velocity", "values": values}))
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             read_artefact(path, problem)
 
 

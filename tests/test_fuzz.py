@@ -30,7 +30,7 @@ WORDS = (
 
 @pytest.fixture
 def command(monkeypatch, capsys):
-    """Run the command line; what it says is at most one sentence, which asks for no report."""
+    """Run the command line; it prints at most one sentence, which asks for no report."""
 
     def run(*words, program=main):
         monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])

@@ -87,7 +87,7 @@ def heard(alarm, shown):
     return np.array(found)
 
 
-def test_false_alarms_are_as_rare_as_it_says():
+def test_false_alarms_are_as_rare_as_stated():
     noise = np.random.default_rng(0).normal(size=(300, 4000, 2))
     alarm = White(300)
     alarm.false_alarms = 0.3
@@ -210,7 +210,7 @@ def test_both_filters_and_alarms_are_compiled_and_nothing_else_comes_out(name, a
 
 
 class Lying(Policy):
-    """Whoever is asked in its place takes the wildest action."""
+    """The network in its place takes the most extreme action."""
 
     control = "gain"
     traceable = True

@@ -4,14 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from naive import positive_definite
 from scipy.stats import multivariate_normal
 
 from filtergym.filters import gaussian, small_matrices
-
-
-def positive_definite(rng, n, batch):
-    root = rng.normal(size=(batch, n, n))
-    return np.moveaxis(root @ root.swapaxes(1, 2) + 0.1 * np.eye(n), 0, -1)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])

@@ -34,7 +34,6 @@ LATER = float(np.finfo(np.float32).eps)
 
 
 def stored_file(env_id, control):
-    """Where the trajectory of an id and control lies."""
     return FOLDER / f"{env_id.split('/')[-1]}-{control}.json"
 
 
@@ -59,7 +58,6 @@ def trajectory_of_stored_actions(env_id, control, backend, decisions):
 
 
 def trajectory(env_id, control, actions, backend="numpy"):
-    """Observations and rewards that the actions lead to."""
     env = gym.make(env_id, control=control, backend=backend, disable_env_checker=True)
     shown, paid = [env.reset(seed=SEED)[0].tolist()], []
     discrete = isinstance(env.action_space, gym.spaces.Discrete)
@@ -123,7 +121,6 @@ def test_no_file_is_left_over():
 
 
 def write_missing():
-    """Write the trajectories that are not there yet."""
     FOLDER.mkdir(exist_ok=True)
     for env_id, cls in catalogue().items():
         for control in cls.controls:

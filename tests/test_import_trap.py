@@ -63,7 +63,6 @@ def everywhere(value, kept=()):
 
 
 def write_table(path, columns):
-    """Write columns as CSV, JSON or Parquet, by the suffix."""
     if path.suffix == ".csv":
         with path.open("w", newline="") as file:
             csv.writer(file).writerows([list(columns), *zip(*columns.values(), strict=True)])
@@ -122,8 +121,8 @@ def flown_ways(folder, command):
             lambda path: make_policy(ENV, "imm", scenario=str(path)),
         ):
             yield f"{call.__code__.co_names} {path.name}", lambda path=path, call=call: call(path)
-    said = {"time": [0.0, 50.0], "position": [[0.0, 0.0], [1e4, 0.0]], "name": NAME, "flight": NAME}
-    yield "scenario from JSON", lambda: gym.make(ENV, scenario=json.loads(json.dumps(said)))
+    track = {"time": [0.0, 50.0], "position": [[0.0, 0.0], [1e4, 0.0]], "name": NAME, "flight": NAME}
+    yield "scenario from JSON", lambda: gym.make(ENV, scenario=json.loads(json.dumps(track)))
     yield "recording from JSON", lambda: gym.make(ENV, scenario={"measurements": {}, "environment": NAME})
 
 
@@ -131,9 +130,9 @@ def spec_ways(folder, command):
     """Specifications of environments, as data sets of Minari hold them."""
     text = gym.make(ENV, horizon=8).spec.to_json()
     task = text.replace(f'"task": "{ENV}"', f'"task": "{NAME}"')
-    for said in (task, text.replace(f'"{ENV}"', f'"{NAME}"')):
-        assert said != text
-        spec = gym.envs.registration.EnvSpec.from_json(said)
+    for changed in (task, text.replace(f'"{ENV}"', f'"{NAME}"')):
+        assert changed != text
+        spec = gym.envs.registration.EnvSpec.from_json(changed)
         yield "gym.make(spec)", lambda spec=spec: gym.make(spec)
         yield "gym.make_vec(spec)", lambda spec=spec: gym.make_vec(spec, num_envs=2)
 
@@ -143,14 +142,14 @@ def minari_ways(folder, command):
     words = ("offline", ENV, "--policy", "imm", "--out", folder / "sets", *SHORT)
     assert command(*words)[0] == 0
     [file] = (folder / "sets").rglob("metadata.json")
-    told = json.loads(file.read_text())
-    name = told["dataset_id"]
-    told |= {"algorithm_name": CLASS, "author": [CLASS], "description": NAME}
+    content = json.loads(file.read_text())
+    name = content["dataset_id"]
+    content |= {"algorithm_name": CLASS, "author": [CLASS], "description": NAME}
     for key in ("env_spec", "eval_env_spec"):
-        if key in told:
-            told[key] = told[key].replace(f'"task": "{ENV}"', f'"task": "{NAME}"')
-    assert NAME in told["env_spec"]
-    file.write_text(json.dumps(told))
+        if key in content:
+            content[key] = content[key].replace(f'"task": "{ENV}"', f'"task": "{NAME}"')
+    assert NAME in content["env_spec"]
+    file.write_text(json.dumps(content))
     yield "minari.load_dataset", lambda: minari.load_dataset(name)[0]
     yield "recover_environment", lambda: minari.load_dataset(name).recover_environment()
     yield "recover_environment, eval", lambda: minari.load_dataset(name).recover_environment(eval_env=True)
@@ -164,12 +163,12 @@ def agent_ways(folder, command):
 
     with safe_open(AGENT.with_suffix(".safetensors"), framework="numpy") as file:
         header, arrays = dict(file.metadata()), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    told = json.loads(header["run"])
+    content = json.loads(header["run"])
     runs = [
-        told | {"environment": NAME},
-        told | {"residual_to": CLASS, "gated": True},
-        told | {"environment": f"{TRAP}:{ENV}", "control": CLASS, "scenario": NAME, "command": NAME},
-        everywhere(told),
+        content | {"environment": NAME},
+        content | {"residual_to": CLASS, "gated": True},
+        content | {"environment": f"{TRAP}:{ENV}", "control": CLASS, "scenario": NAME, "command": NAME},
+        everywhere(content),
     ]
     paths = []
     for i, run in enumerate(runs):
@@ -232,12 +231,12 @@ def settings_ways(folder, command):
 def results_ways(folder, command):
     """Results, evaluations and kept parts of them: JSON, NetCDF, and NumPy's."""
     assert command("evaluate", ENV, "--policy", "imm", *SHORT, "--out", "out")[0] == 0
-    told = json.loads((folder / "out" / "results.json").read_text())
+    results = json.loads((folder / "out" / "results.json").read_text())
     for i, content in enumerate(
         (
-            json.loads(json.dumps(told).replace(ENV, NAME)),
-            json.loads(json.dumps(told).replace('"imm"', f'"{CLASS}"')),
-            everywhere(told, kept=("format", "dims", "dtype")),
+            json.loads(json.dumps(results).replace(ENV, NAME)),
+            json.loads(json.dumps(results).replace('"imm"', f'"{CLASS}"')),
+            everywhere(results, kept=("format", "dims", "dtype")),
         )
     ):
         path = folder / f"results-{i}.json"
@@ -250,9 +249,9 @@ def results_ways(folder, command):
     others = dict.fromkeys(data.attrs, NAME), {"paper": CLASS, "reference": CLASS}
     for attrs in ({"environment": NAME}, *others):
         yield "tidy_records", lambda attrs=attrs: tidy_records(data.assign_attrs(attrs))
-        data.assign_attrs(attrs).to_netcdf(folder / "told.nc", engine="scipy", format="NETCDF3_64BIT")
-        yield "an evaluation as scenario", lambda: gym.make(ENV, scenario=str(folder / "told.nc"))
-        yield "an evaluation as recording", lambda: read_recording(folder / "told.nc")
+        data.assign_attrs(attrs).to_netcdf(folder / "evaluation.nc", engine="scipy", format="NETCDF3_64BIT")
+        yield "an evaluation as scenario", lambda: gym.make(ENV, scenario=str(folder / "evaluation.nc"))
+        yield "an evaluation as recording", lambda: read_recording(folder / "evaluation.nc")
     store, work = Store(folder / "kept"), Work("kept", NAME)
     store.write(work, 1.0)
     [kept] = (folder / "kept").iterdir()
@@ -265,7 +264,7 @@ def results_ways(folder, command):
     for content in (folder / "results-0.json", folder / "results-2.json"):
         (folder / "begun" / "unfinished").mkdir(parents=True, exist_ok=True)
         shutil.copyfile(content, folder / "begun" / name)
-        yield "told of a benchmark", lambda: read_results(folder / "begun" / name)
+        yield "results of a benchmark", lambda: read_results(folder / "begun" / name)
 
 
 @pytest.mark.slow

@@ -57,7 +57,6 @@ def imports_of(file: Path) -> list[tuple[list[str], bool]]:
 
 
 def room_of(file: Path) -> str:
-    """Return the innermost room that a file stands in."""
     return max((room for room in ROOMS if file.is_relative_to(room)), key=len)
 
 
@@ -103,7 +102,7 @@ def test_an_inner_room_knows_only_those_before_it(room: str) -> None:
     assert not wrong
 
 
-def test_every_inner_room_is_small_and_says_what_it_is() -> None:
+def test_every_inner_room_is_small_and_described() -> None:
     for room, inner in INNER_ROOMS.items():
         assert {path.name for path in (ROOT / room).glob("*.py")} == {"__init__.py"}
         for name in inner:
@@ -186,7 +185,7 @@ def test_completion_brings_no_library_that_learns_or_draws(monkeypatch: pytest.M
     assert not imported_by(COMMAND) & {"torch", "stable_baselines3", "matplotlib", "plotly"}
 
 
-def test_an_evaluation_brings_one_environment_and_draws_nothing_that_nobody_keeps() -> None:
+def test_an_evaluation_imports_one_environment_and_draws_nothing_unused() -> None:
     task, id = next(iter(TASKS.items()))
     brought = imported_by(COMMAND, "evaluate", id, "--policy", "random", "--episodes", "8")
     assert brought & TASKS.keys() == {task}

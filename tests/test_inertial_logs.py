@@ -131,7 +131,6 @@ BACKWARD = "rate_x", "rate_y", "acceleration_x", "acceleration_y"
 
 
 def changed(table, columns, change):
-    """A copy of a table, some columns of it replaced."""
     columns = [*columns]
     return table.assign(**{name: change(table[name]) for name in columns})
 
@@ -156,7 +155,7 @@ def changed(table, columns, change):
         (lambda t: changed(t, ["rate_x"], lambda a: a.where(a.index != 7)), "row 7 of the IMU has a cell without"),
     ],
 )  # fmt: skip
-def test_what_no_imu_says_is_refused(pyins, log, change, sentence):
+def test_impossible_imu_values_are_refused(pyins, log, change, sentence):
     imu, fixes, _ = log
     with pytest.raises(ValueError, match=sentence):
         inertial_recording(change(imu), fixes, **WINDOWS)
@@ -172,11 +171,11 @@ def test_what_no_imu_says_is_refused(pyins, log, change, sentence):
         (lambda t: changed(t, ["latitude"], lambda a: 1e7 * a), "must be degrees"),
         (
             lambda t: t.assign(time=pd.date_range("2026-05-01", periods=len(t), freq="500ms")),
-            "write both alike",
+            "use the same form in both",
         ),
     ],
 )
-def test_what_no_receiver_says_is_refused(pyins, log, change, sentence):
+def test_impossible_receiver_values_are_refused(pyins, log, change, sentence):
     imu, fixes, _ = log
     with pytest.raises(ValueError, match=sentence):
         inertial_recording(imu, change(fixes), **WINDOWS)
@@ -235,12 +234,6 @@ def test_metres_of_a_site_are_placed_on_the_ellipsoid():
     np.testing.assert_allclose(
         strapdown.tangent_plane(table, (LATITUDE, LONGITUDE)), [east, north], atol=1e-5
     )
-
-
-def test_without_pyins_the_extra_is_named(log, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pyins", None)
-    with pytest.raises(ValueError, match=r"filtergym\[ins\]"):
-        inertial_recording(*log[:2])
 
 
 @pytest.mark.slow

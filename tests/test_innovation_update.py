@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from naive import positive_definite
 from scipy.stats import multivariate_normal
-from test_kalman import positive_definite
 
 from filtergym.filters import innovation_update
 

@@ -20,19 +20,19 @@ CASES = {
 
 def naive_innovation(environment, recording, estimate, k):
     """Of measurement k > 0 of the first episode, from the estimate after the one before; None where nothing came."""
-    said = {name: values[0, k] for name, values in recording.measurements.items()}
+    measured = {name: values[0, k] for name, values in recording.measurements.items()}
     before = estimate[k - 1]
     if environment == "filtergym/RadarEsmTracking-v0":
         T = recording.seconds[0, k] - recording.seconds[0, k - 1]
         F = np.array([[1.0, T, T**2 / 2.0], [0.0, 1.0, T]])
-        return said["radar"] - F @ before
-    if not said["available"]:
+        return measured["radar"] - F @ before
+    if not measured["available"]:
         return None
     if environment == "filtergym/LooselyCoupledNavigation-v0":
-        return said["fix"] - (
+        return measured["fix"] - (
             before + recording.measurements["ins"][0, k] - recording.measurements["ins"][0, k - 1]
         )
-    return said["position"] - (before[:2] + said["interval"] * before[2:])
+    return measured["position"] - (before[:2] + measured["interval"] * before[2:])
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -74,12 +74,12 @@ def test_records_say_how_large_and_how_white_they_are(case):
         )
 
 
-def test_without_tracks_or_for_a_smoother_nothing_is_said():
+def test_without_tracks_or_for_a_smoother_there_are_no_innovations():
     recording = record("filtergym/ManeuveringTarget-v0", "paper", 1, horizon=20)
     assert "prediction_error" not in evaluate(recording.environment, ["imm"], recording)
     dataset = evaluate(recording.environment, ["imm", "kalman-smoother"], recording, tracks=True)
-    said = {r.policy for r in tidy_records(dataset) if r.metric == "prediction_error"}
-    assert said == {"imm"}
+    competitors = {r.policy for r in tidy_records(dataset) if r.metric == "prediction_error"}
+    assert competitors == {"imm"}
     assert "prediction_error" not in evaluate(
         recording.environment, ["imm"], "paper", episodes=2, tracks=True
     )

@@ -82,7 +82,7 @@ def truth_of(lanes):
 
 
 class Frames(Honest):
-    """Looks into the frames of whoever calls."""
+    """Looks into the frames of its caller."""
 
     def known(self, N):
         frame = sys._getframe()
@@ -249,19 +249,16 @@ def test_names_are_isolated_where_they_are_modules():
             competitor(ID, name)
 
 
-def test_nothing_of_a_module_runs_here(tmp_path, monkeypatch, command):
+def test_nothing_of_a_module_runs_here(tmp_path, monkeypatch, command, refusal, success):
     """Nor where it is wrong: the sentence comes from the other process."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spring.py").write_text("import sys\nsys.exit('no')\n")
     words = ("evaluate", ID, "--isolated", "--episodes", 1, "--set", "horizon=5", "--policy", "spring:Spring")
-    code, shown, _ = command(*words)
-    assert code == 0
+    shown = success(*words)
     assert "1 of 1 episode lost: the program ended in episode 0 at measurement 1" in " ".join(shown.split())
     (tmp_path / "spring.py").write_text("raise OSError('no')\n")
-    code, _, errors = command(*words)
-    assert (code, errors.count("\n")) == (2, 1)
-    assert "'isolated:spring:Spring' takes no part: OSError: no" in errors
+    assert "'isolated:spring:Spring' takes no part: OSError: no" in refusal(*words)
     assert "spring" not in sys.modules
     assert "leave one of them out" in command(*words, "--trust")[2]
 
@@ -314,7 +311,7 @@ def test_a_class_that_ends_its_process_or_hangs_costs_its_own_row(tmp_path):
     for name, ending in (
         ("wretched:Exits", "it has ended the process with exit status 3"),
         ("wretched:Kills", "it has ended the process by SIGKILL"),
-        ("wretched:Hangs", "it has not answered within 1 s, see --time-limit"),
+        ("wretched:Hangs", "it has not responded within 1 s, see --time-limit"),
         ("unborn:Class", "it has ended the process with exit status 0"),
     ):
         assert f"{name!r} takes no part: {ending}" in done.stderr

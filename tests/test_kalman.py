@@ -2,14 +2,10 @@
 
 import numpy as np
 import pytest
+from naive import positive_definite
 from scipy.stats import multivariate_normal
 
 from filtergym.filters import kalman
-
-
-def positive_definite(rng, n, batch):
-    root = rng.normal(size=(batch, n, n))
-    return np.moveaxis(root @ root.swapaxes(1, 2) + 0.1 * np.eye(n), 0, -1)
 
 
 def system(seed, n, m, batch):
@@ -50,7 +46,7 @@ def test_prediction_and_update_equal_naive_matrices(n, m, seed):
         assert result.squared_distance[b] == pytest.approx(distance, rel=1e-9)
 
 
-def test_matrices_shared_by_the_batch_mean_the_same_for_everyone():
+def test_matrices_shared_by_the_batch_equal_repeated_ones():
     s = system(0, 3, 2, 1)
     rng = np.random.default_rng(1)
     mean, covariance, z = rng.normal(size=(3, 5)), positive_definite(rng, 3, 5), rng.normal(size=(2, 5))

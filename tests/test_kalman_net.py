@@ -74,7 +74,7 @@ def test_of_an_ins_zero_answers_are_the_augmented_filter():
 
 
 @pytest.mark.parametrize("plant", ["U", "P"])
-def test_of_an_aircraft_any_answer_is_what_the_description_says(plant):
+def test_gains_for_an_aircraft_follow_the_description(plant):
     """The equations at the head of the module, one lane after the other, with matrices of NumPy."""
     model, initial, measurements = episodes(AIRCRAFT, 8, 60, plant=plant)
     design, p, task = model.task.design, model.task.parameters, model.task
@@ -112,7 +112,7 @@ def test_of_an_aircraft_any_answer_is_what_the_description_says(plant):
             np.testing.assert_allclose(of_gain, rest @ M, rtol=1e-9, atol=1e-9)
 
 
-def test_of_radar_and_esm_any_answer_is_what_the_description_says():
+def test_gains_for_radar_and_esm_follow_the_description():
     """The equations at the head of the module, one lane and class after the other, with matrices of NumPy."""
     model, initial, measurements = episodes(ESM, 6, 12)
     task, bank = model.task, model.filter
@@ -136,7 +136,7 @@ def test_of_radar_and_esm_any_answer_is_what_the_description_says():
             noise, gain = a[classes : classes + 3], a[classes + 3 :]
             R = np.diag(fusion.NOISE_RANGE ** (2.0 * noise[1:])) @ models.R
             W = np.diag(fusion.CAUTION ** (2.0 * gain[1:])) @ R
-            posterior = np.log(before.believed[:, i])
+            posterior = np.log(before.posterior[:, i])
             for s in range(classes):
                 Phi, Q = models.Phi[:, :, s], models.Q[:, :, s]
                 x, carried = Phi @ before.mean[:, s, i], Phi @ P_before[:, :, s, i] @ Phi.T
@@ -155,7 +155,7 @@ def test_of_radar_and_esm_any_answer_is_what_the_description_says():
                 theta = H @ (carried + q_before[i] * Q) @ H.T + R_before[:, :, i]
                 posterior[s] += scipy.stats.multivariate_normal(cov=theta).logpdf(delta)
             weights = np.exp(posterior + esm[:, i] - max(posterior + esm[:, i]))
-            np.testing.assert_allclose(state.believed[:, i], weights / weights.sum(), rtol=1e-7, atol=1e-12)
+            np.testing.assert_allclose(state.posterior[:, i], weights / weights.sum(), rtol=1e-7, atol=1e-12)
             weights *= np.exp(fusion.EVIDENCE * a[:classes])
             np.testing.assert_allclose(
                 state.probabilities[:, i], weights / weights.sum(), rtol=1e-7, atol=1e-12
@@ -197,7 +197,7 @@ def test_of_satellites_the_noise_of_the_motion_holds_until_the_next_measurement(
         assert (state.probabilities == 1.0).all()
 
 
-def test_of_a_radar_any_answer_is_what_the_description_says():
+def test_gains_for_a_radar_follow_the_description():
     """The equations at the head of the module, one lane after the other, with matrices of NumPy."""
     model, initial, measurements = episodes(RADAR, 16, 3)
     rng, bank, correction = np.random.default_rng(0), model.filter, np.zeros((16, 2))
@@ -259,7 +259,7 @@ def test_whatever_the_network_answers_the_filter_reports_a_covariance(id, name, 
     """An evaluation refuses what is not finite, symmetric and positive definite."""
     maker = EstimatorMaker(name, lambda model: network(model, answer))
     cost = filtergym.evaluate(id, {"net": maker}, episodes=8, **SHORT.get(id, {}))["cost"]
-    # The gains of a student are its network's, and nothing keeps those that nobody has trained from losing the track.
+    # The gains of a student are its network's, and nothing keeps those without training from losing the track.
     assert float(cost.max()) < 1e6 or name == "student"
     assert np.isfinite(cost).all()
 
@@ -280,14 +280,14 @@ def test_the_estimator_is_the_policy_in_its_bank(id, name):
         state = model.act(episode, action.T.astype(float)).filter
         np.testing.assert_array_equal(mean, model.filter.mean(state))
         np.testing.assert_array_equal(covariance, model.filter.covariance(state))
-        told = model.filter.records(state, measurement)
+        records = model.filter.records(state, measurement)
         for name, values in likelihood._asdict().items():
-            assert (values is None) == (name not in told)
+            assert (values is None) == (name not in records)
             if values is not None:
-                np.testing.assert_array_equal(values, told[name])
+                np.testing.assert_array_equal(values, records[name])
 
 
-def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
+def test_a_file_is_an_estimator_of_its_environment(tmp_path, success):
     from filtergym.agents.training_run import RunOptions, new_run
 
     pytest.importorskip("stable_baselines3")
@@ -295,8 +295,7 @@ def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
     arrays = network(make_model(RADAR, NAME), 0.3).arrays
     write_arrays(path, arrays, new_run(problem_of(RADAR), RunOptions(NAME)), "tanh")
     assert kind_of(load_policy(problem_of(RADAR).task, path)) == "estimator"
-    code, out, _ = command("evaluate", RADAR, "--policy", path, "--policy", "imm", "--episodes", 2)
-    assert code == 0
+    out = success("evaluate", RADAR, "--policy", path, "--policy", "imm", "--episodes", 2)
     assert [line for line in out.splitlines() if line.startswith(str(path)[:4])]
     with pytest.raises(ValueError, match=f"was trained on '{RADAR}', not on {FUSION}"):
         filtergym.evaluate(FUSION, [str(path)], episodes=1)
@@ -304,14 +303,13 @@ def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
         filtergym.make_policy(RADAR, str(path))
 
 
-def test_training_of_an_environment_without_one(command, tmp_path, monkeypatch):
+def test_training_of_an_environment_without_one(refusal, tmp_path, monkeypatch):
     pytest.importorskip("stable_baselines3")
     monkeypatch.setattr(catalogue()[ESM], "companions", ())
-    code, _, error = command("train", ESM, "--algo", NAME, "--out", tmp_path / "run")
-    assert code == 2
     assert (
-        f"{ESM} has no filter for algorithm '{NAME}': choose another algorithm, or {FUSION}, {RADAR}" in error
+        f"{ESM} has no filter for algorithm '{NAME}': choose another algorithm, or {FUSION}, {RADAR}"
+        in refusal("train", ESM, "--algo", NAME, "--out", tmp_path / "run")
     )
-    code, _, error = command("train", RADAR, "--algo", NAME, "--control", "gain", "--out", tmp_path / "run")
-    assert code == 2
-    assert "unknown control 'gain'" in error
+    assert "unknown control 'gain'" in refusal(
+        "train", RADAR, "--algo", NAME, "--control", "gain", "--out", tmp_path / "run"
+    )

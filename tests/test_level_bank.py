@@ -14,7 +14,6 @@ ID = "filtergym/UavAutopilot-v0"
 
 
 def no_action(bank):
-    """Zero."""
     return np.zeros(bank.action_space.shape)
 
 

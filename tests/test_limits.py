@@ -15,7 +15,7 @@ sys.modules["limits"] = limits
 spec.loader.exec_module(limits)
 
 
-def test_who_is_told_less_than_a_competitor_is_no_limit():
+def test_a_reference_that_knows_less_than_a_competitor_is_no_limit():
     """A reference that is beaten is named as beaten, and by whom."""
     problem = problem_of("filtergym/ManeuveringTarget-v0")
     weak = replace(problem, baselines=replace(problem.baselines, score_reference="fixed-low"))

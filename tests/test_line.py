@@ -45,8 +45,9 @@ KNOWN = {
     "programs of others": {"core"},
 }
 """Parts that a part may import, of those that know few."""
-MOST_LINES = 36_600
-"""Of the core: 36,000, and the declared types of all public names and the process in which a user's class runs."""
+MOST_LINES = 36_700
+"""Of the core: 36,000, and the declared types of all public names, the process in which a user's class runs, and kinds
+and shapes in the docstrings."""
 CIRCLES: set[frozenset[str]] = {
     frozenset({"compiler/namespace.py", "compiler/numpy_functions.py"}),
 }

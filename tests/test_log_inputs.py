@@ -34,13 +34,11 @@ def aircraft(**changes):
 
 
 def untold(**changes):
-    """Without the truth."""
     found = aircraft(**changes)
     return found[[name for name in found if not name.startswith("truth_")]]
 
 
 def read(log, tmp_path, **options):
-    """Write a table and read it as a recording."""
     log.to_csv(tmp_path / "log.csv", index=False, **options)
     return read_recording(tmp_path / "log.csv", TARGET)
 
@@ -108,7 +106,7 @@ def test_positions_alone_judge_positions(tmp_path):
         if r.metric in ("rmse", "cost", "relative_cost_difference", "log_likelihood") and r.window == "all":
             assert r.value == whole[r.policy, r.metric, r.component]
     assert (found["nees_degrees"].values == 2.0).all()
-    # A file of it says the same.
+    # A file of it gives the same.
     recording.write(tmp_path / "again.nc")
     again = evaluate(TARGET, ["imm"], scenario=read_recording(tmp_path / "again.nc"))
     np.testing.assert_array_equal(again["nees"].values[0], found["nees"].values[0])
@@ -193,14 +191,14 @@ def test_places_without_deviations_scatter_as_x_and_y_do(tmp_path):
     assert sigma == pytest.approx(expected, rel=0.02)  # a plane that touches elsewhere, and three digits
     assert places.deviations_from == plane.deviations_from
     assert (places.measurements["variance"] == sigma**2).all()
-    said = f"assumed as positions scatter about their neighbours: sigma_x {expected:.3g} m"
-    assert said in str(plane.notes)  # whoever evaluates filters on it reads what was assumed
+    note = f"assumed as positions scatter about their neighbours: sigma_x {expected:.3g} m"
+    assert note in str(plane.notes)  # a user who evaluates filters on it reads the assumption
     assert (
         read_recording(tmp_path / "log.csv", TARGET, range_sigma=40.0).measurements["variance"] == 1600.0
     ).all()
 
 
-def test_truth_that_one_file_lacks_judges_nobody(tmp_path):
+def test_truth_that_one_file_lacks_judges_no_filter(tmp_path):
     aircraft().to_csv(tmp_path / "a.csv", index=False)
     aircraft(truth_velocity_x=None, truth_velocity_y=None).to_csv(tmp_path / "b.csv", index=False)
     recording = read_recording(tmp_path, TARGET)
@@ -393,7 +391,7 @@ def test_a_deviation_that_is_named_wins_and_several_logs_take_their_median(tmp_p
     assert read_recording(tmp_path, TARGET, range_sigma=7.0).typical == {}
     both.write(tmp_path / "both.nc")
     assert read_recording(tmp_path / "both.nc").parameters["range_sigma"] == 50.0
-    # Where nobody says, how positions scatter: the log's noise is of 40 m.
+    # Where no deviation is given, positions scatter: the log's noise is of 40 m.
     assert read(untold(sigma_x=None, sigma_y=None), tmp_path).typical == {
         "range_sigma": pytest.approx(40.0, rel=0.1)
     }

@@ -23,8 +23,6 @@ from filtergym.names import find_competitor
 
 
 class InPython(Asked):
-    """Asked measurement by measurement."""
-
     kind = "estimator"
 
     def __init__(self, task):

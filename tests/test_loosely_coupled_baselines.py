@@ -47,7 +47,7 @@ def on_paper():
 
 @pytest.fixture(scope="module")
 def some_on_paper():
-    """Those that the tests of code ask about; everyone takes two gigabytes."""
+    """Those that the tests of code use; all of them take two gigabytes."""
     return evaluate(ID, ["plain-white", "augmented", "matched", "matched-covariance"], "paper", 8, seed=1)
 
 
@@ -78,7 +78,7 @@ def test_reference_table(on_paper):
 # --- against naive filters
 
 
-def test_matched_equals_a_naive_filter_told_the_truth():
+def test_matched_equals_a_naive_filter_that_knows_the_errors():
     keywords = {
         "axes": 2, "outage_probability": 1.0, "outage_start": (0.3, 0.5), "outage_duration": (0.2, 0.4),
         "spoofing_probability": 1.0, "spoofing_start": (1.0, 1.0), "spoofing_duration": (0.3, 0.3),
@@ -94,10 +94,10 @@ def test_matched_equals_a_naive_filter_told_the_truth():
         sigma = first.coloured_step[lane] / s.coloured
         white = (first.white_step[lane] ** 2 - s.residual * sigma**2) / 0.01
         A, W, start = loosely_coupled.error_model(first.drift_deviation[lane], sigma, 1.0, white)
-        told = first.disturbances
+        errors = first.disturbances
         (decay, kick), rate = (
-            [each[lane] for each in told["coloured"].process],
-            told["spoofing"].strength[lane],
+            [each[lane] for each in errors["coloured"].process],
+            errors["spoofing"].strength[lane],
         )
         Phi, Qd, P = np.diag([0.0, 0.0, 0.0, decay]), np.diag([0.0, 0.0, 0.0, kick**2]), np.zeros((4, 4))
         Phi[:3, :3], Qd[:3, :3] = van_loan(A, W, 0.01)
@@ -105,14 +105,16 @@ def test_matched_equals_a_naive_filter_told_the_truth():
         H, error = np.array([1.0, 0.0, 0.0, -1.0]), np.zeros((4, 2))
         for k, state in enumerate(states, 1):
             error, P = Phi @ error, Phi @ P @ Phi.T + Qd
-            said = state.measurement
-            if said.available[lane] > 0:
+            measured = state.measurement
+            if measured.available[lane] > 0:
                 K = P @ H / (H @ P @ H + state.truth.deviation[lane] ** 2)
-                fix = said.fix[:, lane] - (0.01 * rate * (k - 99) if 100 <= k < 130 else 0.0)
-                error = error + np.outer(K, said.ins[:, lane] - fix - H @ error)
+                fix = measured.fix[:, lane] - (0.01 * rate * (k - 99) if 100 <= k < 130 else 0.0)
+                error = error + np.outer(K, measured.ins[:, lane] - fix - H @ error)
                 P = P - np.outer(K, H @ P)
             # Equal formulas, different rounding over 200 steps.
-            np.testing.assert_allclose(state.filter.mean[:, lane], said.ins[:, lane] - error[0], atol=1e-10)
+            np.testing.assert_allclose(
+                state.filter.mean[:, lane], measured.ins[:, lane] - error[0], atol=1e-10
+            )
             np.testing.assert_allclose(
                 state.filter.covariance[:, :, lane], P[0, 0] * np.eye(2), rtol=1e-8, atol=1e-14
             )
@@ -300,7 +302,7 @@ def test_a_policy_with_estimated_noise_reports_what_its_filter_does_where_the_ga
 
 
 def test_a_new_report_is_believed():
-    """A receiver that says of itself that it has become better is used so at once."""
+    """A receiver that reports a smaller deviation is used so at once."""
     model = make_model(ID, "gain", "paper")
     for rule in RULES:
         found = competitor(ID, f"augmented-{rule}")(model.task).filter

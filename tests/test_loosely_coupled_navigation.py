@@ -102,17 +102,17 @@ def test_the_bank_equals_naive_filters():
             x = np.full(2, first.ins[axis, lane] - first.increment[axis, lane])
             v, error, P = np.zeros(2), np.zeros(3), START
             for k, (seen, state) in enumerate(run):
-                said, bank = seen.measurement, state.filter
-                R = said.reported_deviation[lane] ** 2
-                x, v = x + said.increment[axis, lane], v + np.array([0.04, 0.36]) * 0.01
+                measured, bank = seen.measurement, state.filter
+                R = measured.reported_deviation[lane] ** 2
+                x, v = x + measured.increment[axis, lane], v + np.array([0.04, 0.36]) * 0.01
                 error, P = Phi @ error, Phi @ P @ Phi.T + Qd
-                if said.available[lane]:
-                    g, z = v / (v + R), said.fix[axis, lane]
+                if measured.available[lane]:
+                    g, z = v / (v + R), measured.fix[axis, lane]
                     x, v = x + g * (z - x), v * (1 - g)
                     K = P[:, 0] / (P[0, 0] + R)
-                    error = error + K * (said.ins[axis, lane] - z - error[0])
+                    error = error + K * (measured.ins[axis, lane] - z - error[0])
                     P = P - np.outer(K, P[0])
-                expected = [*x, said.ins[axis, lane] - error[0]]
+                expected = [*x, measured.ins[axis, lane] - error[0]]
                 weights = np.clip(actions[k, :, lane], 0, 1)
                 weights = weights / weights.sum()
                 # Rounding over 300 steps of different but equal formulas.
@@ -142,19 +142,19 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
         states(model, numbers(model, lanes, steps, 1), lambda k, seen: actions[k])
     ):
         a = np.clip(actions[k, 0], -1, 1)
-        said = seen.measurement
-        gain = said.available * np.where(
+        measured = seen.measurement
+        gain = measured.available * np.where(
             a == -1, 0.0, np.where(a > 0, settled ** (1 - a), settled ** (1 + a) * 1e-5**-a)
         )
-        x = said.ins[0] - said.increment[0] if k == 0 else x
-        before = x + said.increment[0]
-        x = np.where(said.available > 0, (1 - gain) * before + gain * said.fix[0], before)
-        v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * said.reported_deviation**2
+        x = measured.ins[0] - measured.increment[0] if k == 0 else x
+        before = x + measured.increment[0]
+        x = np.where(measured.available > 0, (1 - gain) * before + gain * measured.fix[0], before)
+        v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * measured.reported_deviation**2
         np.testing.assert_allclose(model.mean(state)[0], x, atol=1e-12)
         rest = np.tile(np.eye(3), (lanes, 1, 1))
         rest[:, 0, 0] = 1 - gain
         P = rest @ (Phi @ P @ Phi.T + Qd) @ rest
-        P[:, 0, 0] += gain**2 * said.reported_deviation**2
+        P[:, 0, 0] += gain**2 * measured.reported_deviation**2
         # What the innovations are scaled by, and what is reported: rounding over 200 steps.
         np.testing.assert_allclose(state.filter.variance.assumed[0], v, rtol=1e-12)
         np.testing.assert_allclose(model.covariance(state)[0, 0], P[:, 0, 0], rtol=1e-10)
@@ -178,22 +178,26 @@ def test_scaled_noises_are_those_of_a_textbook_filter():
     for lane in range(lanes):
         error, P, before = np.zeros((3, 2)), START, MODEL[:2]
         for k, (seen, state) in enumerate(run):
-            said, R = seen.measurement, seen.measurement.reported_deviation[lane] ** 2
+            measured, R = seen.measurement, seen.measurement.reported_deviation[lane] ** 2
             scaled = loosely_coupled.error_model(
                 0.6, 0.4 * math.sqrt(coloured[k, lane]), 1.0, 0.04 * white[k, lane]
             )[:2]
             Phi, Qd = linear_systems.van_loan(*before, 0.01)
             shown = Phi @ P @ Phi.T + Qd
-            innovation = said.available[lane] * (said.fix[:, lane] - said.ins[:, lane] + (Phi @ error)[0])
-            np.testing.assert_allclose(seen.filter.seen.innovation[:, lane], innovation, atol=1e-11)
+            innovation = measured.available[lane] * (
+                measured.fix[:, lane] - measured.ins[:, lane] + (Phi @ error)[0]
+            )
+            np.testing.assert_allclose(seen.filter.innovations.innovation[:, lane], innovation, atol=1e-11)
             np.testing.assert_allclose(seen.filter.deviation[lane] ** 2, shown[0, 0], rtol=1e-9)
-            if said.available[lane]:
+            if measured.available[lane]:
                 np.testing.assert_allclose(
-                    seen.filter.seen.normalised[:, lane], innovation / math.sqrt(shown[0, 0] + R), atol=1e-11
+                    seen.filter.innovations.normalised[:, lane],
+                    innovation / math.sqrt(shown[0, 0] + R),
+                    atol=1e-11,
                 )
             Phi, Qd = linear_systems.van_loan(*scaled, 0.01)
             error, P, before = Phi @ error, Phi @ P @ Phi.T + Qd, scaled
-            if said.available[lane]:
+            if measured.available[lane]:
                 R = R * receiver[k, lane]
                 K = P[:, 0] / (P[0, 0] + R)
                 error = error - np.outer(K, innovation)
@@ -201,7 +205,9 @@ def test_scaled_noises_are_those_of_a_textbook_filter():
                 P = rest @ P @ rest.T + R * np.outer(K, K)
             bank = state.filter
             # Rounding over 200 steps of different but equal formulas.
-            np.testing.assert_allclose(model.mean(state)[:, lane], said.ins[:, lane] - error[0], atol=1e-11)
+            np.testing.assert_allclose(
+                model.mean(state)[:, lane], measured.ins[:, lane] - error[0], atol=1e-11
+            )
             np.testing.assert_allclose([bank.drift[:, lane], bank.coloured[:, lane]], error[1:], atol=1e-11)
             np.testing.assert_allclose(model.covariance(state)[..., lane], P[0, 0] * np.eye(2), rtol=1e-9)
 
@@ -237,10 +243,10 @@ def test_averages_are_those_of_the_definition():
     weight = 1 - math.exp(-0.01 / 0.25)
     mean, square, product, last = 0.0, 1.0, 0.0, 0.0
     for seen, _ in states(model, numbers(model, 1, 400, 4), constant(model, 0.4, 1)):
-        said, bank = seen.measurement, seen.filter
-        if said.available[0]:
-            n = bank.seen.innovation[0, 0] / math.sqrt(
-                bank.variance.assumed[0, 0] + said.reported_deviation[0] ** 2
+        measured, bank = seen.measurement, seen.filter
+        if measured.available[0]:
+            n = bank.innovations.innovation[0, 0] / math.sqrt(
+                bank.variance.assumed[0, 0] + measured.reported_deviation[0] ** 2
             )
             mean += weight * (n - mean)
             square += weight * (n * n - square)
@@ -249,7 +255,7 @@ def test_averages_are_those_of_the_definition():
         shown = model.observe(seen)[:, 0]
         expected = [signed_log(mean), math.log1p(square), signed_log(product)]
         np.testing.assert_allclose(shown[2:5], expected, rtol=1e-10, atol=1e-13)
-        assert shown[0] == pytest.approx(signed_log(last) if said.available[0] else 0.0, rel=1e-12)
+        assert shown[0] == pytest.approx(signed_log(last) if measured.available[0] else 0.0, rel=1e-12)
 
 
 # --- Scenarios ---------------------------------------------------------------------------------------------
@@ -272,16 +278,16 @@ def test_disturbances_stand_where_they_are_drawn():
         ):
             first, end = seen.truth.disturbances[drawn].window
             inside = (k >= first) & (k < end)
-            said = seen.measurement
-            np.testing.assert_array_equal(said.available, np.where(inside & (name == "outage"), 0.0, 1.0))
+            measured = seen.measurement
+            np.testing.assert_array_equal(measured.available, np.where(inside & (name == "outage"), 0.0, 1.0))
             jammed = np.where(inside & (name == "jamming"), 10.0, 1.0)
             np.testing.assert_allclose(seen.truth.deviation, math.sqrt(2) * jammed, rtol=1e-14)
-            stated = model.task.world.reading_deviations(said)[0]
-            np.testing.assert_allclose([said.reported_deviation, stated], math.sqrt(2), rtol=1e-14)
+            stated = model.task.world.reading_deviations(measured)[0]
+            np.testing.assert_allclose([measured.reported_deviation, stated], math.sqrt(2), rtol=1e-14)
             pull = np.where(inside & (name == "spoof-ramp"), 0.02 * (k - first + 1), 0.0)
             fix = np.where(inside & (name == "outage"), 0.0, seen.truth.reference[0] + pull)
             # Sums of three numbers of up to 100 m.
-            np.testing.assert_allclose(said.fix[0], fix, atol=1e-12)
+            np.testing.assert_allclose(measured.fix[0], fix, atol=1e-12)
         # One row of a hundredth of a second is the rounding of start and end.
         p, windows = model.task.parameters, TASK.scenarios[name].windows
         for seconds, (low, high) in ((first, getattr(p, start)), (end - first, getattr(p, duration))):
@@ -294,7 +300,7 @@ def test_disturbances_stand_where_they_are_drawn():
             assert (end <= windows["after"][0]).all()
 
 
-def test_random_draws_what_it_says_and_reports_half_of_the_changes():
+def test_random_draws_as_described_and_reports_half_of_the_changes():
     model, lanes = make("random", undisturbed=0.0), 20000
     state = model.begin(*numbers(model, lanes, 0, 8)[:2]).truth
     low, high = 10**-0.5, 10**0.5

@@ -6,14 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from models import begin, make_model
-from naive import BEARING_SIGMA, RANGE_SIGMA, T, episode_numbers, naive_bank, variances
+from naive import BEARING_SIGMA, RANGE_SIGMA, T, variances
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
-from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
 from filtergym.envs.data.trajectory import Trajectory
-from filtergym.filters import alpha_beta, imm
-from filtergym.filters.gaussian import log_density
 
 ID = "filtergym/ManeuveringTarget-v0"
 REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0), "coloured_sigma": (0.0, 0.0)}
@@ -32,125 +29,6 @@ def paper_flight():
         step = [x + T * vx + a * T**2 / 2, y + T * vy + a * T**2 / 2, vx + a * T, vy + a * T]
         states.append(np.array(step))
     return np.array(states)
-
-
-def paper_data(seed):
-    """Start of the filters and measurements of the episode with this seed, from the documented numbers."""
-    truth = paper_flight()
-    normals, _, rows, _ = episode_numbers(seed, 4, 0, 2, 0, 101)
-    sigma = np.sqrt(variances(*truth[0, :2]))
-    start = truth[0] + np.concatenate([sigma, math.sqrt(2) * sigma / T]) * normals
-    z = [truth[k, :2] + np.sqrt(variances(*truth[k, :2])) * rows[k - 1] for k in range(1, 102)]
-    return truth, start, z
-
-
-def naive_imm(start, measurements, gains, transition, probabilities):
-    """Estimates and mode probabilities of every scan; gains are ``(M,)``, or ``(scans, M)`` where they change."""
-    scans = [(T * k, None, z) for k, z in enumerate(measurements, 1)]
-    used = np.broadcast_to(gains, (len(scans), len(probabilities)))
-    mean, _, mu = zip(*naive_bank(start, scans, transition, probabilities, used), strict=True)
-    return np.array(mean), np.array(mu)
-
-
-BANKS = [
-    ((0.3, 0.7), ((0.9, 0.1), (0.1, 0.9)), (0.5, 0.5)),
-    ((0.3, 0.7), ((0.95, 0.05), (0.3, 0.7)), (0.8, 0.2)),
-    ((0.2, 0.5, 0.8), ((0.9, 0.08, 0.02), (0.1, 0.7, 0.2), (0.05, 0.35, 0.6)), (0.2, 0.3, 0.5)),
-]
-
-
-@pytest.mark.parametrize("bank", BANKS)
-def test_imm_policy_equals_the_imm_as_plain_filter(bank):
-    gains, transition, initial = bank
-    seed = 2
-    env = gym.make(
-        ID,
-        control="weights",
-        scenario="paper",
-        gains=gains,
-        transition=transition,
-        initial_probabilities=initial,
-        detailed_info=True,
-    )
-    truth, start, measurements = paper_data(seed)
-    expected, probabilities = naive_imm(start, measurements, gains, transition, initial)
-    policy = InteractingMultipleModel(env.unwrapped.model)
-    observation, _ = env.reset(seed=seed)
-    for k in range(1, 101):
-        lanes = env.unwrapped.fleet.only
-        np.testing.assert_allclose(lanes.state.measurement.position[:, 0], measurements[k - 1], rtol=1e-12)
-        action, _ = policy.predict(observation)
-        observation, _, _, truncated, info = env.step(action)
-        # An IMM amplifies rounding, and the observation compresses likelihoods by a logarithm: 1e-6 m.
-        np.testing.assert_allclose(info["error"] + truth[k], expected[k - 1], rtol=0, atol=1e-6)
-        np.testing.assert_allclose(info["mode_probability"], probabilities[k - 1], rtol=0, atol=1e-9)
-    assert truncated
-
-
-@pytest.mark.parametrize("bank", BANKS)
-def test_gains_are_those_of_a_naive_imm(bank):
-    """Of every filter the logit of the gain moves by the action; at zero it is the paper's IMM."""
-    gains, transition, initial = bank
-    env = gym.make(
-        ID,
-        control="gains",
-        scenario="paper",
-        gains=gains,
-        transition=transition,
-        initial_probabilities=initial,
-        gain_logits=1.5,
-        detailed_info=True,
-    )
-    truth, start, measurements = paper_data(1)
-    actions = np.random.default_rng(2).uniform(-1.2, 1.2, (101, len(gains)))
-    odds = np.array(gains) / (1.0 - np.array(gains)) * np.exp(1.5 * np.clip(actions, -1.0, 1.0))
-    alpha = odds / (1.0 + odds)
-    expected, probabilities = naive_imm(start, measurements, alpha, transition, initial)
-    last = [f.name for f in env.unwrapped.observation_fields].index("last_alpha_1")
-    env.reset(seed=1)
-    for k in range(1, 101):
-        observation, _, _, truncated, info = env.step(actions[k - 1])
-        np.testing.assert_allclose(observation[last : last + len(gains)], alpha[k - 1], rtol=1e-12)
-        # An IMM amplifies rounding.
-        np.testing.assert_allclose(info["error"] + truth[k], expected[k - 1], rtol=0, atol=1e-6)
-        np.testing.assert_allclose(info["mode_probability"], probabilities[k - 1], rtol=0, atol=1e-9)
-    assert truncated
-
-
-def test_zero_evidence_is_the_plain_filter_bit_for_bit():
-    """The recursion through the functions of ``filters``, batch of 8, against the task's own bank."""
-    model = make_model(ID, "evidence", "random", **REGULAR)
-    rng = np.random.default_rng(0)
-    state = begin(model, rng, 8)
-    mean, covariance, mu = state.filter.mean, state.filter.covariance, state.filter.probabilities
-    alpha = np.array([[0.3], [0.7]])
-    beta = alpha_beta.benedict_bordner_beta(alpha)
-    transition = np.array([[0.9, 0.1], [0.1, 0.9]])
-    for _ in range(model.task.horizon):
-        state = model.measure(state, rng.normal(size=(2, 8)))
-        prediction = imm.predict_mode_probabilities(transition, mu)
-        mean, covariance = imm.mix(mean, covariance, prediction.mixing)
-        position, velocity = alpha_beta.predict(mean[:2], mean[2:], T), mean[2:]
-        covariance = alpha_beta.predict_joint_covariance(covariance, T)
-        innovation = state.measurement.position[:, None] - position
-        R = np.eye(2)[:, :, None, None] * state.measurement.variance[:, None]
-        log_likelihood, _ = log_density(innovation, covariance[:2, :2] + R)
-        mu = imm.mode_posterior(imm.log_probabilities(prediction.probabilities), log_likelihood)
-        mean = np.concatenate(alpha_beta.update(position, velocity, innovation, alpha, beta, T))
-        covariance = alpha_beta.update_joint_covariance(
-            covariance, state.measurement.variance[:, None], alpha, beta, T
-        )
-        state = model.act(state, np.zeros((2, 8)))
-        np.testing.assert_array_equal(state.filter.probabilities, mu)
-        np.testing.assert_array_equal(state.filter.mean, mean)
-        np.testing.assert_array_equal(state.filter.covariance, covariance)
-        np.testing.assert_allclose(
-            model.error(state),
-            imm.combine(mean, covariance, mu)[0]
-            - np.concatenate([state.truth.position, state.truth.velocity]),
-            rtol=0,
-            atol=1e-9,
-        )
 
 
 # --- the paper's table

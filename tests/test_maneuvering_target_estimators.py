@@ -17,13 +17,13 @@ from filtergym.baselines.maneuvering_target.adaptive_estimators import SageHusaP
 from filtergym.baselines.maneuvering_target.estimators import (
     KalmanInteractingMultipleModel,
     KalmanTurnInteractingMultipleModel,
-    UnscentedTurn,
 )
 from filtergym.baselines.maneuvering_target.log_families import ConstantAcceleration
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
 from filtergym.baselines.tuning import Candidate, episode_costs
 from filtergym.envs.maneuvering_target.semi_markov import TRAINING
+from filtergym.envs.maneuvering_target.unscented_turn import UnscentedTurn
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
 
@@ -45,7 +45,6 @@ def model():
 
 
 def estimates(model, estimator):
-    """What an estimator is given and answers: start, measurements, means and covariances of eight episodes."""
     start, measurements, answers = watch_estimator(model, estimator)
     mean, covariance, _ = zip(*answers, strict=True)
     return start, measurements, np.array(mean), np.array(covariance)
@@ -136,35 +135,6 @@ def test_modes_start_as_the_chain_leaves_them(model, stay):
     np.testing.assert_allclose(
         estimator.probabilities @ estimator.transition, estimator.probabilities, rtol=1e-14
     )
-
-
-def test_imm_equals_filterpys(model):
-    filterpy = pytest.importorskip("filterpy.kalman")
-    sigmas, stay = (0.2, 4.0), (0.98, 0.9)
-
-    def track(x, P):
-        filters = []
-        for sigma in sigmas:
-            one = filterpy.KalmanFilter(dim_x=4, dim_z=2)
-            one.x, one.P, one.H, one.sigma = x.copy(), P.copy(), H, sigma
-            filters.append(one)
-        mu = [1 / (1 - s) for s in stay]
-        chain = np.array([[stay[0], 1 - stay[0]], [1 - stay[1], stay[1]]])
-        peer = filterpy.IMMEstimator(filters, np.array(mu) / sum(mu), chain)
-        z, R, dt = yield
-        while True:
-            for one in filters:
-                one.R, one.F, one.Q = R, transition(dt), one.sigma**2 * unit_noise(dt)
-            peer.predict()
-            if z is not None:
-                peer.update(z)
-            else:  # the predicted probabilities are in force, which filterpy learns in an update only
-                peer.mu = peer.cbar
-                peer._compute_mixing_probabilities()
-                peer._compute_state_estimate()
-            z, R, dt = yield peer.x, peer.P
-
-    compare(model, KalmanInteractingMultipleModel(model.task, sigmas, stay), track, rtol=1e-8)
 
 
 def test_unscented_filter_equals_filterpys(model):
@@ -281,8 +251,8 @@ def test_the_tunable_semi_markov_filter_begins_with_its_prior(model):
 
 @pytest.mark.parametrize("is_polar", [False, True])
 @pytest.mark.parametrize(("scenario", "errors"), [("biased", {}), ("random", {"coloured_sigma": (0.8, 1.2)})])
-def test_the_reference_is_told_lasting_errors_as_they_are_measured(scenario, errors, is_polar):
-    """Along x and y, or of range and azimuth: its own errors are then as large as it says."""
+def test_the_reference_knows_lasting_errors_as_they_are_measured(scenario, errors, is_polar):
+    """Along x and y, or of range and azimuth: its errors are then as large as it states."""
     keywords = {"polar_measurements": is_polar, **errors}
     records = tidy_records(evaluate(ID, ["imm", "known-turn"], scenario, episodes=200, **keywords))
     [anees] = [
@@ -291,7 +261,7 @@ def test_the_reference_is_told_lasting_errors_as_they_are_measured(scenario, err
         if (record.policy, record.metric, record.component, record.window)
         == ("known-turn", "anees", "state", "all")
     ]
-    assert anees == pytest.approx(1.0, abs=0.1)  # 20,000 scans; told the wrong axes it was 16
+    assert anees == pytest.approx(1.0, abs=0.1)  # 20,000 scans; with the wrong axes it was 16
 
 
 @pytest.mark.parametrize(

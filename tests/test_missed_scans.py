@@ -47,43 +47,51 @@ def paper_data(seed):
     return start, scans
 
 
-CHAIN, PRIOR = ((0.95, 0.05), (0.3, 0.7)), (0.8, 0.2)
+BANKS = [
+    ((0.3, 0.7), ((0.95, 0.05), (0.3, 0.7)), (0.8, 0.2)),
+    ((0.2, 0.5, 0.8), ((0.9, 0.08, 0.02), (0.1, 0.7, 0.2), (0.05, 0.35, 0.6)), (0.2, 0.3, 0.5)),
+]
+"""Gains, transition and probabilities at the start."""
 
 
-def flown(control, act, seed, **keywords):
+def flown(control, act, seed, bank=BANKS[0], **keywords):
     """What every scan of the paper's flight shows and leads to: observation, measurement and info."""
+    gains, chain, prior = bank
     env = gym.make(
         ID,
         control=control,
         scenario="paper",
-        transition=CHAIN,
-        initial_probabilities=PRIOR,
+        gains=gains,
+        transition=chain,
+        initial_probabilities=prior,
         detailed_info=True,
         **IRREGULAR,
         **keywords,
     )
-    model, said, truncated = env.unwrapped.model, [], False
+    model, steps, truncated = env.unwrapped.model, [], False
     observation, _ = env.reset(seed=seed)
     while not truncated:
         measurement = env.unwrapped.fleet.only.state.measurement
         shown = observation
         observation, _, _, truncated, info = env.step(act(model, observation))
-        said.append((shown, measurement, info))
-    return model, said
+        steps.append((shown, measurement, info))
+    return model, steps
 
 
-def test_policy_of_the_paper_equals_the_imm_as_plain_filter():
+@pytest.mark.parametrize("bank", BANKS)
+def test_policy_of_the_paper_equals_the_imm_as_plain_filter(bank):
     seed = 0
     start, scans = paper_data(seed)
-    expected = naive_bank(start, scans, CHAIN, PRIOR, [(0.3, 0.7)] * len(scans))
+    gains, chain, prior = bank
+    expected = naive_bank(start, scans, chain, prior, [gains] * len(scans))
 
     def act(model, observation):
         return InteractingMultipleModel(model).predict(observation)[0]
 
-    _, said = flown("weights", act, seed)
+    _, steps = flown("weights", act, seed, bank)
     assert 5 < sum(z is None for *_, z in scans) < 70
     before, measured = 0.0, 0.0
-    for (time, truth, z), (mean, covariance, mu), (_, m, info) in zip(scans, expected, said, strict=False):
+    for (time, truth, z), (mean, covariance, mu), (_, m, info) in zip(scans, expected, steps, strict=False):
         np.testing.assert_allclose(m.interval[0], time - before, rtol=1e-9)
         np.testing.assert_allclose(m.elapsed[0], time - measured, rtol=1e-9)
         before, measured = time, measured if z is None else time
@@ -100,22 +108,29 @@ def test_policy_of_the_paper_equals_the_imm_as_plain_filter():
         assert info["nis_degrees"] == (0.0 if z is None else 2.0)
 
 
-def test_steered_gains_equal_the_imm_as_plain_filter():
+@pytest.mark.parametrize("bank", BANKS)
+def test_steered_gains_equal_the_imm_as_plain_filter(bank):
     """Where the scan missed the target neither the action nor the likelihood counts."""
+    gains, chain, prior = bank
     rng, used = np.random.default_rng(5), []
 
     def act(model, observation):
-        action = rng.uniform(-1.0, 1.0, 2)
-        used.append(1.0 / (1.0 + np.exp(-(np.log([0.3 / 0.7, 0.7 / 0.3]) + 2.0 * action))))
+        action = rng.uniform(-1.2, 1.2, len(gains))
+        odds = np.array(gains) / (1.0 - np.array(gains)) * np.exp(1.5 * np.clip(action, -1.0, 1.0))
+        used.append(odds / (1.0 + odds))
         return action
 
     start, scans = paper_data(3)
-    _, said = flown("gains", act, 3)
-    expected = naive_bank(start, scans[:100], CHAIN, PRIOR, used)
-    for (mean, covariance, mu), (_, _, info) in zip(expected, said, strict=True):
+    model, steps = flown("gains", act, 3, bank, gain_logits=1.5)
+    expected = naive_bank(start, scans[:100], chain, prior, used)
+    for (mean, covariance, mu), (_, _, info) in zip(expected, steps, strict=True):
         np.testing.assert_allclose(info["estimate"], mean, rtol=0, atol=1e-7)
         np.testing.assert_allclose(info["covariance"], covariance, rtol=1e-9, atol=1e-6)
         np.testing.assert_allclose(info["mode_probability"], mu, rtol=0, atol=1e-10)
+    last = [field.name for field in model.fields].index("last_alpha_1")
+    for (*_, z), alpha, (shown, *_) in zip(scans, used, steps[1:], strict=False):
+        if z is not None:
+            np.testing.assert_allclose(shown[last : last + len(gains)], alpha, rtol=1e-12)
 
 
 def test_one_filter_equals_the_recursion_with_the_gain_over_the_elapsed_time():
@@ -127,20 +142,20 @@ def test_one_filter_equals_the_recursion_with_the_gain_over_the_elapsed_time():
         return action
 
     start, scans = paper_data(4)
-    _, said = flown("gain", act, 4, unmodelled_acceleration=0.0)
+    _, steps = flown("gain", act, 4, unmodelled_acceleration=0.0)
     # A bank of two equal filters is one filter.
-    expected = naive_bank(start, scans[:100], CHAIN, PRIOR, [(alpha, alpha) for alpha in used])
-    for (_, _, z), (mean, _, _), (_, _, info) in zip(scans, expected, said, strict=False):
+    expected = naive_bank(start, scans[:100], *BANKS[0][1:], [(alpha, alpha) for alpha in used])
+    for (_, _, z), (mean, _, _), (_, _, info) in zip(scans, expected, steps, strict=False):
         np.testing.assert_allclose(info["estimate"], mean, rtol=0, atol=1e-8)
         assert info["nis_degrees"] == (0.0 if z is None else 2.0)
-    alphas = [info["alpha"] for *_, info in said]
+    alphas = [info["alpha"] for *_, info in steps]
     held = [a == b for a, b, (_, _, z) in zip(alphas[1:], alphas, scans[1:], strict=False) if z is None]
     assert held
     assert all(held)
 
 
 def rolled(control, detections, jitter=0.0, count=8, normals=0.0, scenario="random", seed=0, **keywords):
-    """Episodes after each scan, before and after random actions; ``detections`` says which see the target."""
+    """Episodes after each scan, before and after random actions; ``detections``: which of them see the target."""
     scans = {
         "detection_probability": (0.5, 0.5),
         "scan_jitter": (jitter, jitter),
@@ -153,7 +168,7 @@ def rolled(control, detections, jitter=0.0, count=8, normals=0.0, scenario="rand
     episode = model.begin(
         rng.random((noise.uniforms, count)), normals * rng.standard_normal((noise.initial_normals, count))
     )
-    said = [(None, episode)]
+    steps = [(None, episode)]
     for seen in detections:
         row = np.concatenate(
             [
@@ -162,14 +177,14 @@ def rolled(control, detections, jitter=0.0, count=8, normals=0.0, scenario="rand
                 rng.random((1, count)),
             ]
         )
-        before = model.measure(said[-1][1], row)
+        before = model.measure(steps[-1][1], row)
         space = model.action_space
         shape = (*space.shape, count)
         action = (
             rng.integers(space.n, size=shape) if control == "mode" else rng.uniform(*_limits(space), shape)
         )
-        said.append((before, model.act(before, action)))
-    return model, said
+        steps.append((before, model.act(before, action)))
+    return model, steps
 
 
 def _limits(space):
@@ -178,11 +193,11 @@ def _limits(space):
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_a_target_that_is_never_seen_is_predicted(control):
-    model, said = rolled(control, [False] * 30, 0.9, normals=1.0)
-    start = said[0][1].measurement
+    model, steps = rolled(control, [False] * 30, 0.9, normals=1.0)
+    start = steps[0][1].measurement
     time, chance = np.zeros(8), np.array([0.5, 0.5])
     x0, P0 = start.mean, start.covariance
-    for before, after in said[1:]:
+    for before, after in steps[1:]:
         time = time + before.measurement.interval
         chance = chance @ np.array(model.task.parameters.transition)
         np.testing.assert_allclose(before.measurement.elapsed, time, rtol=1e-12)
@@ -209,23 +224,23 @@ def test_a_target_that_is_never_seen_is_predicted(control):
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_averages_and_gains_hold_where_the_target_is_missed(control):
-    model, said = rolled(control, [True] * 5 + [False] * 4 + [True], normals=1.0)
-    seen, missed = said[5][1].filter, said[9][1].filter
+    model, steps = rolled(control, [True] * 5 + [False] * 4 + [True], normals=1.0)
+    seen, missed = steps[5][1].filter, steps[9][1].filter
     for name in ("average_innovation", "average_log_squared", "alpha"):
         np.testing.assert_array_equal(getattr(missed, name), getattr(seen, name))
-    assert (said[10][1].filter.average_innovation != seen.average_innovation).all()
+    assert (steps[10][1].filter.average_innovation != seen.average_innovation).all()
     read = {name: model.reader(name) for name in ("available", "elapsed")}
-    shown = [model.observe(before).T for before, _ in said[1:]]
+    shown = [model.observe(before).T for before, _ in steps[1:]]
     assert [read["available"](o)[0, 0] for o in shown] == [1.0] * 5 + [0.0] * 4 + [1.0]
     elapsed = [read["elapsed"](o)[0, 0] for o in shown]
     np.testing.assert_allclose(elapsed, [1.0] * 5 + [1.0, 2.0, 3.0, 4.0, 5.0], rtol=1e-14)
 
 
 @pytest.mark.parametrize("control", CONTROLS)
-def test_what_is_said_of_a_missed_target_does_not_count(control):
+def test_values_of_a_missed_target_do_not_count(control):
     """Not even NaN, which a recording might hold."""
-    model, said = rolled(control, [True] * 3, normals=1.0)
-    episode, before = said[-1][1], said[-1][0]
+    model, steps = rolled(control, [True] * 3, normals=1.0)
+    episode, before = steps[-1][1], steps[-1][0]
     missed = before.measurement._replace(available=np.zeros(8))
     answers = []
     for position in (0.0, 1e9, math.nan):
@@ -267,18 +282,18 @@ def test_a_bank_that_could_miss_the_target_is_the_same_where_it_does_not(control
 
 def test_turns_and_thrust_are_exact_at_the_time_of_a_scan():
     """One manoeuvre from the start to the end: a circle, or a parabola."""
-    model, said = rolled(
+    model, steps = rolled(
         "gain", [True] * 60, 0.9, count=64, maneuver_count=(1, 1), maneuver_duration=(100, 100), horizon=100
     )
-    start = said[0][1].truth
-    context = model.context(said[1][0])
+    start = steps[0][1].truth
+    context = model.context(steps[1][0])
     turn = context["maneuver_turn"][0] / T
     turning = turn != 0.0
     assert 10 < turning.sum() < 54
     across = np.stack([-start.velocity[1], start.velocity[0]])
     centre = start.position + across / np.where(turning, turn, 1.0)
     time = np.zeros(64)
-    for before, _ in said[1:]:
+    for before, _ in steps[1:]:
         time, truth = time + before.measurement.interval, before.truth
         arm, first = truth.position - centre, start.position - centre
         c, s = np.cos(turn * time), np.sin(turn * time)
@@ -304,9 +319,9 @@ def test_turns_and_thrust_are_exact_at_the_time_of_a_scan():
 def test_legs_are_flown_by_time():
     legs = {"legs": ((20.0, 0.0), (90.0, 2.0), (40.0, -1.0))}
     keywords = {"flight": "legs", "initial_velocity": (150.0, 0.0), "initial_position": (8e3, 1e3)}
-    model, said = rolled("gain", [True] * 40, 0.9, scenario="paper", **legs, **keywords)
+    model, steps = rolled("gain", [True] * 40, 0.9, scenario="paper", **legs, **keywords)
     time = np.zeros(8)
-    for before, _ in said[1:]:
+    for before, _ in steps[1:]:
         time = time + before.measurement.interval
         angle = np.radians(2.0) * np.clip(time - 20.0, 0.0, 90.0) - np.radians(1.0) * np.clip(
             time - 110.0, 0.0, 40.0
@@ -351,7 +366,7 @@ def test_left_of_an_acceleration_that_goes_on():
     position, velocity = (1 - alpha) * d, a * grown - beta / grown * d
     position, velocity = position + since * velocity + a * since**2 / 2, velocity + a * since
     nothing = alpha_beta.Covariance(*np.zeros(3))
-    left = alpha_beta.left_by_acceleration(nothing, d**2, alpha, beta, grown, since)
+    left = alpha_beta.add_acceleration_error(nothing, d**2, alpha, beta, grown, since)
     np.testing.assert_allclose(left, [position**2, position * velocity, velocity**2], rtol=1e-13)
 
 
@@ -395,11 +410,11 @@ def test_the_ramp_waits_for_a_measurement():
 
 
 def test_bound_gains_nothing_where_the_target_is_missed():
-    model, said = rolled("gain", [True, False, False, True, True, False] * 5, 0.8, normals=1.0)
+    model, steps = rolled("gain", [True, False, False, True, True, False] * 5, 0.8, normals=1.0)
     bound = KnownInputBound(model.task)
-    memory = bound.start(said[0][1].measurement, said[0][1].truth)
+    memory = bound.start(steps[0][1].measurement, steps[0][1].truth)
     expected = np.moveaxis(memory, -1, 0)
-    for before, _ in said[1:]:
+    for before, _ in steps[1:]:
         m, truth = before.measurement, before.truth
         diagonal, memory = bound.update(memory, m, truth)
         for i in range(8):
@@ -439,8 +454,8 @@ def test_a_table_may_be_missed():
     time = np.arange(12) * T
     states = (1e4 + 100.0 * time, 5e3 + 0.0 * time, 100.0 + 0.0 * time, 0.0 * time)
     table = {"flight": "track", "horizon": 10, "track": tuple(map(tuple, states))}
-    _, said = rolled("gain", [True, False, True], scenario="paper", **table)
-    for k, (before, _) in enumerate(said[1:], start=1):
+    _, steps = rolled("gain", [True, False, True], scenario="paper", **table)
+    for k, (before, _) in enumerate(steps[1:], start=1):
         np.testing.assert_allclose(before.truth.position[:, 0], [1e4 + 600.0 * k, 5e3], rtol=1e-14)
 
 

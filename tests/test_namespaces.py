@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from naive import positive_definite
 
 from filtergym.filters import (
     alpha_beta,
@@ -22,26 +23,26 @@ torch = pytest.importorskip("torch")
 rng = np.random.default_rng(0)
 
 
-def positive_definite(n, *batch):
-    root = rng.normal(size=(n, n, *batch))
-    return np.einsum("ij...,kj...->ik...", root, root) + 0.1 * np.eye(n).reshape(n, n, *(1 for _ in batch))
-
-
 N = 5
 P2 = alpha_beta.Covariance(*(np.abs(rng.normal(size=(2, N))) + least for least in (2.0, 0.0, 2.0)))
 MU = rng.dirichlet(np.ones(3), size=N).T
 TRANSITION = rng.dirichlet(np.ones(3), size=3)
 MIXING = imm.predict_mode_probabilities(TRANSITION, MU).mixing
-MEANS, COVARIANCES = rng.normal(size=(4, 3, N)), positive_definite(4, 3, N)
+MEANS, COVARIANCES = rng.normal(size=(4, 3, N)), positive_definite(rng, 4, 3, N)
 GAIN = np.array([[0.2], [0.5], [0.8]])
 S2, X4, P4, Z2 = (
-    positive_definite(2, N),
+    positive_definite(rng, 2, N),
     rng.normal(size=(4, N)),
-    positive_definite(4, N),
+    positive_definite(rng, 4, N),
     rng.normal(size=(2, N)),
 )
-F4, Q4, H24, R2 = rng.normal(size=(4, 4)), positive_definite(4), rng.normal(size=(2, 4)), positive_definite(2)
-X5, P5 = rng.normal(size=(5, N)), positive_definite(5, N)
+F4, Q4, H24, R2 = (
+    rng.normal(size=(4, 4)),
+    positive_definite(rng, 4),
+    rng.normal(size=(2, 4)),
+    positive_definite(rng, 2),
+)
+X5, P5 = rng.normal(size=(5, N)), positive_definite(rng, 5, N)
 ALPHA, BETA = rng.uniform(0.1, 0.9, N), rng.uniform(0.1, 0.9, N)
 LEVEL = noise_adaptation.Level(np.abs(Z2) + 0.5, np.abs(Z2) + 1.0)
 WINDOW = rng.normal(size=(3, 2, N))
@@ -53,7 +54,7 @@ CALLS = [
     (alpha_beta.update, (Z2, Z2, Z2, ALPHA, BETA, 6.0)),
     (alpha_beta.predict_covariance, (P2, 6.0)),
     (alpha_beta.update_covariance, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
-    (alpha_beta.left_by_acceleration, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
+    (alpha_beta.add_acceleration_error, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
     (alpha_beta.predict_joint_covariance, (COVARIANCES, 6.0)),
     (alpha_beta.update_joint_covariance, (COVARIANCES, np.abs(Z2)[:, None], GAIN, GAIN, 6.0)),
     (bounds.predict_bound, (P4, F4[..., None], Q4[..., None])),

@@ -15,7 +15,7 @@ from filtergym.evaluation.running import rollout as rollouts
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import rollout, run_episodes
 from filtergym.evaluation.running.seeds import episode_seeds
-from filtergym.evaluation.running.stored_values import StoredValues, limits
+from filtergym.evaluation.running.stored_values import StoredValues, bound_values
 
 pytest.importorskip("llvmlite")
 
@@ -36,7 +36,7 @@ def model_of(environment, name, scenario, threads=1, **keywords):
     control = control_of(maker, None, problem.task, name)
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     model = make_model(problem.task, control, scenario, backend="compiled", threads=threads, **keywords)
-    return model, maker, kind, limits if kind == "bound" else StoredValues(tracks=True)
+    return model, maker, kind, bound_values if kind == "bound" else StoredValues(tracks=True)
 
 
 def run_stepped(model, maker, kind, report, seeds=SEEDS):
@@ -72,9 +72,9 @@ def test_episodes_go_on_from_where_they_were_left(name, monkeypatch):
     given = model_of("ManeuveringTarget", name, "random", horizon=24)
     found, action = run_episodes(*given[:3], SEEDS, given[3])
     monkeypatch.setattr(rollouts, "AT_ONCE", 16 * 7)
-    told = []
-    parts, actions = run_episodes(*given[:3], SEEDS, given[3], tick=told.append)
-    assert told == [11 * 7, 11 * 7, 11 * 7, 11 * 3]
+    ticks = []
+    parts, actions = run_episodes(*given[:3], SEEDS, given[3], tick=ticks.append)
+    assert ticks == [11 * 7, 11 * 7, 11 * 7, 11 * 3]
     for each, values in found.items():
         np.testing.assert_array_equal(parts[each], values, err_msg=each)
         assert parts[each].flags.c_contiguous
@@ -94,7 +94,7 @@ def test_company_tiles_and_threads_change_no_bit(threads):
 
 
 class Traced(Policy):
-    """Says what it answers."""
+    """States what it returns."""
 
     control = "gain"
     traceable = True
@@ -121,7 +121,7 @@ class Branching(Traced):
 
 
 class Counting(Far):
-    """Another ``act`` that says nothing of itself."""
+    """Another ``act`` without declarations."""
 
     def act(self, observation, state, start):
         self.asked = getattr(self, "asked", 0) + 1
@@ -138,7 +138,7 @@ def test_an_action_that_is_no_number_is_refused():
         evaluate(ID, {"none": NoNumber}, episodes=3, horizon=10)
 
 
-def test_what_cannot_be_traced_is_asked_in_python_and_says_so():
+def test_a_policy_that_cannot_be_traced_runs_in_python_with_a_note():
     with pytest.warns(UserWarning, match="Branching.*test_native_rollout.py, line"):
         run = evaluate(ID, {"mine": Branching}, episodes=3, horizon=10)
     assert set(np.unique(run["action"])) <= {0.0, 1.0}
@@ -150,7 +150,7 @@ def test_a_method_that_is_replaced_is_not_taken_for_traceable():
 
 
 def test_a_function_may_make_another_policy_next_time():
-    """Of what makes it nobody knows whether it always makes the same."""
+    """It is unknown whether its maker always makes the same."""
     level = 0.1
 
     class Level(Policy):
@@ -176,7 +176,7 @@ def test_a_function_may_make_another_policy_next_time():
 
 
 def test_a_function_may_make_another_estimator_next_time():
-    """Likewise of what is compiled as a filter."""
+    """A function that is compiled as a filter, by its outputs."""
     known = problem_of(ID)
     names = ["kalman-imm", "kalman-imm-turn"]
 
@@ -192,22 +192,35 @@ def test_a_function_may_make_another_estimator_next_time():
 
 
 def test_a_time_is_that_of_a_decision_without_setting_up(monkeypatch):
-    """A clock that goes by 3 ms for every run and by 40 us for every measurement of all episodes."""
+    """A clock that advances by 3 ms in every run and by 40 us in every measurement of all episodes, of which the world
+    takes 15 us.
+    """
     given = model_of("ManeuveringTarget", "imm", "random", horizon=90)
     clock, flown = [0.0], []
 
     def run(self, report, compiled_policy, measurements):
-        clock[0] += 3e-3 + 40e-6 * measurements
-        flown.append(measurements)
+        idle = compiled_policy is None
+        clock[0] += 3e-3 + (15e-6 if idle else 40e-6) * measurements
+        if not idle:
+            flown.append(measurements)
 
     monkeypatch.setattr(rollouts.Lanes, "run", run)
     monkeypatch.setattr(rollouts.time, "process_time", lambda: clock[0])
     found = rollouts.measure_time(*given[:3], SEEDS, "imm")
     assert found.compiled
-    assert found.nanoseconds == pytest.approx(40e3 / rollouts.TIMED_EPISODES, rel=1e-9)
-    # A run of about twenty milliseconds, were setting it up all that a first decision takes; some of them.
-    assert set(flown) == {1, 8}
-    assert flown.count(8) >= rollouts.FEWEST_RUNS
+    assert found.nanoseconds == pytest.approx(25e3 / rollouts.TIMED_EPISODES, rel=1e-9)
+    # A run of about ten milliseconds, were setting it up all that a first decision takes; some of them.
+    assert set(flown) == {1, 5}
+    assert flown.count(5) >= rollouts.TIMED_ROUNDS * rollouts.FEWEST_RUNS
+
+
+@pytest.mark.parametrize("backend", ["compiled", "numpy"])
+def test_an_estimator_that_does_nothing_takes_the_least_time(backend, monkeypatch):
+    """Which the time of its run less that of the world cannot fall below."""
+    monkeypatch.setattr(rollouts, "LEAST_NANOSECONDS", 1e9)
+    model = make_model(problem_of(ID).task, "gain", "random", backend=backend)
+    found = rollouts.measure_time(model, rollouts.IdleEstimator, "estimator", SEEDS)
+    assert found == (1e9, backend == "compiled", False)
 
 
 @pytest.mark.parametrize("name", ["ManeuveringTarget", "LooselyCoupledNavigation"])

@@ -1,4 +1,4 @@
-"""Estimated noise levels against the papers' formulas, one episode at a time, and against the truth they are told."""
+"""Estimated noise levels against the papers' formulas, one episode at a time, and against the given truth."""
 
 import numpy as np
 import pytest

@@ -4,19 +4,12 @@ import math
 
 import numpy
 import pytest
+from naive import positive_definite
 
 from filtergym.filters import imm, noise_levels, packed_covariance
 from filtergym.filters.noise_levels import LevelHypotheses, SensorNoise
 
 n, H, L, N = 3, 4, 5, 6
-
-
-def covariances(rng: numpy.random.Generator, *shape: int) -> numpy.ndarray:
-    """Random ones, ``(n, n, *shape)``."""
-    factor = rng.standard_normal((n, n, *shape))
-    return numpy.einsum("ik...,jk...->ij...", factor, factor) + 0.1 * numpy.eye(n).reshape(
-        n, n, *[1] * len(shape)
-    )
 
 
 def normalised(values: numpy.ndarray) -> numpy.ndarray:
@@ -26,7 +19,7 @@ def normalised(values: numpy.ndarray) -> numpy.ndarray:
 def some(seed: int) -> tuple[numpy.random.Generator, LevelHypotheses, numpy.ndarray]:
     """Hypotheses, and their covariances as matrices."""
     rng = numpy.random.default_rng(seed)
-    P = covariances(rng, H, N)
+    P = positive_definite(rng, n, H, N)
     q = tuple(normalised(rng.random((L, H, N))) for _ in range(2))
     h = LevelHypotheses(
         rng.standard_normal((n, H, N)), packed_covariance.pack(P), normalised(rng.random((H, N))), q
@@ -60,8 +53,8 @@ def test_a_hypothesis_that_was_ruled_out_comes_back() -> None:
     _, h, _ = some(0)
     h = h._replace(probability=numpy.concatenate([0.0 * h.probability[:1], normalised(h.probability[1:])]))
     change = numpy.full((H, 1), 0.01)
-    nobody = numpy.array([[0.0], [0.5], [0.25], [0.25]])
-    for prior in (nobody, nobody[::-1]):
+    unweighted = numpy.array([[0.0], [0.5], [0.25], [0.25]])
+    for prior in (unweighted, unweighted[::-1]):
         after = noise_levels.switch(h, change, prior, change, numpy.full((L, 1, 1), 1.0 / L))
         assert all(numpy.isfinite(part).all() for part in (*after[:3], *after.sensors))
         assert (after.probability > 0.0).all()

@@ -65,7 +65,7 @@ class Careful(Careless):
 
 
 def received(task, measurement, field):
-    """Whether each value of a field was received, by what else the measurement says."""
+    """Whether each value of a field was received, by the other fields of the measurement."""
     there = (
         measurement.available > 0 if hasattr(measurement, "available") else measurement.decision < task.types
     )
@@ -95,7 +95,7 @@ def test_what_is_not_received_is_nan(id, replayed):
         assert all(np.isfinite(values).all() for values in others)
 
 
-def test_an_estimator_that_overlooks_a_missed_scan_is_told():
+def test_an_estimator_that_overlooks_a_missed_scan_is_warned_of():
     sentence = r"not finite after a missed measurement .* in episode \d+ at measurement \d+"
     with pytest.raises(ValueError, match=sentence):
         evaluate(RADAR, {"mine": Careless}, episodes=8, strict=True)

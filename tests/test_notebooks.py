@@ -19,7 +19,6 @@ def code_of(notebook):
 
 
 def printed(notebook):
-    """All text of the outputs."""
     outputs = [output for cell in code_of(notebook) for output in cell.outputs]
     return "\n".join(one.text if "text" in one else one.data.get("text/plain", "") for one in outputs)
 

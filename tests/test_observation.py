@@ -9,9 +9,9 @@ from models import begin, make_model, next_row
 
 from filtergym.envs.contract.observation import (
     BOUNDED_LOG,
-    KEPT_AS_LOG1P,
     LOG1P,
     SIGNED_LOG,
+    STORED_AS_LOG1P,
     Block,
     Blocks,
     Quantity,
@@ -21,7 +21,7 @@ from filtergym.envs.contract.observation import (
 BLOCKS = (
     Block("a", lambda state, _: state.a, "two numbers", ("x", "y"), SIGNED_LOG),
     Block("b", lambda state, measurement: state.b + measurement, "one number"),
-    Block("c", lambda state, _: state.c, "kept as a logarithm", compression=KEPT_AS_LOG1P),
+    Block("c", lambda state, _: state.c, "kept as a logarithm", compression=STORED_AS_LOG1P),
     Block("d", lambda state, _: state.d, "four numbers in two axes", ("1x", "1y", "2x", "2y"), SIGNED_LOG),
     Block("e", lambda state, _: state.e, "scaled", compression=linear_scale(0.1, 45.0), unit="10 dB"),
     Block("f", lambda state, _: state.f, "a square", compression=LOG1P),
@@ -108,7 +108,7 @@ def test_a_bounded_logarithm_is_the_value_near_zero_and_below_eight_everywhere()
     assert blocks.fields[0].description == "y / (1 + |y| / 8) with y = sign(x) log(1 + |x|) of anything"
 
 
-def test_unknown_names_and_names_said_twice():
+def test_unknown_and_repeated_names():
     blocks = Blocks(BLOCKS, QUANTITIES, np)
     with pytest.raises(ValueError, match="unknown quantity 'g' of the observation: choose from a, b"):
         blocks.reader("g")

@@ -1,7 +1,6 @@
 """Offline data: transitions as Gymnasium gives them; Minari writes and loads them, and makes the environment again."""
 
 import json
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +12,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.seeds import episode_seeds
-from filtergym.evaluation.running.transitions import member, transitions_of
+from filtergym.evaluation.running.transitions import clip_to_space, transitions_of
 from filtergym.names import competitor
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -88,7 +87,7 @@ def test_episodes_of_different_length_end_where_they_end():
 
 def test_actions_are_brought_into_their_space():
     box = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    action = member(box, np.array([[1.0 + 1e-12, -3.0], [0.1, 0.2]]))
+    action = clip_to_space(box, np.array([[1.0 + 1e-12, -3.0], [0.1, 0.2]]))
     assert all(map(box.contains, action))
     np.testing.assert_array_equal(action, np.array([[1.0, -1.0], [0.1, 0.2]], dtype=np.float32))
 
@@ -120,7 +119,7 @@ def test_data_sets_are_loaded_back_by_minari(env_id, short, minari):
             np.testing.assert_array_equal(episode.rewards, right.rewards)
             np.testing.assert_array_equal(episode.truncations, right.truncations)
             assert not episode.terminations.any()
-        assert [told["seed"] for told in dataset.storage.get_episode_metadata(range(3))] == SEEDS
+        assert [episode["seed"] for episode in dataset.storage.get_episode_metadata(range(3))] == SEEDS
         assert dataset.storage.metadata["algorithm_name"] == entry.policy
         assert entry.mean_return == pytest.approx(np.mean([e.rewards.sum() for e in dataset]), rel=1e-12)
 
@@ -205,12 +204,3 @@ def test_an_interruption_leaves_no_half_of_a_data_set(minari, monkeypatch, tmp_p
     with pytest.raises(KeyboardInterrupt):
         offline.write_datasets(ENV, ["imm"], episodes=2, horizon=4, folder=tmp_path / "out")
     assert list(tmp_path.rglob("*")) == []
-
-
-def test_without_minari_one_sentence_says_what_to_install(command, monkeypatch, tmp_path):
-    for name in ("minari", "minari.storage"):
-        monkeypatch.setitem(sys.modules, name, None)
-    code, _, errors = command("offline", ENV, "--episodes", 2, "--out", tmp_path / "out")
-    assert code == 2
-    assert "pip install 'filtergym[offline]'" in errors
-    assert not (tmp_path / "out").exists()

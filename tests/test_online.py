@@ -238,7 +238,6 @@ OF_ALL_KINDS = [
 
 
 def begin(filter):
-    """Start a filter of one track, and return the initial estimate, ``(..., 1)``."""
     initial = filter.input.initial
     given = {name: array[..., 0] for name, array in initial._asdict().items() if name != "first"}
     if filter.task.id == RADAR:
@@ -331,22 +330,22 @@ def test_a_users_own_runs_is_saved_and_restored():
         filter.start(STATE, COVARIANCE, tracks=[0])
 
 
-def test_an_agent_says_when_what_comes_is_unlike_its_training():
+def test_an_agent_reports_measurements_unlike_its_training():
     filter = filtergym.online(RADAR, "bptt", sampling_interval=5.0)
     filter.start(STATE, COVARIANCE)
     rng = np.random.default_rng(1)
     for k in range(40):
         x, y = 1e4 - 1000.0 * (k + 1) + 100.0 * rng.normal(), 2e4 + 250.0 * (k + 1) + 100.0 * rng.normal()
-        said = filter.update(x=x, y=y).departure
-    assert said == ""
+        sentence = filter.update(x=x, y=y).departure
+    assert sentence == ""
     for _ in range(40):
-        said = filter.update(x=x, y=y, sigma_x=0.5, sigma_y=0.5).departure
-    assert "lie outside the range of its training" in said
+        sentence = filter.update(x=x, y=y, sigma_x=0.5, sigma_y=0.5).departure
+    assert "lie outside the range of its training" in sentence
     filter.start(STATE, COVARIANCE)
     assert filter.update(x=9e3, y=2e4).departure == ""
 
 
-def test_the_example_of_the_page_prints_what_the_page_says(capsys):
+def test_the_example_of_the_page_prints_its_comments(capsys):
     docs = Path(__file__).parent.parent / "docs"
     runpy.run_path(str(docs / "examples" / "live_track.py"))
     assert capsys.readouterr().out in (docs / "live.md").read_text(encoding="utf-8")
@@ -366,7 +365,7 @@ def test_the_example_of_the_page_prints_what_the_page_says(capsys):
         (lambda f: f.update(x=[1.0, 2.0], y=2.0), r"x must have shape \(\), got \(2,\)"),
     ],
 )
-def test_what_is_wrong_is_said(call, sentence):
+def test_wrong_values_are_refused(call, sentence):
     filter = filtergym.online(RADAR, "imm")
     with pytest.raises(ValueError, match="has not been started: call start first"):
         filter.update(x=1.0, y=2.0)
@@ -381,7 +380,7 @@ def test_what_cannot_run_ahead_is_refused():
             filtergym.online(RADAR, name)
 
 
-def test_a_misspelt_value_is_told_where_an_environment_takes_its_arrays_by_name(monkeypatch):
+def test_a_misspelt_name_of_an_array_is_refused(monkeypatch):
     monkeypatch.setattr(import_problem(UAV).task, "companions", ())
     filter = filtergym.online(UAV, "kalman")
     states = len(filter.names)
@@ -390,7 +389,7 @@ def test_a_misspelt_value_is_told_where_an_environment_takes_its_arrays_by_name(
         filter.update(readings=np.zeros(3), command=0.0, control=0.0)
 
 
-def test_what_an_environment_needs_is_said():
+def test_missing_needs_of_an_environment_are_named():
     filter = filtergym.online(LOOSE, "plain-reduced")
     filter.start([0.0], [[0.0]])
     filter.update(ins=0.1, fix=0.2)
@@ -477,8 +476,8 @@ def test_what_is_older_than_the_buffer_is_counted_and_refused(lag, kept):
     assert max(sizes[kept:]) - min(sizes[kept:]) < 200
     before = filter.predict().mean
     for count in (1, 2):
-        said = rf"of 50.0 s comes too late: .* until 104.0 s are final; {count} were"
-        with pytest.raises(ValueError, match=said):
+        message = rf"of 50.0 s comes too late: .* until 104.0 s are final; {count} were"
+        with pytest.raises(ValueError, match=message):
             filter.update(50.0, x=0.0, y=0.0)
         assert filter.too_late == filter.save().too_late == count
     np.testing.assert_array_equal(filter.predict().mean, before)
@@ -585,10 +584,10 @@ def test_fixes_too_near_in_time_are_no_speed(name):
 
 
 def test_an_initial_covariance_is_one():
-    said = "the initial covariance must be symmetric and positive definite, got"
+    message = "the initial covariance must be symmetric and positive definite, got"
     upper = COVARIANCE + np.triu(np.full((4, 4), 50.0), 1)
     for covariance in (-COVARIANCE, 0.0 * COVARIANCE, upper, np.ones((4, 4))):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             filtergym.online(RADAR, "kalman-imm-turn").start(STATE, covariance)
     many = filtergym.online(RADAR, "imm", tracks=2)
     both = np.stack([COVARIANCE, -COVARIANCE], axis=2)
@@ -596,7 +595,7 @@ def test_an_initial_covariance_is_one():
         many.start(np.array([STATE, STATE]).T, both)
     known = filtergym.online(LOOSE, "plain-reduced")
     known.start([0.0], [[0.0]])  # which is how an episode begins there
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         known.start([0.0], [[-1.0]])
 
 

@@ -47,7 +47,7 @@ def dataset():
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path, dataset):
+def run(command, monkeypatch, tmp_path, dataset):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("filtergym.evaluation.running.summary.run_competitors", lambda *_, **__: dataset)
     monkeypatch.setattr(
@@ -55,15 +55,13 @@ def run(monkeypatch, capsys, tmp_path, dataset):
     )
     monkeypatch.setattr("filtergym.reports.pages.html_report.report_html", lambda *_, **__: "<html></html>")
 
-    def command(*words, output=None, program=main):
+    def ran(*words, output=None, program=main):
         if output is not None:
             monkeypatch.setattr("sys.stdout", output)
-        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            program()
-        return ended.value.code, capsys.readouterr().err
+        code, _, errors = command(*words, program=program)
+        return code, errors
 
-    yield command
+    yield ran
     console.quiet, console.refusal = True, None
     console.print()  # nothing: what is left from a refused print goes
     console.quiet = False

@@ -1,7 +1,7 @@
 """What README and the pages tell to type is right: commands are parsed, names are known, Python imports what there is.
 
 Pages for each audience run from top to bottom in ``test_docs.py``, snippets of README in ``test_readme.py``; here whole
-pages of the reference run likewise.
+those of pages of the reference run, too.
 """
 
 import ast
@@ -37,14 +37,12 @@ RUNNING = {
 
 
 def blocks(text, *languages):
-    """Yield blocks of a page in some languages."""
     for indent, language, block in BLOCK.findall(text):
         if language in languages:
             yield re.sub(f"^{indent}", "", block, flags=re.M)
 
 
 def commands(text):
-    """Yield words of every command of a page."""
     for block in blocks(text, "sh", "console"):
         for line in block.replace("\\\n", " ").splitlines():
             for command in re.split(r"&&|\|", line.removeprefix("$ ")):

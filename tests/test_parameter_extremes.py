@@ -1,4 +1,4 @@
-"""Parameters at the ends of their limits, alone and together: finite numbers, or one sentence that says why not.
+"""Parameters at the ends of their limits, alone and together: finite numbers, or one sentence with the reason.
 
 A few combinations here; every end alone and 2000 combinations of each environment by
 ``python tests/test_parameter_extremes.py 2000``; a second number is the seed, and names of environments may follow.
@@ -153,8 +153,8 @@ def combinations(cls, count, seed):
 def test_extreme_parameters_are_finite_or_refused(env_id):
     rng = np.random.default_rng(0)
     for keywords, kind in combinations(catalogue()[env_id], 12, seed=1):
-        said = finding(env_id, keywords, kind, rng)
-        assert not said or said.startswith("refused: "), f"{keywords}: {said}"
+        outcome = finding(env_id, keywords, kind, rng)
+        assert not outcome or outcome.startswith("refused: "), f"{keywords}: {outcome}"
 
 
 @pytest.mark.parametrize(
@@ -226,13 +226,13 @@ def main(count, seed="0", *chosen):
         refused = failed = 0
         for keywords, kind in cases:
             try:
-                said = finding(env_id, keywords, kind, rng)
+                outcome = finding(env_id, keywords, kind, rng)
             except Exception as error:
-                said = f"{type(error).__name__}: {error}"
-            refused += said.startswith("refused: ")
-            if said and not said.startswith("refused: "):
+                outcome = f"{type(error).__name__}: {error}"
+            refused += outcome.startswith("refused: ")
+            if outcome and not outcome.startswith("refused: "):
                 failed += 1
-                print(f"{env_id} {keywords}: {said}", flush=True)
+                print(f"{env_id} {keywords}: {outcome}", flush=True)
         print(
             f"{env_id}: {len(cases)} tried ({len(alone)} alone), {refused} refused, {failed} failed",
             flush=True,

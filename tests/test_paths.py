@@ -1,4 +1,4 @@
-"""Whoever takes the name of a file takes a ``pathlib.Path``; one name need not be a list."""
+"""Every function that takes the name of a file takes a ``pathlib.Path``; one name need not be a list."""
 
 import shutil
 from pathlib import Path

@@ -67,7 +67,6 @@ def _changed(columns, changes):
 
 
 def untold(columns):
-    """Without the truth."""
     return {name: values for name, values in columns.items() if not name.startswith("truth_")}
 
 
@@ -162,7 +161,7 @@ NOTED = [
 
 
 @pytest.mark.parametrize(("env", "columns", "sentence"), NOTED, ids=[sentence for *_, sentence in NOTED])
-def test_what_is_noteworthy_is_said(env, columns, sentence, tmp_path):
+def test_what_is_noteworthy_is_printed(env, columns, sentence, tmp_path):
     path = table(tmp_path / "log.csv", **columns)
     *others, note = further_notes(read_recording(path, env))
     assert others == (["120 missed measurements: these have no row"] if columns is LOST else [])
@@ -180,13 +179,13 @@ def test_what_is_noteworthy_goes_with_an_evaluation(tmp_path):
 
 def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):
     short = {name: values[:10] for name, values in plots().items()}
-    said = [*reading_lines(read_recording(table(tmp_path / "ten.csv", **short), TARGET))]
-    assert any(line.startswith("Fewer than 30 measurements") for line in said)
+    lines = [*reading_lines(read_recording(table(tmp_path / "ten.csv", **short), TARGET))]
+    assert any(line.startswith("Fewer than 30 measurements") for line in lines)
     # Kilometres whose deviations are kilometres, too, are a slow target: who knows it sees that.
-    (extent,) = (line for line in said if line.startswith("Positions span"))
+    (extent,) = (line for line in lines if line.startswith("Positions span"))
     assert re.fullmatch(r"Positions span [45],\d{3} m by [1-4]\d\d m, at 1[2-8]\d m/s in the median.", extent)
-    said = [*reading_lines(read_recording(table(tmp_path / "sixty.csv", **plots()), TARGET))]
-    assert not any("guess" in line for line in said)
+    lines = [*reading_lines(read_recording(table(tmp_path / "sixty.csv", **plots()), TARGET))]
+    assert not any("guess" in line for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +209,7 @@ def test_a_right_table_passes_without_a_note(tmp_path):
         assert further_notes(read_recording(table(tmp_path / "log.csv", **columns), env)) == []
 
 
-def test_slow_targets_are_taken_where_somebody_says_so(tmp_path):
+def test_slow_targets_are_accepted_on_request(tmp_path):
     path = table(tmp_path / "slow.csv", **untold(plots(time=lambda t: 300.0 * t)))
     with pytest.raises(ValueError, match="are the times milliseconds"):
         read_recording(path, TARGET, sampling_interval=1500.0)

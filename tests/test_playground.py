@@ -19,7 +19,7 @@ import filtergym
 
 STATIC = Path(__file__).parent.parent / "docs" / "_static"
 WAIT = 60.0
-"""Seconds that nobody should need."""
+"""Seconds that suffice on any machine."""
 WIDTH = 16_000.0
 """Of the map, m."""
 in_browser = pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())
@@ -55,7 +55,7 @@ def assert_equal_up_to_rounding(mean, covariance, name, plots):
     ]
     other, Q = replay(name, moved)
     tolerance = (np.abs(other - expected) / sigma).max()
-    assert 0.0 < tolerance < 1e-3  # else the comparison says nothing
+    assert 0.0 < tolerance < 1e-3  # else the comparison shows nothing
     assert (np.abs(mean - expected) / sigma).max() < tolerance
     scale = sigma[:, :, None] * sigma[:, None, :]
     assert (np.abs(covariance - P) / scale).max() < max((np.abs(Q - P) / scale).max(), 1e-11)
@@ -190,7 +190,7 @@ def shown_steps(driver):
     return [{name: step[name] for name in names} for step in kept], kept[2:]
 
 
-def assert_shows_what_python_says(driver):
+def assert_shows_what_python_computes(driver):
     plots, shown = shown_steps(driver)
     for name in FILTERS:
         own = [step["estimates"][name] for step in shown]
@@ -223,13 +223,13 @@ def test_a_table_is_run_as_python_runs_it(driver):
     rows.writerows({k: "" if v != v else v for k, v in plot.items()} for plot in plots)
     driver.execute_script(DROP, table.getvalue())
     wait(driver, f"return {STATUS}.startsWith('mine.csv: 300 rows')")
-    assert len(assert_shows_what_python_says(driver)) == 298
+    assert len(assert_shows_what_python_computes(driver)) == 298
     # Deviations that the table does not state are those of the slider.
     set_slider(driver, "noise", 200)
     bare = "\n".join(",".join(line.split(",")[:3]) for line in table.getvalue().splitlines())
     driver.execute_script(DROP, bare)
     wait(driver, "return playground.track.steps[0].sigma_x === 200")
-    assert_shows_what_python_says(driver)
+    assert_shows_what_python_computes(driver)
     for broken, complaint in (
         ("time,x\n1,2", "y not found"),
         ("time,x,y\n1,2,3\n1,2,3\n2,3,4", "row 2"),

@@ -48,7 +48,7 @@ def test_context_is_finite_of_one_shape_and_the_truths_own(env_id, short):
             np.testing.assert_array_equal(context[key], values[..., 0])
 
 
-def test_maneuvers_are_flown_when_the_context_says():
+def test_maneuvers_are_flown_as_the_context_states():
     found = 0
     for seed in range(2):
         # On time: of a scan that comes early the velocity is that between two scans.
@@ -66,7 +66,7 @@ def test_maneuvers_are_flown_when_the_context_says():
     assert found
 
 
-def test_outages_are_where_the_context_says():
+def test_outages_are_as_the_context_states():
     contexts, states = rollout(LOOSE, 499, scenario="outage", decision_interval=1)
     first, beyond = contexts[0]["outage"]
     number = np.arange(1, 501)
@@ -75,7 +75,7 @@ def test_outages_are_where_the_context_says():
     assert states[-1].measurement.available[0] == contexts[-1]["available"]
 
 
-def test_class_changes_when_the_context_says():
+def test_class_changes_as_the_context_states():
     contexts, _ = rollout(ESM, 100, scenario="class-change", decision_interval=1)
     start = contexts[0]
     changed = np.arange(1, 102) >= start["change_scan"]
@@ -85,7 +85,7 @@ def test_class_changes_when_the_context_says():
     assert set(classes[~changed]) == {start["target_class"]}
 
 
-def test_faults_hold_when_the_context_says():
+def test_faults_hold_as_the_context_states():
     contexts, _ = rollout(TIGHT, 20, scenario="accelerometer-failure", decision_interval=10, horizon=300)
     first, last = contexts[0]["stuck"]
     steps = 1 + 10 * np.arange(21)
@@ -202,7 +202,7 @@ def test_policies_are_not_shown_what_is_privileged():
         ({"observation": "asymmetric", "scenario": {"random": 1, "paper": 1}}, "context of another shape"),
     ],
 )
-def test_wrong_keywords_are_told(keywords, message):
+def test_wrong_keywords_are_refused(keywords, message):
     with pytest.raises(ValueError, match=message):
         gymnasium.make(ID, **keywords)
 

@@ -1,4 +1,4 @@
-"""Programs as competitors: what they are told, what becomes of their mistakes, and that nothing is left of them."""
+"""Programs as competitors: what they receive, what becomes of their mistakes, and that nothing is left of them."""
 
 import contextlib
 import json
@@ -47,10 +47,10 @@ ID = "filtergym/ManeuveringTarget-v0"
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
 CLIENTS = EXAMPLES / "programs"
 LINUX = pytest.mark.skipif(
-    sys.platform != "linux", reason="only Linux limits memory and tells processor time"
+    sys.platform != "linux", reason="only Linux limits memory and measures processor time"
 )
 
-# Holds what it was told first; the word behind the file says what goes wrong at the third measurement.
+# Holds what it received first; the word behind the file names what goes wrong at the third measurement.
 HOLD = """
 import json, os, sys, time
 
@@ -100,7 +100,7 @@ for k, line in enumerate(sys.stdin):
 
 
 def task_of(components=2):
-    """A task as far as a program is told of it."""
+    """A task as far as a program receives it."""
     named = [Component(f"c{i}", "m") for i in range(components)]
     return SimpleNamespace(
         id="mine/Task-v0", components=named, groups={}, companions=(), parameters=None, closes_loop=False
@@ -150,7 +150,7 @@ for line in sys.stdin:
 """
 
 
-def test_a_program_steers_the_tracking_loops_where_it_says_a_number(tmp_path):
+def test_a_program_steers_the_tracking_loops_by_its_numbers(tmp_path):
     """What is no number is not taken, and the loops follow the estimate, as without."""
     (tmp_path / "steer.py").write_text(STEER)
     navigation = make_model("filtergym/TightlyCoupledNavigation-v0", scenario="kinematic", horizon=4)
@@ -175,14 +175,14 @@ def test_a_program_steers_the_tracking_loops_where_it_says_a_number(tmp_path):
     [
         ("crash", ENDED, 2, "it was ended by SIGABRT"),
         ("exit", ENDED, 2, "it has ended with exit status 1: disk full"),
-        ("hang", LATE, 2, "it has not answered within 0.3 s"),
+        ("hang", LATE, 2, "it has not responded within 0.3 s"),
         ("shape", WRONG, 2, "its 'mean' is not 8 lists of 2 numbers"),
         ("words", WRONG, 2, "its 'mean' is not 8 lists of 2 numbers"),
-        ("prints", WRONG, 2, "its answer is no JSON object: 'debugging"),
-        ("twice", WRONG, 3, "it has written more than an answer"),
-        ("afterwards", WRONG, 3, "it has written more than an answer"),
-        ("flood", WRONG, 2, "it has answered with a line of more than"),
-        ("no hello", WRONG, 0, "its answer is no JSON object: 'welcome"),
+        ("prints", WRONG, 2, "its response is no JSON object: 'debugging"),
+        ("twice", WRONG, 3, "it has written more than one response"),
+        ("afterwards", WRONG, 3, "it has written more than one response"),
+        ("flood", WRONG, 2, "it has responded with a line of more than"),
+        ("no hello", WRONG, 0, "its response is no JSON object: 'welcome"),
         ("no licence", ENDED, 0, "it has ended with exit status 1: RuntimeError: no licence"),
         pytest.param("memory", ENDED, 2, "exit status 1: MemoryError", marks=LINUX),
     ],
@@ -194,8 +194,8 @@ def test_a_mistake_loses_all_tracks_with_its_reason_from_there_on(
         monkeypatch.setattr(program_process, "END_SECONDS", 0.1)
     with pytest.warns(UserWarning, match=f"measurement {first + 1}: .*; 8 episodes are lost") as noted:
         means, estimator = run(hold(how), seconds=0.3 if how == "hang" else 10.0, memory=1000.0)
-    [told] = [str(one.message) for one in noted if "program" in str(one.message)]
-    assert words in told
+    [warning] = [str(one.message) for one in noted if "program" in str(one.message)]
+    assert words in warning
     assert estimator.fault == fault
     assert np.isfinite(means[:first]).all()
     assert np.isnan(means[first:]).all()
@@ -301,7 +301,6 @@ def test_neither_side_waits_for_the_other_with_a_full_pipe(tmp_path):
 
 
 def running(pid):
-    """Whether there is a process, a zombie too."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -366,7 +365,7 @@ def test_its_time_is_that_of_its_process(hold):
     assert found.nanoseconds > 0.0
 
 
-# --- what it is told
+# --- what it receives
 
 
 def test_a_hello_names_every_number(env_id):
@@ -388,7 +387,7 @@ def test_a_hello_names_every_number(env_id):
         assert [tuple(own["shape"]) for own in present] == [a.shape[:-1] for _, a in named_arrays(part)]
         assert hello["numbers"][name] == sum(a[..., 0].size for a in leaves(part))
         assert rows_of(part, 1).shape == (1, hello["numbers"][name])
-    # Every field of a measurement says what it is; its unit is among the words.
+    # Every field of a measurement has a description; its unit is among the words.
     assert all(own["about"] for own in hello["measurement"])
     C = len(model.task.components)
     assert hello["numbers"]["answer"] == C + C * C
@@ -427,7 +426,7 @@ def estimates(maker, scenario="glint", episodes=3, horizon=12):
 def agree(one, other):
     """Assert equality of filters that compute the same in another order.
 
-    Positions of 1e5 m are known to 1e-11 of them, ten additions and products of them; covariances of 1e6 m^2 likewise.
+    Positions of 1e5 m are known to 1e-11 of them, ten additions and products of them; so are covariances of 1e6 m^2.
     """
     for own, expected in zip(estimates(one), estimates(other), strict=True):
         np.testing.assert_allclose(own, expected, rtol=1e-11, atol=1e-6)

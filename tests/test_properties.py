@@ -64,7 +64,7 @@ def test_impossible_modes_leave_the_imm_finite(transition, probabilities, log_li
     assert_probabilities(prediction.mixing)
     mean, covariance = random_bank(4)
     assert_bank(*imm.mix(mean, covariance, prediction.mixing))
-    # A measurement that no mode allows is nobody's to judge.
+    # A measurement that no mode allows is not to be judged.
     log_likelihood[0] = np.maximum(log_likelihood[0], -1e300)
     posterior = imm.mode_posterior(imm.log_probabilities(prediction.probabilities), log_likelihood)
     assert_probabilities(posterior)

@@ -37,7 +37,6 @@ def assert_all_equal(some, others):
 
 
 def length(env):
-    """Decisions until the first truncation."""
     env.reset(seed=0)
     action, count, finished = env.action_space.sample(), 0, False
     while not finished:
@@ -60,7 +59,7 @@ def test_every_kind(id):
 
 
 def refuses_keywords_as_a_client_expects_who_tries_them(subject):
-    # TorchRL's GymEnv does, and takes the keyword back if this is what Python says.
+    # TorchRL's GymEnv does, and takes the keyword back if Python raises this.
     for make in (gym.make, make_three):
         with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
             make(subject.id, frameskip=1)
@@ -70,7 +69,7 @@ def refuses_keywords_as_a_client_expects_who_tries_them(subject):
             make(subject.id, horizons=5)
 
 
-def says_in_its_spec_how_long_an_episode_is(subject):
+def spec_has_the_length_of_an_episode(subject):
     for make in (subject.single, functools.partial(subject.native, 3)):
         env, limited, unlimited = (make(**k) for k in ({}, *({"max_episode_steps": n} for n in (3, -1))))
         assert env.spec.max_episode_steps == length(env) == 5
@@ -82,7 +81,7 @@ def says_in_its_spec_how_long_an_episode_is(subject):
         assert again.spec.max_episode_steps == length(again) == 5
 
 
-def says_how_long_a_scenario_is(subject):
+def scenarios_have_their_length(subject):
     task = subject.single().unwrapped.task
     for name, scenario in (
         (None, task.scenarios[task.default_scenario]),
@@ -147,7 +146,7 @@ def rounds_a_single_environment_as_a_vector(subject):
 
 
 def draws_without_a_trace_and_copies_alike(subject):
-    """Whoever draws, closes or copies a picture changes no episode, and a copy draws what the original does."""
+    """To draw, close or copy a picture changes no episode, and a copy draws what the original does."""
     plain, env = subject.single(), subject.single(render_mode="rgb_array")
     np.testing.assert_array_equal(plain.reset(seed=3)[0], env.reset(seed=3)[0])
     actions = actions_for(env, 5)
@@ -164,8 +163,8 @@ def draws_without_a_trace_and_copies_alike(subject):
 
 PROPERTIES = (
     refuses_keywords_as_a_client_expects_who_tries_them,
-    says_in_its_spec_how_long_an_episode_is,
-    says_how_long_a_scenario_is,
+    spec_has_the_length_of_an_episode,
+    scenarios_have_their_length,
     limits_only_whom_asks,
     is_aware_of_time,
     rounds_a_single_environment_as_a_vector,

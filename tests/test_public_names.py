@@ -27,7 +27,6 @@ ELSEWHERE = {
 
 
 def resolve(name):
-    """Return what a dotted name stands for."""
     words = name.split(".")
     for count in range(len(words), 0, -1):
         try:

@@ -55,7 +55,7 @@ def test_non_adaptive_and_ideal_have_their_exact_errors():
 
 
 def played(model, estimator, seeds, decisions):
-    """What was told of the start; then episodes after each measurement, and the estimator's mean and covariance."""
+    """The given start; then episodes after each measurement, and the estimator's mean and covariance."""
     begun, states = [], []
     lanes = start_lanes(model, seeds, begun.append)
     (start,) = begun
@@ -99,12 +99,12 @@ def test_ideal_switches_its_model_at_the_change():
     model = make_model(ID, scenario="class-change", decision_interval=1)
     models, start = model.task.design_models(model.task.parameters)
     H, R = models.H, models.R
-    told, states = played(model, Ideal(model.task), range(8), 120)
+    initial, states = played(model, Ideal(model.task), range(8), 120)
     first = model.task.parameters.class_change[0]
     for lane in range(8):
         changes = 0
         governed = int(states[0][0].truth.target_class[lane])
-        mean, covariance = numpy.append(told.first.radar[:, lane], 0.0), start[..., governed]
+        mean, covariance = numpy.append(initial.first.radar[:, lane], 0.0), start[..., governed]
         for episode, estimate, reported in states:
             z = episode.measurement.radar[:, lane]
             Phi = models.Phi[..., governed]

@@ -48,7 +48,7 @@ def test_hypotheses_multiplies_the_odds_of_a_second_emitter(steered):
 
     for state, measurement in quiet(bank, scans)[::7]:
         before, after = (
-            bank.look(state, bank.own.update(state.own, bank_input(measurement, action)), measurement)
+            bank.add_observed(state, bank.own.update(state.own, bank_input(measurement, action)), measurement)
             for action in (None, np.eye(7)[4] * math.log(2.0))
         )
         p = before.second_emitter

@@ -3,6 +3,7 @@
 import math
 from types import SimpleNamespace
 
+import models
 import numpy
 import pytest
 
@@ -23,14 +24,7 @@ def make(scenario="paper", control="evidence", xp=numpy, **keywords) -> Model:
 
 
 def draw(model, N, seed):
-    """Noise of an episode for N lanes: uniforms, normals, rows."""
-    rng, layout = numpy.random.default_rng(seed), model.task.noise
-    start = rng.random((layout.uniforms, N)), rng.standard_normal((layout.initial_normals, N))
-    rows = (
-        numpy.concatenate([rng.standard_normal((layout.normals, N)), rng.random((layout.row_uniforms, N))])
-        for _ in range(model.task.horizon + 1)
-    )
-    return *start, rows
+    return models.draw(model, N, seed, model.task.horizon + 1)
 
 
 def roll(model, noise, policy=None):
@@ -156,20 +150,20 @@ def test_weights_that_are_stated_are_the_prior_of_the_next_scan(control):
     model = make("random", control, horizon=20)
     stated = numpy.full(8, 2) if control == "mode" else numpy.tile([[0.0], [0.0], [1.0]], 8)
     for _, _, state in roll(model, draw(model, 8, 4), lambda _: stated):
-        numpy.testing.assert_array_equal(state.filter.believed, [[0.0] * 8, [0.0] * 8, [1.0] * 8])
+        numpy.testing.assert_array_equal(state.filter.posterior, [[0.0] * 8, [0.0] * 8, [1.0] * 8])
 
 
-def test_everyone_is_told_the_first_measurement_and_how_good_it_is():
+def test_every_filter_receives_the_first_measurement_with_its_covariance():
     model = make("fixed-type", prior=(0.2, 0.3, 0.5))
     uniforms, normals, _ = draw(model, 40000, 15)
     episode = model.begin(uniforms, normals)
-    told, error = episode.measurement, episode.measurement.mean - episode.truth.motion
-    assert numpy.array_equal(told.mean[:2], told.first.radar)
-    assert told.first.looked.all()
-    assert (told.mean[2] == 0.0).all()
+    measured, error = episode.measurement, episode.measurement.mean - episode.truth.motion
+    assert numpy.array_equal(measured.mean[:2], measured.first.radar)
+    assert measured.first.looked.all()
+    assert (measured.mean[2] == 0.0).all()
     # 40000 lanes: the mean of squares has a standard error of 0.7 %, more where the classes mix.
-    assert (error**2).mean(axis=1) == pytest.approx(told.covariance[..., 0].diagonal(), rel=0.03)
-    assert (told.covariance[..., 0] == numpy.diag(told.covariance[..., 0].diagonal())).all()
+    assert (error**2).mean(axis=1) == pytest.approx(measured.covariance[..., 0].diagonal(), rel=0.03)
+    assert (measured.covariance[..., 0] == numpy.diag(measured.covariance[..., 0].diagonal())).all()
 
 
 WORLDS = {

@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from readme import with_printed
+from readme import insert_outputs
 from records import read_record
 
 import filtergym
@@ -40,8 +40,8 @@ def test_commands_print_what_the_readme_shows():
     """``python docs/make readme --printed`` puts it there again."""
     pytest.importorskip("llvmlite")  # what is compiled is not marked as asked in Python
     text = README.read_text(encoding="utf-8")
-    assert without_times(with_printed(README)) == without_times(text)
-    # The text says over what, as the table's title does.
+    assert without_times(insert_outputs(README)) == without_times(text)
+    # The text names the episodes, as the table's title does.
     for words in (
         "500 episodes, test split, seed 0",
         "500 of the test split, seed 0",
@@ -58,10 +58,10 @@ def test_the_headline_names_the_episodes_of_its_record():
 def test_what_a_page_shows_of_its_commands_is_what_they_print(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
-        "In `said.py`:\n\n```python\nraise SystemExit\n```\n\n```sh\nfiltergym --version\n```\n\n"
+        "In `exit.py`:\n\n```python\nraise SystemExit\n```\n\n```sh\nfiltergym --version\n```\n\n"
         "<!-- printed: begin -->\nold\n<!-- printed: end -->\n"
     )
-    shown = with_printed(page)
+    shown = insert_outputs(page)
     assert (
         f"<!-- printed: begin -->\n\n```text\nfiltergym {filtergym.__version__}\n```\n\n<!-- printed: end -->"
         in shown
@@ -69,7 +69,7 @@ def test_what_a_page_shows_of_its_commands_is_what_they_print(tmp_path):
     assert "old" not in shown
     page.write_text(page.read_text().replace("--version", "--nothing"))
     with pytest.raises(ValueError, match="filtergym --nothing failed"):
-        with_printed(page)
+        insert_outputs(page)
 
 
 def test_links_exist():

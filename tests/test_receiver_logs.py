@@ -156,7 +156,6 @@ def test_what_is_no_solution_is_refused(change, sentence, tmp_path):
 
 
 def sentence(words):
-    """Words with their checksum."""
     total = 0
     for byte in words.encode():
         total ^= byte
@@ -190,7 +189,6 @@ def nmea(path, deviations=True, dates=True, quality=None):
 
 @pytest.fixture
 def pynmea2():
-    """The library that parses sentences."""
     return pytest.importorskip("pynmea2", reason="not installed: pip install 'filtergym[logs]'")
 
 
@@ -264,22 +262,6 @@ def test_logs_of_too_many_rows_are_refused(pynmea2, tmp_path, monkeypatch):
     ):
         with pytest.raises(ValueError, match="it has more than 39 rows: split it"):
             read_recording(path, TARGET)
-
-
-@pytest.mark.parametrize(
-    ("suffix", "library"),
-    [
-        (".nmea", "pynmea2"),
-        (".ulg", "pyulog"),
-        (".bin", "pymavlink.DFReader"),
-        (".bag", "rosbags.rosbag1"),
-    ],
-)
-def test_a_missing_library_is_named(suffix, library, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, library, None)
-    (tmp_path / f"log{suffix}").write_bytes(b"anything")
-    with pytest.raises(ValueError, match=r"needs one more package: pip install 'filtergym\[logs\]'"):
-        read_recording(tmp_path / f"log{suffix}", TARGET)
 
 
 # --- ULog

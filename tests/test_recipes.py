@@ -20,7 +20,6 @@ TINY = {"STEPS": 2_000, "UPDATES": 1, "RECORDED": 2, "EPISODES": 8}
 
 
 def shortened(file: Path) -> str:
-    """Text of a recipe with tiny budgets."""
     text = file.read_text(encoding="utf-8")
     if file.suffix == ".sh":
         for name, value in TINY.items():

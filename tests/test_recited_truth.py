@@ -28,7 +28,7 @@ class Held:
 
 
 class Recited:
-    """An estimator that says at each time what is to be expected, linear in the initial estimate.
+    """An estimator that returns at each time the expected truth, linear in the initial estimate.
 
     Args:
         coefficients: ``(K, 1 + C, C)``, of one and of the initial estimate.
@@ -53,7 +53,7 @@ class Recited:
 def learn(truth, initial):
     """Regress the truth at every time ``(episodes, K, C)`` on one and the initial estimate ``(episodes, C)``."""
     episodes, K, C = truth.shape
-    # Units differ by orders of magnitude; a component that is always the same says nothing beside one.
+    # Units differ by orders of magnitude; a component that is always the same is not compared.
     centre, spread = initial.mean(axis=0), initial.std(axis=0)
     scale = np.where(spread > 1e-9 * (1.0 + np.abs(centre)), spread, np.inf)
     design = np.concatenate([np.ones((episodes, 1)), (initial - centre) / scale], axis=1)
@@ -66,7 +66,7 @@ def learn(truth, initial):
 
 
 def reciters(env_id, paper):
-    """Reciters learned from training episodes; several where the truth is another for whoever steers."""
+    """Reciters learned from training episodes; several where the truth is another for each competitor that steers."""
     flown = evaluate(
         env_id, {"held": Held, paper: paper}, "random", TRAINING_EPISODES, split="train", tracks=True
     )

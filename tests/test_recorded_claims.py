@@ -9,7 +9,7 @@ from filtergym.names import ranked_names
 
 pytestmark = pytest.mark.claims
 COMPETE = ("policy", "estimator")
-"""Kinds that are told nothing, and not what comes later."""
+"""Kinds that know neither the truth nor the future."""
 AS_MODELLED = ("ManeuveringTarget", "LooselyCoupledNavigation", "RadarEsmTracking")
 """Environments whose reference knows the world as it is, in every scenario."""
 
@@ -20,7 +20,7 @@ def recorded_scenarios(name):
     return {scenario: found["competitors"] for scenario, found in scenarios.items()}
 
 
-def test_nobody_is_significantly_better_than_the_reference(env_id):
+def test_no_competitor_is_significantly_better_than_the_reference(env_id):
     """A score of one is the reference; its interval is that of paired differences over the same episodes."""
     scenarios = recorded_scenarios(bare_name(env_id))
     assert list(scenarios) == list(catalogue()[env_id].scenarios)

@@ -12,7 +12,7 @@ from comparison import compared_policies
 from contract import assert_properties
 from front import panels_of
 from made_results import results_of
-from readme import with_numbers
+from readme import insert_numbers
 from records import (
     FOLDER,
     BenchmarkRecords,
@@ -39,12 +39,12 @@ DOCS = Path(__file__).parent.parent / "docs"
 PAGES = {
     str(path.relative_to(DOCS.parent)): path.read_text(encoding="utf-8")
     for path in (DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md")))
-    if "reproductions" not in path.parts  # each is the record of one command, and says which
+    if "reproductions" not in path.parts  # each is the record of one command, and names it
 }
 ROLE = re.compile(r"\{(number|value|record)\}`([^`]+)`")
 MEASURED = re.compile(r"(?<![\w.])\d[\d,.]*\s?(?:%|ns\b|µs\b|\[[-+\d., ]+\])")
 NAMED = re.compile(r"\{record\}`|docs/records/")
-"""How a section says where its numbers are from; README, which nobody renders, by a link."""
+"""How a section names the source of its numbers; README, which is not rendered, by a link."""
 MOST_BYTES = 400_000
 
 
@@ -113,7 +113,7 @@ def test_every_record_is_small_and_shown():
 def test_readme_and_paper_show_the_records(name):
     """If not: ``python docs/make readme NAME``."""
     page = DOCS.parent / name
-    assert with_numbers(page) == page.read_text(encoding="utf-8")
+    assert insert_numbers(page) == page.read_text(encoding="utf-8")
 
 
 def test_readme_gets_its_numbers(tmp_path, make_page, monkeypatch):
@@ -217,7 +217,7 @@ def test_comparison_shows_what_the_records_say(recorded, result):
 
 
 def test_a_record_takes_competitors_measured_later(recorded, tmp_path, make_page):
-    """Over the same episodes they are as if they had been there; whoever does not come out again is refused."""
+    """Over the same episodes they are as if they had been there; a competitor with other results is refused."""
     later = results_of(ENV, ["imm", "imm-tuned", "ppo", "known-turn", "zero"], None, 10, **SMALL)
     write_results(tmp_path / "later.json", [later], settings_of("filtergym evaluate"))
     before, _ = read_benchmark("ManeuveringTarget", recorded)
@@ -263,7 +263,7 @@ def test_results_table_of_everybody_and_of_some(recorded, result):
     [data] = markdown_tables(some)
     assert data["columns"] == ["policy", "cost against `imm`, %", "ANEES"]
     assert {row[0] for row in data["rows"]} == {"`ppo`", "`imm`"}
-    # A row is that of the whole table, whoever else is shown.
+    # A row is that of the whole table, whatever other rows are shown.
     [everything] = markdown_tables(whole)
     for row in data["rows"]:
         assert row[1] == table_cell(everything, row[0].strip("`"), "cost against")
@@ -303,7 +303,7 @@ def test_numbers_of_sentences(tmp_path):
         assert record_of(path) == "benchmark/ManeuveringTarget"
     for wrong in (
         "random/bptt/price",
-        "random/nobody/cost",
+        "random/missing/cost",
         "nowhere/bptt/cost",
         "random",
         "random/bptt/rmse x",

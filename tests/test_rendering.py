@@ -21,7 +21,6 @@ ID = "filtergym/ManeuveringTarget-v0"
 
 
 def played(steps, seed=1, **keywords):
-    """Environment after some random actions."""
     env = TaskEnv(ID, render_mode="rgb_array", **keywords)
     env.action_space.seed(seed)
     env.reset(seed=seed)
@@ -30,7 +29,10 @@ def played(steps, seed=1, **keywords):
     return env
 
 
-@pytest.mark.parametrize(("control", "general"), [("gain", False), ("evidence", False), ("evidence", True)])
+@pytest.mark.parametrize(
+    ("control", "general"),
+    [("gain", False), ("sigma-points", False), ("evidence", False), ("evidence", True)],
+)
 def test_frames_are_images_that_change(control, general, monkeypatch):
     """Drawn with the task's own picture, and with the one for tasks that have none."""
     if general:
@@ -154,7 +156,7 @@ def test_ellipse_axes_of_a_turned_covariance():
     ],
 )
 def test_limits_grow_on_a_ladder(limits, low, high, expected):
-    assert rendering.grown(limits, low, high) == pytest.approx(expected, rel=1e-12)
+    assert rendering.widen_limits(limits, low, high) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize(("face", "many"), [(TaskEnv, {}), (TaskVectorEnv, {"num_envs": 2})])
@@ -169,7 +171,7 @@ def test_render_before_reset_and_without_a_mode(face, many):
         face(ID, **many, render_mode="rgb_aray")
 
 
-def test_human_mode_says_what_is_missing_and_no_mode_needs_no_library():
+def test_human_mode_names_what_is_missing_and_no_mode_needs_no_library():
     code = (
         "import filtergym, gymnasium, sys, warnings\n"
         f"gymnasium.make({ID!r}).reset(seed=0)\n"
@@ -277,7 +279,7 @@ def test_estimators_smoothers_and_references_are_drawn(id, name, monkeypatch):
         numpy.testing.assert_allclose(drawn[-1][key], expected, rtol=1e-6, atol=1e-6)
 
 
-def test_steps_that_nobody_looks_at_are_drawn_when_somebody_does():
+def test_skipped_steps_are_drawn_with_the_next_picture():
     """Stable-Baselines3's ``make_vec_env`` asks for a render mode always: it must cost nothing.
 
     In a scenario whose measurements take uniform numbers, too, with several measurements a decision.

@@ -1,4 +1,4 @@
-"""The report: what its file of results keeps, what its page says, and that nothing of it is executed."""
+"""The report: what its file of results keeps, what its page shows, and that nothing of it is executed."""
 
 import base64
 import functools
@@ -219,7 +219,7 @@ def test_rows_of_ones_own_are_marked(width, result, command_console):
         for r in result.records
     ]
     own = {r.policy for r in records} - {"ppo"}
-    tables = results_tables(records, {}, width, own=own)
+    tables = results_tables(records, {}, width, user_names=own)
     text = command_console(width, *tables)
     assert text.count("> isolated:mine") == len(own) * len(tables)
     assert "> ppo" not in text
@@ -283,7 +283,7 @@ def test_consistency_in_a_word():
 
 def test_only_who_is_consistent_is_called_so(result):
 
-    def told(low):
+    def sentences(low):
         consistency = {"value": 1.1, "low": low, "high": 1.2}
         records = [
             r._replace(**consistency) if (r.metric, r.window) == ("anees", "all") else r
@@ -291,8 +291,10 @@ def test_only_who_is_consistent_is_called_so(result):
         ]
         return remarks([result._replace(records=records)])
 
-    assert any("The winner states a covariance that does not fit" in s and "1.1" in s for s in told(1.05))
-    assert "The covariance of every winner is as large as its errors." in told(0.9)
+    assert any(
+        "The winner states a covariance that does not fit" in s and "1.1" in s for s in sentences(1.05)
+    )
+    assert "The covariance of every winner is as large as its errors." in sentences(0.9)
 
 
 def test_remarks_follow_from_the_numbers(result):
@@ -414,7 +416,7 @@ def has_the_lead_of_a_naive_search(result, seed):
         assert max(naive) == (3999 if lead.last == np.inf else lead.last - 1.0)
 
 
-def test_page_holds_what_the_file_says(result):
+def test_page_holds_the_content_of_the_file(result):
     html = report_html([result], SETTINGS)
     page = Page(html)
     assert len(html) < 10e6
@@ -435,7 +437,7 @@ def test_page_holds_what_the_file_says(result):
     assert '<td data-label="it holds">in turns and other manoeuvres</td>' in html
     assert [one.policy for one in result.worst] == ["imm"] * 3
     assert all(f"<code>{one.seed}</code>" in html for one in result.worst)
-    # Every figure says in words what it shows.
+    # Every figure states in words what it shows.
     assert html.count('role="img"') == html.count('<div class="plot"') == 8
     assert not [address for address in page.addresses if not address.startswith("#")]
 
@@ -480,17 +482,17 @@ def test_a_filter_of_the_user_comes_first(result):
 
 
 @pytest.mark.parametrize(
-    ("cost", "said"),
+    ("cost", "phrase"),
     [
         ((0.425, 0.4, 0.45), "42.5 % more error cost than `imm`"),
         ((-0.3, -0.4, -0.2), "30.0 % less error cost than `imm`"),
         ((0.01, -0.02, 0.04), "level with `imm`"),
     ],
 )
-def test_a_sentence_compares_the_users_own(result, cost, said):
+def test_a_sentence_compares_the_users_own(result, cost, phrase):
     records = made(result, {"imm": COSTS["imm"], "mine": (*cost, "estimator", 100.0)}, {}).records
     best = ", the lowest of all 2" if cost[0] < 0.0 else ""
-    assert own_sentences(records, ["mine"], "imm") == [f"`mine`: {said}{best}; states no covariance."]
+    assert own_sentences(records, ["mine"], "imm") == [f"`mine`: {phrase}{best}; states no covariance."]
 
 
 def test_nothing_of_a_hostile_file_becomes_markup(result, tmp_path):

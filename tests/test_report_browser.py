@@ -10,7 +10,7 @@ from filtergym.reports.pages.html_report import report_html
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())]
 FIGURES = ["ranking", "rmse", "exceeded", "difference", "consistency", "steering", "track", "worst"]
 WAIT = 60.0
-"""Seconds that nobody should need."""
+"""Seconds that suffice on any machine."""
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +33,12 @@ def page(results, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def wide(page):
-    """The page on a screen, everything open."""
     with browser.opened(page, 1400, height=1400) as driver:
         yield opened_whole(driver)
 
 
 @pytest.fixture(scope="module")
 def narrow(page):
-    """The page on a telephone, everything open."""
     with browser.opened(page, 400) as driver:
         yield opened_whole(driver)
 
@@ -118,7 +116,7 @@ def test_nothing_is_off_a_narrow_screen(narrow):
     )
 
 
-def test_a_table_that_is_too_wide_says_so(page):
+def test_a_table_that_is_too_wide_has_a_hint(page):
     with browser.opened(page, 1000) as driver:
         opened_whole(driver)
         scrolls = driver.execute_async_script(
@@ -126,8 +124,8 @@ def test_a_table_that_is_too_wide_says_so(page):
             "requestAnimationFrame(() => requestAnimationFrame(() => done("
             "tables.map(x => [x.scrollWidth > x.clientWidth + 1, x.classList.contains('scrolls')]))))"
         )
-        assert all(wider == said for wider, said in scrolls)
-        assert any(said for _, said in scrolls)
+        assert all(wider == width for wider, width in scrolls)
+        assert any(width for _, width in scrolls)
 
 
 def test_tables_sort_by_number_and_by_name(wide):
@@ -218,7 +216,7 @@ def test_a_hostile_file_runs_nothing(results, tmp_path):
         )
         # Not even the page's policy had anything to refuse.
         assert errors(driver) == []
-        # What the file says is shown as text, in tables and in figures.
+        # The content of the file is shown as text, in tables and in figures.
         assert "</script><script>" in driver.find_element("css selector", "table.sortable").text
         assert driver.execute_script(
             "return document.querySelector('figure[data-kind=ranking] .plot').textContent.includes('<img')"

@@ -14,7 +14,7 @@ from filtergym.papers.reproduction import (
     Claim,
     Reproduction,
     episode_count,
-    its_command,
+    reproduction_command,
     verdict_of,
 )
 from filtergym.reproductions import paper_module, papers
@@ -28,7 +28,7 @@ def example() -> Reproduction:
         [Claim("C1", "It is small.", "|e| = 3.1 ± 0.2 m", "10 runs", "not reproduced")],
         [Grid("Errors", ("run", "m"), [("first", "3.0"), ("second", "3.2")])],
         {"figure_1": (figure, "The error."), "figure_2": (figure, "The same again.")},
-        its_command("filtergym.papers.a_paper", 3),
+        reproduction_command("filtergym.papers.a_paper", 3),
     )
 
 
@@ -37,7 +37,7 @@ def test_an_unknown_paper_is_named_with_what_was_meant() -> None:
         paper_module("imm-alpha-gamma")
 
 
-def test_a_package_without_the_repository_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_without_the_repository_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("filtergym.reproductions.PAPERS", "filtergym.no_papers")
     with pytest.raises(ValueError, match="are part of the repository, not of the package"):
         paper_module("imm-alpha-beta")

@@ -93,7 +93,7 @@ def test_cost_and_likelihood_is_the_sum_per_component(env_id, short, random_acti
 
 @pytest.mark.parametrize("env_id", KINDS)
 @pytest.mark.parametrize("kind", ["relative", "cost-and-likelihood"])
-def test_what_else_is_told_leaves_the_reward_alone(env_id, kind, short, random_actions):
+def test_additional_information_does_not_change_the_reward(env_id, kind, short, random_actions):
     """To the last bit: compiled logarithms may round otherwise than NumPy's."""
     envs = [
         TaskVectorEnv(env_id, 11, reward=kind, **keywords, **short)

@@ -39,7 +39,7 @@ def place_in(length, index):
 
 
 def run_loops(code, read, shown=0, between=None):
-    """Run a rolled program turn by turn, as its text says; returns the results in the program's order."""
+    """Run a rolled program turn by turn, by its text; returns the results in the program's order."""
     rolled = roll(code, shown)
     scratch, written = {}, {}
 
@@ -168,15 +168,15 @@ def test_first_results_are_known_before_another_input_is_read():
     code = program(
         graph, [*wanted, *(ProgramResult(1, row, node) for row, node in enumerate(last.nodes.tolist()))]
     )
-    given, told = inputs(), []
+    given, outputs = inputs(), []
 
     def read(argument, row):
-        assert argument == 0 or told
+        assert argument == 0 or outputs
         return given[argument + row]
 
     expected = interpret(code, lambda argument, row: given[argument + row])
-    assert_same_bits(run_loops(code, read, 8, told.append), expected)
-    assert_same_bits(told[0], expected[:8])
+    assert_same_bits(run_loops(code, read, 8, outputs.append), expected)
+    assert_same_bits(outputs[0], expected[:8])
 
 
 def test_loops_in_c_have_the_bits_of_the_straight_line(tmp_path):
@@ -202,7 +202,7 @@ def test_loops_in_c_have_the_bits_of_the_straight_line(tmp_path):
     assert_same_bits(found["rolled"], found["straight"])
 
 
-def test_a_loop_in_c_says_whose_operations_it_has():
+def test_a_loop_in_c_names_the_function_of_its_operations():
     graph = Graph(callers=True)
     with namespace.tracing(graph):
         given = Traced(np.array([graph.input(0, row) for row in range(16)]), np.float64)
@@ -298,16 +298,16 @@ def test_a_filter_in_loops_has_the_bits_of_its_straight_line(environment, name):
     answers = np.random.default_rng(0).uniform(0.2, 0.8, (64, 2))
     for measured in given.measurements:
         structures = {STATE: state, MEASUREMENT: measured, ANSWER: answers}
-        told: list = []
+        outputs: list = []
 
-        def read(argument, row, structures=structures, told=told):
-            assert argument != ANSWER or told or not traced.shown  # what is shown comes before any answer
+        def read(argument, row, structures=structures, outputs=outputs):
+            assert argument != ANSWER or outputs or not traced.shown  # what is shown comes before any answer
             return structures[argument][row]
 
-        found = run_loops(traced.update, read, traced.shown, told.append)
+        found = run_loops(traced.update, read, traced.shown, outputs.append)
         expected = interpret(traced.update, lambda argument, row, own=structures: own[argument][row])
         assert_same_bits(found, expected)
         if traced.shown:
-            assert_same_bits(told[0], expected[: traced.shown])
+            assert_same_bits(outputs[0], expected[: traced.shown])
         end = traced.shown + len(traced.state) - len(derived)
         state = [*expected[traced.shown : end], *derived]

@@ -11,7 +11,6 @@ import xarray
 from models import make_model
 
 from filtergym import evaluate, record, tidy_records
-from filtergym.__main__ import main
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import (
@@ -105,14 +104,14 @@ def test_seconds_where_measurements_come_regularly():
     assert evaluate(model.task.id, ["kalman"], "paper-noise", 2, horizon=8, sampling_interval=0.1).elapsed[
         0
     ] == pytest.approx(0.1)
-    # Scans that miss the target leave gaps; the number of a plot then says nothing about its time.
+    # Scans that miss the target leave gaps; the number of a plot then does not give its time.
     missing = {"horizon": 8, "detection_probability": (0.5, 0.9)}
     assert "elapsed" not in evaluate(TARGET, ["imm"], "paper", 2, **missing).coords
     recording = record(TARGET, episodes=2, **missing)
     assert "elapsed" not in evaluate(TARGET, ["imm"], recording).coords
 
 
-def test_keywords_that_json_does_not_know_are_told():
+def test_keywords_that_json_cannot_hold_are_refused():
     given = {"gain": np.float64(0.5), "gains": np.array([[1, 2]]), "pair": (1.0, 2.0), "odd": slice(3)}
     text = keywords_as_text(given)
     read = keywords_of(xarray.Dataset(attrs={"keywords": text}))
@@ -123,7 +122,7 @@ def test_keywords_that_json_does_not_know_are_told():
 
 
 @pytest.mark.slow
-def test_examples_of_the_page(tmp_path, monkeypatch, capsys):
+def test_examples_of_the_page(tmp_path, monkeypatch, capsys, success):
     """What is written by a command is read by xarray alone, and drawn."""
     page = (Path(__file__).parent.parent / "docs" / "evaluation.md").read_text(encoding="utf-8")
     read, drawn = (
@@ -132,11 +131,7 @@ def test_examples_of_the_page(tmp_path, monkeypatch, capsys):
     )
     monkeypatch.chdir(tmp_path)
     words = ["evaluate", TARGET, "--scenario", "paper", "--policy", "imm", "--policy", "known-turn"]
-    monkeypatch.setattr("sys.argv", ["filtergym", *words, "--episodes", "8", "--out", "results/paper"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 0
-    capsys.readouterr()
+    success(*words, "--episodes", 8, "--out", "results/paper")
     names = {}
     exec(read, names)
     dataset = evaluate(TARGET, ["imm", "known-turn"], "paper", 8)

@@ -64,7 +64,6 @@ def sb3():
 
 
 def save(model, folder, name="model.zip", statistics="vecnormalize.pkl"):
-    """Save a model, and its statistics under a name that may lie in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     model.save(folder / name)
     if statistics:
@@ -240,7 +239,6 @@ class Sluggish:
 
 
 def looped(policy, seeds, begin=True, **keywords):
-    """Costs of episodes that are stepped by hand, one after the other."""
     env = gymnasium.make(ID, detailed_info=True, **{**policy.keywords, **keywords})
     found = []
     for seed in seeds:
@@ -258,7 +256,7 @@ class TestMadePolicy:
         "name",
         ["imm", "adaptive", "random", "adaptive-rearm-tuned", "ppo"],
     )
-    def test_a_loop_costs_what_an_evaluation_says(self, name):
+    def test_a_loop_has_the_cost_of_an_evaluation(self, name):
         dataset = evaluate(ID, [name], episodes=3, **SHORT)
         seeds = [int(seed) for seed in dataset["episode_seed"]]
         policy = make_policy(ID, name, **SHORT)
@@ -311,7 +309,7 @@ class TestMadePolicy:
             observation, _, _, start, _ = env.step(action)
         assert np.std(actions) > 0.01
 
-    def test_an_environment_says_what_there_is(self):
+    def test_an_environment_lists_its_options(self):
         env = gymnasium.make(ID, control="weights")
         assert make_policy(env, "imm").keywords == {"control": "weights"}
         with pytest.raises(ValueError, match="'adaptive' is made for control 'gain', not 'weights'"):
@@ -329,7 +327,7 @@ class TestMadePolicy:
         with pytest.raises(ValueError, match="unknown policy 'imn': did you mean 'imm'"):
             make_policy(ID, "imn")
 
-    def test_what_was_tuned_beside_the_policy_is_told(self):
+    def test_competitors_tuned_beside_the_policy_are_listed(self):
         id = "filtergym/TightlyCoupledNavigation-v0"
         policy = make_policy(id, "sticky", "mode" if competitor(id, "sticky").control == "mode" else None)
         env = gymnasium.make(id, **policy.keywords)

@@ -15,7 +15,6 @@ from models import (
 )
 from scipy.stats import multivariate_normal
 
-from filtergym import evaluate
 from filtergym.envs.maneuvering_target.semi_markov import (
     SLOWEST,
     VAGUE,
@@ -44,7 +43,6 @@ def random_gaussian(rng, n):
 
 
 def moments(weights, means, covariances):
-    """Of a mixture."""
     x = sum(w * m for w, m in zip(weights, means, strict=True))
     spread = (w * (P + np.outer(m - x, m - x)) for w, m, P in zip(weights, means, covariances, strict=True))
     return x, sum(spread)
@@ -177,8 +175,8 @@ def enumerated(filter, initial, measurements, b):
 def answers_of(model, estimator, count):
     """Start, measurements and answers of the first scans."""
     start, measurements, answers = watch_estimator(model, estimator)
-    told = [(mean, covariance, likelihood.log_likelihood) for mean, covariance, likelihood in answers]
-    return start, measurements[:count], told[:count]
+    estimates = [(mean, covariance, likelihood.log_likelihood) for mean, covariance, likelihood in answers]
+    return start, measurements[:count], estimates[:count]
 
 
 IRREGULAR = {"detection_probability": (0.6, 0.8), "scan_jitter": (0.8, 0.8)}
@@ -261,13 +259,6 @@ def test_survives_what_its_prior_rules_out():
             assert np.isfinite(mean).all()
             assert np.isfinite(likelihood.log_likelihood).all()
             assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()
-
-
-@pytest.mark.filterwarnings("error")
-def test_is_compiled_with_the_world():
-    # What cannot be traced runs as Python code, and a warning says so.
-    assert not SemiMarkov.in_python
-    evaluate(ID, ["semi-markov", "semi-markov-vague"], episodes=8, horizon=4, backend="compiled")
 
 
 @pytest.fixture(scope="module")

@@ -18,11 +18,13 @@ from filtergym.envs.engine.catalogue import task_class
 pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
+from test_agents_training import train
+
 from filtergym.agents import training_run, validation
 from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import train_bptt
 from filtergym.agents.export import export_run
-from filtergym.agents.sb3_training import train_sb3, training_environment
+from filtergym.agents.sb3_training import training_environment
 from filtergym.agents.settings import merge_settings, parse_settings, read_config
 from filtergym.agents.training_run import RunOptions, load_run, new_run, open_run, read_hyperparameters
 from filtergym.agents.training_session import Session
@@ -47,10 +49,8 @@ def all_training_scenarios(monkeypatch):
     monkeypatch.setattr(cls, "scenarios", every)
 
 
-def trained(run, folder, **keywords):
-    folder.mkdir(exist_ok=True)
-    trainer = train_bptt if run.algorithm == "bptt" else train_sb3
-    return trainer(run, Session(folder, **{"validate_every": 10**9, "trust": True, **keywords}))
+def asked(options, **more):
+    return new_run(problem_of(ID), replace(options, **more))
 
 
 @pytest.mark.parametrize(
@@ -142,14 +142,14 @@ def test_a_config_may_have_a_default_section(tmp_path):
         (f"{ID}: {{gama: 0.5}}", "unknown setting 'algo.gama': did you mean 'algo.gamma'"),
     ],
 )
-def test_wrong_configs_are_told(text, message, tmp_path):
+def test_wrong_configs_are_refused(text, message, tmp_path):
     config = tmp_path / "mine.yml"
     config.write_text(text)
     with pytest.raises(ValueError, match=message):
         new_run(problem_of(ID), RunOptions("ppo", config=config))
 
 
-def test_a_config_that_is_missing_is_told(tmp_path):
+def test_a_missing_config_is_refused(tmp_path):
     with pytest.raises(ValueError, match="cannot read settings"):
         new_run(problem_of(ID), RunOptions("ppo", config=tmp_path / "none.yml"))
 
@@ -173,7 +173,7 @@ def test_a_config_that_is_missing_is_told(tmp_path):
         ("bptt", {"dtype": "float32"}, {}, "leave out env.dtype"),
     ],
 )
-def test_wrong_settings_are_told(algorithm, keywords, overrides, message):
+def test_wrong_settings_are_refused(algorithm, keywords, overrides, message):
     with pytest.raises(ValueError, match=message):
         new_run(problem_of(ID), RunOptions(algorithm, keywords=keywords, overrides=overrides))
 
@@ -197,12 +197,9 @@ def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
     small = {"learning_starts": 8, "buffer_size": 50, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
     options = RunOptions("sac", "gain", 20, 2, overrides=small)
 
-    def asked(**more):
-        return new_run(problem_of(ID), replace(options, **more))
-
-    trained(open_run(tmp_path, asked(), False), tmp_path)
-    open_run(tmp_path, asked(), True)
-    assert load_run(tmp_path).hyperparameters == asked().hyperparameters
+    train(open_run(tmp_path, asked(options), False), tmp_path)
+    open_run(tmp_path, asked(options), True)
+    assert load_run(tmp_path).hyperparameters == asked(options).hyperparameters
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
@@ -210,22 +207,19 @@ def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm,
     keywords = {"range_sigma": 60.0, "horizon": 40, "reward": "log-likelihood"}
     options = RunOptions(algorithm, "gain", 240, 4, overrides=SMALL[algorithm], keywords=keywords)
 
-    def asked(**more):
-        return new_run(problem_of(ID), replace(options, **more))
-
-    trained(open_run(tmp_path, asked(), False), tmp_path)
+    train(open_run(tmp_path, asked(options), False), tmp_path)
     kept = load_run(tmp_path)
     assert kept.hyperparameters["env_kwargs"] == keywords
     assert parse_settings(words_of(kept.command))[0] == keywords
     dataset = evaluate(ID, ["imm"], episodes=8, split="validation", range_sigma=60.0, horizon=40)
     assert kept.validation[0]["paper_cost"] == pytest.approx(float(dataset["cost"].mean()), rel=1e-12)
     # The same again goes on, other settings are refused, and none are those of the run.
-    open_run(tmp_path, asked(steps=480), True)
+    open_run(tmp_path, asked(options, steps=480), True)
     with pytest.raises(ValueError, match=r"hyperparameters.env_kwargs.range_sigma 60.0, not 61.0"):
-        open_run(tmp_path, asked(steps=480, keywords={**keywords, "range_sigma": 61.0}), True)
-    run = open_run(tmp_path, asked(steps=480, keywords={}, overrides={}), True, same=True)
+        open_run(tmp_path, asked(options, steps=480, keywords={**keywords, "range_sigma": 61.0}), True)
+    run = open_run(tmp_path, asked(options, steps=480, keywords={}, overrides={}), True, same=True)
     assert run.hyperparameters == kept.hyperparameters
-    assert trained(run, tmp_path, resume=True).steps_done >= 480
+    assert train(run, tmp_path, resume=True).steps_done >= 480
     # What is exported is checked under the same parameters; an evaluation is of whatever it is asked for.
     out = tmp_path / "agent.safetensors"
     cost = export_run(tmp_path, out).exported["cost"]
@@ -238,7 +232,6 @@ def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm,
 
 
 def words_of(command):
-    """Settings in a command."""
     words = shlex.split(command)
     return [word for before, word in itertools.pairwise(words) if before == "--set"]
 
@@ -246,7 +239,7 @@ def words_of(command):
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
 def test_validations_are_curves_in_the_log(algorithm, tmp_path):
     run = new_run(problem_of(ID), RunOptions(algorithm, "gain", 800, 4, overrides=SMALL[algorithm]))
-    trained(run, tmp_path, validate_every=300)
+    train(run, tmp_path, validate_every=300)
     [file] = (tmp_path / "log").glob("*.csv")
     with file.open() as content:
         validated = [row for row in csv.DictReader(content) if row.get("validation/cost")]
@@ -283,18 +276,15 @@ def test_training_on_a_mixture(algorithm, tmp_path):
         keywords={"horizon": 20},
     )
 
-    def asked(**more):
-        return new_run(problem_of(ID), replace(options, **more))
-
-    run = trained(open_run(tmp_path, asked(steps=160), False), tmp_path)
+    run = train(open_run(tmp_path, asked(options, steps=160), False), tmp_path)
     assert load_run(tmp_path).scenario == "random:0.75,cruise:0.25"
     costs = [
         weight * evaluate(ID, ["imm"], name, episodes=8, split="validation", horizon=20)["cost"].mean().item()
         for name, weight in mixture.items()
     ]
     assert run.validation[0]["paper_cost"] == pytest.approx(sum(costs), rel=1e-12)
-    resumed = open_run(tmp_path, asked(steps=240), True)
-    assert trained(resumed, tmp_path, resume=True).steps_done >= 240
+    resumed = open_run(tmp_path, asked(options, steps=240), True)
+    assert train(resumed, tmp_path, resume=True).steps_done >= 240
     assert export_run(tmp_path, tmp_path / "agent.safetensors").scenario == run.scenario
 
 
@@ -322,13 +312,12 @@ def test_options_of_a_reset_reach_the_environments_of_an_adapter():
         env.reset()
 
 
-def test_settings_of_the_command_line(command, tmp_path):
+def test_settings_of_the_command_line(refusal, success, tmp_path):
     config = tmp_path / "mine.yml"
     config.write_text("env: {range_sigma: 70.0}\nalgo: {hidden_size: 4, truncation: 40, n_envs: 2}\n")
     words = ("train", ID, "--algo", "bptt", "--control", "gain", "--no-compare", "--out", tmp_path / "run")
     settings = ("--config", config, "--set", "algo.hidden_size=3", "--set", "env.horizon=50")
-    code, _, errors = command(*words, *settings, "--reward", "log-likelihood", "--steps", 100)
-    assert code == 0, errors
+    success(*words, *settings, "--reward", "log-likelihood", "--steps", 100)
     run = load_run(tmp_path / "run")
     assert run.hyperparameters["hidden_size"] == 3
     assert run.hyperparameters["env_kwargs"] == {
@@ -336,8 +325,5 @@ def test_settings_of_the_command_line(command, tmp_path):
         "horizon": 50,
         "reward": "log-likelihood",
     }
-    code, _, errors = command(*words, "--envs", 2, "--resume", "--steps", 100)
-    assert code == 0, errors
-    code, _, errors = command(*words, "--envs", 2, "--resume", "--set", "env.horizon=60")
-    assert code == 2
-    assert "hyperparameters" in errors
+    success(*words, "--envs", 2, "--resume", "--steps", 100)
+    assert "hyperparameters" in refusal(*words, "--envs", 2, "--resume", "--set", "env.horizon=60")

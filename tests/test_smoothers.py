@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from test_estimators import Start
 
 from filtergym import evaluate, record, tidy_records
 from filtergym.baselines.maneuvering_target.estimators import (
@@ -43,7 +44,7 @@ TARGET = "filtergym/ManeuveringTarget-v0"
         (KalmanTurnIMMSmoother, KalmanTurnInteractingMultipleModel),
     ],
 )
-def test_a_smoother_without_lag_says_what_its_filter_says(smoother, estimator):
+def test_a_smoother_without_lag_equals_its_filter(smoother, estimator):
     found = evaluate(
         TARGET, {"smoother": Variant(smoother, lag=0), "filter": estimator}, scenario="random", episodes=9
     )
@@ -264,18 +265,8 @@ def test_recordings_are_shown_to_smoothers_but_not_to_references():
     assert not {"known-turn", "known-input-bound"} & set(names)
 
 
-class Holds:
-    """The initial estimate, whatever is measured."""
-
-    def start(self, initial, N):
-        return initial.mean, initial.covariance + 1e-3 * np.eye(len(initial.mean))[:, :, None]
-
-    def update(self, memory, measurement):
-        return *memory, memory
-
-
-class HoldsToTheEnd(Holds):
-    """The same, said when all is measured."""
+class HoldsToTheEnd(Start):
+    """The initial estimate, returned when all is measured."""
 
     kind = "smoother"
 
@@ -286,7 +277,7 @@ class HoldsToTheEnd(Holds):
 
 def test_another_open_loop_takes_a_smoother():
     env, keywords = "filtergym/LooselyCoupledNavigation-v0", {"horizon": 40, "axes": 2}
-    makers = {"smoother": HoldsToTheEnd, "estimator": Holds}
+    makers = {"smoother": HoldsToTheEnd, "estimator": Start}
     found = evaluate(env, makers, episodes=9, backend="numpy", **keywords)
     for name in ("error", "cost", "nees", "lost"):
         one, other = (found[name].sel(policy=policy).values for policy in ("smoother", "estimator"))

@@ -406,7 +406,7 @@ def test_a_lost_episode_leaves_the_others_alone():
         assert np.isnan(own[..., :4, 1]).any()
 
 
-def test_a_mode_that_cannot_be_reached_says_nothing():
+def test_an_unreachable_mode_changes_nothing():
     # An absorbing first mode from which all tracks start: the second has probability zero, and no estimate is NaN.
     intervals, available = np.ones(8), np.ones(8, dtype=bool)
     motions = [transitions(intervals, sigma) for sigma in (0.7, 2.0)]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy
+from naive import kalman_update
 from own_models import simulate
 
 import filtergym
@@ -29,11 +30,7 @@ def naive(x, P, rows):
     for dt, z in rows:
         F = np.array([[1.0, dt], [0.0, 0.9]])
         x, P = F @ x, F @ P @ F.T + dt * Q
-        there = np.isfinite(z)
-        if there.any():
-            H, noise = np.eye(2)[there], np.diag([*R.values()])[np.ix_(there, there)]
-            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + noise)
-            x, P = x + K @ (z[there] - H @ x), (np.eye(2) - K @ H) @ P
+        x, P = kalman_update(x, P, z - x, np.eye(2), np.diag([*R.values()]))
     return x, P
 
 
@@ -69,7 +66,7 @@ def test_what_comes_late_is_taken_in_as_if_all_had_begun_anew(make, kind):
 
 
 def test_the_world_hands_over_what_it_has_held_back(make):
-    """Of 2,000 episodes: as many come late as is said, and each is of the state three measurements before."""
+    """Of 2,000 episodes: as many come late as declared, and each is of the state three measurements before."""
     _, kept = simulate(make(), 8, 2000, **LATE)
     due = [kept[k][1].late_available.sum(axis=1) + 0.0 for k in (3, 4, 5, 6, 7)]
     in_time = [kept[k][1].available.sum(axis=1) for k in (0, 1, 2, 3, 4)]

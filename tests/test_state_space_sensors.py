@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from naive import kalman_update
 from own_models import simulate
 
 import filtergym
@@ -59,10 +60,7 @@ def naive(x, P, rows, R=R):
             S = (H @ P @ H.T + R)[np.ix_(gps, gps)]
             if nu[gps] @ np.linalg.inv(S) @ nu[gps] > GATE**2:
                 there[:2], closed = False, closed + 1
-        if there.any():
-            C = H[there]
-            K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R[np.ix_(there, there)])
-            x, P = x + K @ nu[there], (np.eye(3) - K @ C) @ P
+        x, P = kalman_update(x, P, np.where(there, nu, np.nan), H, R)
     return x, P, closed
 
 
@@ -149,7 +147,7 @@ def test_a_sensor_has_a_factor_on_its_noise(make):
     np.testing.assert_allclose(scaled[3, 3], 0.5 * factors, rtol=1e-15)
 
 
-def test_a_closed_gate_takes_nothing_in_and_is_told_all_the_same(make):
+def test_a_closed_gate_uses_no_measurement_and_reports_it(make):
     model = make_model(make(), "noise", backend="numpy")
     one, zero = np.ones(8), np.zeros((2, 8))
     start, _ = simulate(make(), 1, 8)
@@ -273,8 +271,8 @@ def test_a_noise_that_the_log_does_not_tell_is_not_identifiable(make, tmp_path):
     log = read_recording(tmp_path / "log.csv", problem.id)
     family = families_of(problem, log)["extended"]
     tunable, fitted, intervals = fit_all(FittedLog(problem, log), family)
-    said = "\n".join(parameter_lines(tunable, fitted, intervals))
-    assert re.search(r"compass noise .*not identifiable, the likelihood is flat", said)
+    text = "\n".join(parameter_lines(tunable, fitted, intervals))
+    assert re.search(r"compass noise .*not identifiable, the likelihood is flat", text)
     for name, factor in (("process_noise", 0.25), ("gps_noise", 4.0), ("odometry_noise", 4.0)):
         interval = intervals[f"log10_{name}"]
         assert interval.low - 0.1 < np.log10(factor) < interval.high + 0.1
@@ -320,8 +318,8 @@ def test_a_source_of_noise_has_a_factor_of_its_own(make, kind, name):
     np.testing.assert_allclose(*found, rtol=1e-6 if name == "unscented" else 1e-9, atol=1e-12)
 
 
-def test_a_log_tells_the_noise_of_each_source(make, tmp_path):
-    """Of 300 measurements: within the intervals that are said, which are of 95 %."""
+def test_a_log_identifies_the_noise_of_each_source(make, tmp_path):
+    """Of 300 measurements: within the printed intervals of 95 %."""
     larger = {"speed": 4.0 * WANDERS["speed"], "drift": 0.25 * WANDERS["drift"]}
     sensors = {"gps": Sensor([[1, 0]], 0.01), "log": Sensor([[0, 1]], 0.01)}
     world = make(**{**TWO, "diffusion": larger, "sensors": sensors})

@@ -116,5 +116,5 @@ def test_an_agent_is_traced_once_for_all_that_an_evaluation_does_with_it(monkeyp
         "filtergym.evaluation.running.rollout.trace_policy",
         lambda *given: traced.append(given) or trace_policy(*given),
     )
-    evaluate(*BPTT, episodes=24, horizon=HORIZON - 1, timed=True)  # a horizon that nobody else has
+    evaluate(*BPTT, episodes=24, horizon=HORIZON - 1, timed=True)  # a horizon of no other test
     assert len(traced) == 1

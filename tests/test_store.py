@@ -96,7 +96,7 @@ def test_objects_are_neither_written_nor_read(tmp_path):
     assert store.read(WORK, np.ndarray) is None
 
 
-def test_nothing_is_kept_without_a_folder_or_of_what_nobody_knows(tmp_path):
+def test_nothing_is_stored_without_a_folder_or_for_unknown_competitors(tmp_path):
     for store, work in ((Store(), WORK), (Store(tmp_path / "new"), None)):
         assert store.result(work, float, lambda: 1.0) == 1.0
         assert store.read(work, float) is None

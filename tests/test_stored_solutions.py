@@ -29,7 +29,7 @@ def test_a_stored_solution_is_what_scipy_finds(entry):
     ):
         # Processors and versions of LAPACK round in other ways; entries differ by ten orders of magnitude.
         np.testing.assert_allclose(own, other, rtol=1e-9, atol=1e-13 * np.abs(other).max())
-    assert found[0] is not solve(*given)[0]  # nobody else's array
+    assert found[0] is not solve(*given)[0]  # an array of its own
 
 
 def test_other_numbers_are_solved_anew():
@@ -38,7 +38,6 @@ def test_other_numbers_are_solved_anew():
 
 
 def write_missing():
-    """Make every environment and store what is not stored."""
     entries = {stored_solutions.key_of(entry["function"], *entry["arguments"]): entry for entry in ENTRIES}
 
     def storing(solve):

@@ -1,4 +1,4 @@
-"""The crash test: what is done to measurements, what is said of a filter, and that mistakes in a filter are noticed."""
+"""The crash test: what is done to measurements, the verdict on a filter, and that mistakes in a filter are noticed."""
 
 import json
 
@@ -183,7 +183,7 @@ def test_nothing_is_altered_before_it_happens_and_truth_belongs_to_what_is_measu
         assert (deviations > 0.0).all()
 
 
-def test_each_alteration_does_what_it_says():
+def test_each_alteration_has_its_effect():
     test = CrashTest(problem_of("filtergym/ManeuveringTarget-v0").experiment("paper", 8), 0, None, SHORT)
     plain, streams = test.streams[UNALTERED.name], test.streams
     k = SETTLED
@@ -224,7 +224,7 @@ def test_each_alteration_does_what_it_says():
     assert (np.abs(apart) < 5.0 * np.sqrt(np.einsum("iin->in", plain.initial.covariance))).all()
 
 
-# --- what is said
+# --- the verdict
 
 
 class Careless(Tracker):
@@ -249,7 +249,7 @@ def _stop(mean, covariance):
 
 
 @pytest.mark.parametrize(
-    ("then", "said"),
+    ("then", "phrase"),
     [
         (lambda m, P: (np.nan * m, P), "is not finite after a missed measurement"),
         (lambda m, P: (m, -P), "the covariance is not positive definite"),
@@ -257,10 +257,10 @@ def _stop(mean, covariance):
         (_stop, "stops at measurement 61: estimator 'mine' failed at measurement"),
     ],
 )
-def test_what_is_no_estimate_fails(radar, then, said):
+def test_what_is_no_estimate_fails(radar, then, phrase):
     found = unaltered(radar, Careless(then))
     assert found.verdict == "failed"
-    assert said in found.reason
+    assert phrase in found.reason
 
 
 def test_what_keeps_something_to_itself_cannot_be_restored(radar):

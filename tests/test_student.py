@@ -19,7 +19,7 @@ from filtergym.envs.maneuvering_target.student import ACCELERATION_REACH
 NAME = "student"
 
 
-def test_of_a_radar_any_answer_is_what_the_description_says():
+def test_weights_for_a_radar_follow_the_description():
     """The equations at the head of the two modules, one lane after the other, with matrices of NumPy."""
     model, initial, measurements = episodes(RADAR, 16, 3, NAME, undisturbed=0.0)
     rng, bank = np.random.default_rng(0), model.filter
@@ -120,7 +120,7 @@ def test_a_student_in_c_answers_as_on_numpy():
     compile_and_test(writer, given, compiler(), FLAGS)
 
 
-def test_what_a_teacher_says_is_the_expected_reward(monkeypatch):
+def test_the_value_of_a_teacher_is_the_expected_reward(monkeypatch):
     """Against the mean over truths that are drawn from the teacher's estimate; differences, for the constant."""
     monkeypatch.setattr(reward, "COMPRESSED_BEYOND", 1e9)
     model, rng, draws, kind = (
@@ -144,7 +144,7 @@ def test_what_a_teacher_says_is_the_expected_reward(monkeypatch):
         drawn = truth._replace(position=true[:2], velocity=true[2:])
         episode = Episode(drawn, None, state)
         np.testing.assert_allclose(world.state(drawn), true)
-        own_reward = reward.OWN_REWARDS[kind](model, episode)
+        own_reward = reward.REWARD_FUNCTIONS[kind](model, episode)
         error = own_reward.std() / np.sqrt(draws)
         expected.append((own_reward.mean(), error))
         state = model.filter.start(Initial(x, P[..., None]))

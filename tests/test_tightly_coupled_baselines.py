@@ -80,7 +80,7 @@ def test_bound_is_the_dense_recursion():
         coloured, decay = colour.deviation[lane], colour.process.decay[lane]
         P = numpy.diag([*model.task.world.initial_sigma[:, 0] ** 2, *[coloured**2] * S])
         mode = int(seen[0][1].mode[lane])
-        for (said, truth), mean_square in zip(seen, bounds, strict=True):
+        for (measured, truth), mean_square in zip(seen, bounds, strict=True):
             jumped = truth.jumped[lane] > 0.0
             i = mode if jumped else int(truth.mode[lane])
             moving = scipy.linalg.block_diag(F[i], decay * numpy.eye(S))
@@ -89,10 +89,10 @@ def test_bound_is_the_dense_recursion():
             if jumped:
                 P[8:11] = P[:, 8:11] = 0.0
             position, velocity = model.task.satellites_at(truth.step)
-            _, rows = gnss_ins.observe(truth.state, position, velocity, said.ins_angles, p.gravity)
+            _, rows = gnss_ins.observe(truth.state, position, velocity, measured.ins_angles, p.gravity)
             H = numpy.hstack([dense(rows, truth.state)[..., lane], numpy.eye(len(rows), S)])
             R = numpy.array(model.task.sensor_variance) * truth.noise_factor[:, lane] ** 2
-            there = said.available[:, lane] > 0.0
+            there = measured.available[:, lane] > 0.0
             there[2 * S : 2 * S + 3] &= truth.disturbances["stuck"].now[lane] == 0.0
             H, R = H[there], numpy.diag(R[there])
             P = P - P @ H.T @ numpy.linalg.solve(H @ P @ H.T + R, H @ P)
@@ -352,9 +352,9 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
         return predict(state, measurement)
 
     estimator.bank.predict = watched
-    told = [episode for episode, _ in rollout(model, estimator, episode_seeds("test", 5, 8))]
-    stuck = numpy.stack([episode.truth.disturbances["stuck"].now for episode in told])
-    there = numpy.stack([episode.measurement.available for episode in told])
+    episodes = [episode for episode, _ in rollout(model, estimator, episode_seeds("test", 5, 8))]
+    stuck = numpy.stack([episode.truth.disturbances["stuck"].now for episode in episodes])
+    there = numpy.stack([episode.measurement.available for episode in episodes])
     assert stuck.any()
     assert (there == 0.0).any()
     there[:, 8:11] *= 1.0 - stuck[:, None]
@@ -412,7 +412,7 @@ def test_metrics_follow_from_the_dataset(on_random):
     assert records["singer", "adaptation_time", "rest to singer"].value == pytest.approx(0.01, rel=1e-12)
     assert records["singer", "adaptation_censored", "singer to constant-velocity"].value == 1.0
     assert ("singer", "adaptation_time", "singer to constant-velocity") not in records
-    # A reference says what it estimates, not what it expects.
+    # A reference returns what it estimates, not what it expects.
     assert not {m for p, m, _ in records if p == "known-mode"} & {"track_loss_rate", "adaptation_time"}
     assert not [r for r in records if r[0] == "known-mode-bound" and r[1] == "cost_median"]
 
@@ -515,7 +515,7 @@ def test_the_innovation_test_sums_the_last_steps():
         assert alarm[1, k] == (window.sum() > limit)
 
 
-def test_tracks_that_were_lost_are_told_with_their_median_time():
+def test_lost_tracks_are_reported_with_their_median_time():
     """Of lost episodes alone; and no time where none was lost."""
     lost = numpy.array([True, False, True, True, False])
     each = {

@@ -4,6 +4,7 @@ import math
 
 import numpy
 import pytest
+from models import draw
 from naive import dense
 
 from filtergym.envs.contract.causes import Causes
@@ -26,21 +27,9 @@ def make(scenario, control="evidence", xp=numpy, **keywords) -> Model:
     return Model(TightlyCoupledNavigation(parameters, xp), control)
 
 
-def numbers(model, N, seed, steps):
-    """Uniforms, initial normals, and one row for each step."""
-    rng = numpy.random.default_rng(seed)
-    layout = model.task.noise
-    uniforms, normals = rng.random((layout.uniforms, N)), rng.standard_normal((layout.initial_normals, N))
-    rows = (
-        numpy.concatenate([rng.standard_normal((layout.normals, N)), rng.random((layout.row_uniforms, N))])
-        for _ in range(steps)
-    )
-    return uniforms, normals, rows
-
-
 def drive(model, N, seed, steps, action=None, kind=numpy.asarray):
     """Yield step, state after ``measure``, observation and state after ``act``."""
-    uniforms, normals, rows = numbers(model, N, seed, steps)
+    uniforms, normals, rows = draw(model, N, seed, steps)
     state = model.begin(kind(uniforms), kind(normals))
     for k, row in enumerate(rows, 1):
         measured = model.measure(state, kind(row))
@@ -71,12 +60,16 @@ def naive_bank(model, state, posterior):
             model.task.common.decay,
         )[..., 0, 0]
         mean, P = F @ mean, F @ P @ F.T + model.task.process_noise[:, :, i, 0]
-        said = state.measurement
+        measured = state.measurement
         expected, rows = gnss_ins.observe(
-            mean[:, None], said.satellite_position, said.satellite_velocity, said.ins_angles, p.gravity
+            mean[:, None],
+            measured.satellite_position,
+            measured.satellite_velocity,
+            measured.ins_angles,
+            p.gravity,
         )
         H = dense(rows, mean[:, None])[..., 0]
-        nu = (said.readings - expected)[:, 0]
+        nu = (measured.readings - expected)[:, 0]
         R = numpy.diag(model.task.sensor_variance)
         S = H @ P @ H.T + R
         log_likelihoods.append(
@@ -98,7 +91,7 @@ def test_zero_evidence_is_the_algorithm_of_the_paper(scenario, seed):
     posterior = None
     for _, measured, _, state in drive(model, 1, seed, 60):
         if posterior is None:
-            start = model.begin(*numbers(model, 1, seed, 0)[:2]).filter
+            start = model.begin(*draw(model, 1, seed, 0)[:2]).filter
             posterior = (
                 list(start.means[..., 0].T),
                 [unpack(start.covariances, 17)[:, :, i, 0] for i in range(3)],
@@ -122,8 +115,8 @@ def test_controls_that_ask_for_the_paper_get_it_bit_for_bit():
 def test_weights_that_state_the_probabilities_follow_the_paper():
     paper = make("random")
     probabilities = [s.filter.probabilities for *_, s in drive(paper, 8, 3, 30)]
-    told = make("random", "weights")
-    by_weights = [s.filter.mean for *_, s in drive(told, 8, 3, 30, lambda k, o, s: probabilities[k - 1])]
+    weighted = make("random", "weights")
+    by_weights = [s.filter.mean for *_, s in drive(weighted, 8, 3, 30, lambda k, o, s: probabilities[k - 1])]
     for estimate, (*_, state) in zip(by_weights, drive(paper, 8, 3, 30), strict=True):
         # Normalising weights that already sum to one moves the last digit.
         numpy.testing.assert_allclose(estimate, state.filter.mean, rtol=1e-9, atol=1e-9)
@@ -139,12 +132,12 @@ def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
     far[7, :4] += 10.0  # clock drift, m/s: more than the rates' aperture
     far[3, 4:] += 300.0  # clock bias, m: more than the ranges' aperture
     for feedback, rates, ranges in ((None, 1.0, 1.0), (expected, 1.0, 1.0), (far, 0.0, 0.0)):
-        _, said = model.task.world.advance(state.truth, row, feedback)
-        assert (said.available[4:8, :4] == rates).all()
-        assert (said.available[:4, 4:] == ranges).all()
-        assert (said.available[:4, :4] == 1.0).all()
-        assert (said.available[4:8, 4:] == 1.0).all()
-        assert (said.available[8:] == 1.0).all()
+        _, measured = model.task.world.advance(state.truth, row, feedback)
+        assert (measured.available[4:8, :4] == rates).all()
+        assert (measured.available[:4, 4:] == ranges).all()
+        assert (measured.available[:4, :4] == 1.0).all()
+        assert (measured.available[4:8, 4:] == 1.0).all()
+        assert (measured.available[8:] == 1.0).all()
     assert not make("matched", control).task.closes_loop
 
 
@@ -218,7 +211,7 @@ UNMIXED = {"urban": False, "aperture": False, "undisturbed": 0.0}
 
 def test_some_episodes_are_undisturbed_between_houses_steered_or_one_manoeuvre():
     model, N = make("random", horizon=300), 4000
-    uniforms, normals, _ = numbers(model, N, 21, 0)
+    uniforms, normals, _ = draw(model, N, 21, 0)
     truth = model.begin(uniforms, normals).truth
     found, p = truth.disturbances, model.task.parameters
     urban, aperture = found["reflections"].urban, found["aperture"]
@@ -340,7 +333,7 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
     )
     previous, noisy, stuck, out = None, 0, 0, 0
     for k, state, _, _ in drive(model, 8, 11, 320):
-        s, said = state.truth, state.measurement
+        s, measured = state.truth, state.measurement
         assert ((s.noise_factor[4:8] == 1.0) | (s.noise_factor[4:8] == s.disturbances["noisy"].own)).all()
         noisy = noisy + (s.noise_factor[4:8] > 1.0).sum(axis=0)
         assert (s.noise_factor[:4] == 1.0).all()
@@ -353,14 +346,14 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
         assert (causes["stuck accelerometers"] == held).all()
         assert (causes["noisy rate"] == (s.noise_factor > 1.0).any(axis=0)).all()
         if previous is not None:
-            same = (said.readings[8:11] == previous.readings[8:11]).all(axis=0)
+            same = (measured.readings[8:11] == previous.readings[8:11]).all(axis=0)
             assert (same == held).all()
         stuck = stuck + held
-        missing = 4 - said.available[:4].sum(axis=0)
-        assert (said.available[:4] == said.available[4:8]).all()
+        missing = 4 - measured.available[:4].sum(axis=0)
+        assert (measured.available[:4] == measured.available[4:8]).all()
         assert set(missing) <= {0.0, 2.0}
         out = out + (missing == 2.0)
-        previous = said
+        previous = measured
     assert (out == 200).all()
     assert ((noisy >= 100) & (noisy <= 300)).all()
     assert ((stuck >= 29) & (stuck <= 100)).all()

@@ -43,7 +43,7 @@ def naive_length(series):
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
-def test_blocks_are_as_long_as_the_rule_says(correlation):
+def test_blocks_have_the_length_of_the_rule(correlation):
     series = autoregressive(np.random.default_rng(3), correlation, 600)
     assert block_length(series) == naive_length(series)
     assert block_length(np.ones(50)) == 1
@@ -71,7 +71,7 @@ CORRELATED = {
 
 
 @pytest.mark.parametrize(("correlation", "known"), CORRELATED.items())
-def test_interval_of_a_correlated_error_covers_as_often_as_it_says_or_there_is_none(correlation, known):
+def test_interval_of_a_correlated_error_has_its_coverage_or_is_missing(correlation, known):
     """The mean square of an error with AR(1); with intervals for all, those of 200 at 0.99 would cover a third."""
     generator, truth, trials = np.random.default_rng(1), 1.0 / (1.0 - correlation**2), 120
     for number, share in zip((200, 1000, 10_000), known, strict=True):
@@ -102,7 +102,7 @@ def test_a_long_episode_is_resampled_in_units():
     assert within[:2, 1].tolist() == [0.0, 0.0]
 
 
-def test_one_episode_has_intervals_of_what_is_a_mean_over_time_and_says_whose(monkeypatch):
+def test_one_episode_has_labelled_intervals_of_means_over_time(monkeypatch):
     few = evaluate(ENV, ["imm", "fixed-low"], episodes=1, horizon=400)
     assert "has no intervals: it contains 12 blocks of 34 measurements" in few.attrs["notes"]
     assert {r.low for r in tidy_records(few) if r.metric in ("rmse", "cost", "anees")} == {None}

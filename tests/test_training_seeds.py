@@ -14,12 +14,12 @@ from training_seeds import (
     Study,
     compare,
     comparison_grids,
+    describe_runs,
     episode_means,
     learning_curves,
     load_runs,
     seeds_markdown,
     spread,
-    trained_of,
 )
 
 from filtergym.agents.learned_policy import ENVELOPE, PRETRAINED, read_arrays
@@ -172,7 +172,9 @@ def test_command_makes_the_record_and_the_record_the_tables(folders, tmp_path, m
         Comparison(**{name: round_number(v) if isinstance(v, float) else v for name, v in each.items()})
         for each in json.loads((tmp_path / "seeds.json").read_text())
     ]
-    for grid in comparison_grids(problem_of(records[0].environment), trained_of(load_runs(folders)), records):
+    for grid in comparison_grids(
+        problem_of(records[0].environment), describe_runs(load_runs(folders)), records
+    ):
         assert "\n".join(markdown_table(grid.header, grid.rows)) in text
     # The first table is shown, the others wait for a click; inside HTML, Markdown needs blank lines around it.
     shown, *folded = text.split("<details>\n")

@@ -1,4 +1,4 @@
-"""What can execute code when it is loaded is not loaded, unless somebody says --trust."""
+"""What can execute code when it is loaded is not loaded, without --trust."""
 
 import json
 import pickle
@@ -97,48 +97,41 @@ def test_the_module_that_a_record_names_is_not_imported(stranger, command, make_
     assert sprung.exists()
 
 
-def test_what_is_no_policy_is_not_called(command):
+def test_what_is_no_policy_is_not_called(refusal):
     before = list(sys.path)
     for name in ("os:system", "os:path", "sys:argv", "math:pi"):
-        code, _, errors = command("evaluate", ID, "--policy", name, "--episodes", 1)
-        assert code == 2
-        assert f"'{name}' is no competitor" in errors
+        assert f"'{name}' is no competitor" in refusal("evaluate", ID, "--policy", name, "--episodes", 1)
         assert sys.path == before
     found = competitor(ID, "filtergym.baselines.maneuvering_target.references:KnownTurn")
     assert found.kind == "reference"
 
 
-def test_a_name_with_a_colon_can_be_a_path(tmp_path, monkeypatch, command):
+def test_a_name_with_a_colon_can_be_a_path(tmp_path, monkeypatch, refusal, success):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a:b").mkdir()
     for name in ("a:b/agent.safetensors", "C:\\agent.safetensors"):
         shutil.copyfile(AGENT.with_suffix(".safetensors"), tmp_path / name)
-        code, output, errors = command("evaluate", ID, "--policy", name, "--episodes", 2)
-        assert code == 0, errors
+        output = success("evaluate", ID, "--policy", name, "--episodes", 2)
         assert name in output
     for name, expected in (
         ("D:\\agent.safetensors", "no learned policy at D:\\agent.safetensors"),
         (".x:C", "cannot load policy '.x:C': ImportError: a module is named by words"),
         ("D:\\agent", "cannot load policy 'D:\\\\agent'"),
     ):
-        code, _, errors = command("evaluate", ID, "--policy", name, "--episodes", 1)
-        assert code == 2
-        assert expected in errors
+        assert expected in refusal("evaluate", ID, "--policy", name, "--episodes", 1)
 
 
-def test_a_path_is_not_read_as_markup(stranger, command):
+def test_a_path_is_not_read_as_markup(stranger, command, success):
     folder, name = stranger[0], "[bold]:warning:/[/red]/a.safetensors"
     shutil.copyfile(AGENT.with_suffix(".safetensors"), folder / "best" / "agent.safetensors")
-    code, output, errors = command("export", folder, "--out", name)
-    assert code == 0, errors
+    output = success("export", folder, "--out", name)
     assert name in output
-    code, output, errors = command("evaluate", ID, "--policy", name, "--episodes", 2)
-    assert code == 0, errors
+    output = success("evaluate", ID, "--policy", name, "--episodes", 2)
     assert name in output
     assert name[:-1] in command("evaluate", ID, "--policy", name[:-1])[2]
 
 
-def test_a_module_in_the_working_directory_is_found(tmp_path, monkeypatch, command):
+def test_a_module_in_the_working_directory_is_found(tmp_path, monkeypatch, refusal, success):
     """As an installed command starts: without the working directory on the path."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place not in ("", str(tmp_path))])
@@ -149,13 +142,12 @@ def test_a_module_in_the_working_directory_is_found(tmp_path, monkeypatch, comma
         "class Middle(ConstantPolicy):\n    control, action = 'gain', (0.0,)\n"
     )
     (tmp_path / "middle_environment.py").write_text("1 / 0")
-    code, output, errors = command("evaluate", ID, "--policy", "middle_policy:Middle", "--episodes", 2)
-    assert code == 0, errors
+    output = success("evaluate", ID, "--policy", "middle_policy:Middle", "--episodes", 2)
     assert "middle_policy:Middle" in output
     # An environment's module is looked for in the same places, and its errors are a sentence, too.
-    code, _, errors = command("list", "middle_environment:mine/Middle-v0")
-    assert code == 2
-    assert "registers environment 'mine/Middle-v0': ZeroDivisionError" in errors
+    assert "registers environment 'mine/Middle-v0': ZeroDivisionError" in refusal(
+        "list", "middle_environment:mine/Middle-v0"
+    )
 
 
 LIBRARIES = (
@@ -199,7 +191,7 @@ def test_a_file_of_ones_own_is_no_library(tmp_path):
     assert "middle:Middle" in (tmp_path / "out" / "records.csv").read_text()
 
 
-def test_what_nobody_expected_is_a_sentence(monkeypatch, command):
+def test_an_unexpected_error_is_a_sentence(monkeypatch, command):
     def broken(*_, **__):
         raise KeyError("lost")
 

@@ -1,4 +1,4 @@
-"""The truth of a log in a file of its own: what is matched, interpolated, said and refused."""
+"""The truth of a log in a file of its own: what is matched, interpolated, noted and refused."""
 
 import numpy as np
 import pandas
@@ -45,8 +45,8 @@ def test_equal_times_are_as_in_one_file(tmp_path):
     log(truth_position_x=x, truth_position_y=y).to_csv(tmp_path / "both.csv", index=False)
     together = read_recording(tmp_path / "both.csv", ID)
     np.testing.assert_array_equal(apart.truth, together.truth)
-    said = "80 of 80 rows have a truth: 80 at the same time, 0 between two that are at most 1.5 s apart"
-    assert said in apart.notes
+    expected = "80 of 80 rows have a truth: 80 at the same time, 0 between two that are at most 1.5 s apart"
+    assert expected in apart.notes
 
 
 def test_it_is_interpolated_in_short_gaps_alone(tmp_path):
@@ -94,13 +94,13 @@ def test_dates_are_matched_with_seconds_since_1970_and_with_rtklib(tmp_path):
     assert any(note.startswith("truth: times are GPST") for note in found.notes)
 
 
-def test_an_offset_is_told_and_not_applied(tmp_path):
+def test_an_offset_is_reported_and_not_applied(tmp_path):
     late = truth(TIME).assign(time=TIME + 18.0)
     found = read(tmp_path, log(), late)
-    said = [note for note in found.notes if "were added to its times" in note]
-    assert len(said) == 1
-    assert "-18.0 s" in said[0]
-    assert "Nothing was shifted" in said[0]
+    sentences = [note for note in found.notes if "were added to its times" in note]
+    assert len(sentences) == 1
+    assert "-18.0 s" in sentences[0]
+    assert "Nothing was shifted" in sentences[0]
     shifted = read(tmp_path, log(), late, truth_offset=-18.0)
     np.testing.assert_allclose(shifted.truth, read(tmp_path, log(), truth(TIME)).truth, atol=1e-9)
     assert any("-18 s were added to its times" in note for note in shifted.notes)
@@ -143,13 +143,12 @@ def test_one_truth_is_enough(tmp_path):
         read_recording(tmp_path / "log.csv", ID, truth=tmp_path / "nothing.csv")
 
 
-def test_commands_take_it(tmp_path, command):
+def test_commands_take_it(tmp_path, refusal, success):
     read(tmp_path, log(), truth(TIME))
     given = ("--recording", tmp_path / "log.csv", "--truth", tmp_path / "truth.csv")
-    code, out, err = command("evaluate", ID, *given, "--policy", "imm")
-    assert code == 0, err
+    out = success("evaluate", ID, *given, "--policy", "imm")
     assert "80 of 80 rows have a truth" in " ".join(out.split())
     assert "RMSE" in out
-    code, _, err = command("evaluate", ID, "--scenario", "paper", "--truth", tmp_path / "truth.csv")
-    assert code == 2
-    assert "--truth is for a recording" in err
+    assert "--truth is for a recording" in refusal(
+        "evaluate", ID, "--scenario", "paper", "--truth", tmp_path / "truth.csv"
+    )

@@ -193,8 +193,10 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str) -
         numpy.testing.assert_allclose(state.filter.estimate[:, lane], estimate, rtol=0, atol=1e-9)
         if not raw:
             steered = control == "gain" and choice[0] != 0.0
-            told = max(1.0, state.filter.mean_nis[lane]) if steered else 1.0
-            numpy.testing.assert_allclose(model.covariance(state)[..., lane], told * P, rtol=1e-9, atol=1e-9)
+            inflation = max(1.0, state.filter.mean_nis[lane]) if steered else 1.0
+            numpy.testing.assert_allclose(
+                model.covariance(state)[..., lane], inflation * P, rtol=1e-9, atol=1e-9
+            )
         u = d.feedforward * state.measurement.command[lane] - L @ estimate
         truth = state.truth.state[:, lane].copy()
         truth[model.task.output] -= state.measurement.command[lane]

@@ -286,7 +286,7 @@ def test_lost_loops_are_counted_and_every_number_stays_finite() -> None:
 
 
 @pytest.mark.slow
-def test_reproduction_with_few_runs_tells_its_progress() -> None:
+def test_reproduction_with_few_runs_reports_its_progress() -> None:
     done: list[float] = []
     result = paper.reproduce(done.append, 20)
     assert sum(done) == paper.STEPS
@@ -386,8 +386,8 @@ def test_with_noise_as_stated_an_adaptive_filter_is_the_papers(plant):
 
 
 @BOTH
-def test_noise_is_estimated_from_what_a_sensor_says_beyond_what_is_predicted(plant):
-    """Of the first sensor, by the matrices of the plant; in a dropout it says nothing."""
+def test_noise_is_estimated_from_the_innovation(plant):
+    """Of the first sensor, by the matrices of the plant; in a dropout nothing."""
     model = make_model(ID, plant=plant, backend="numpy", horizon=40)
     kept = []
 
@@ -451,7 +451,7 @@ def test_a_bank_over_one_level_is_a_kalman_filter(plant: str) -> None:
         )
 
 
-def test_a_slow_error_in_the_bank_is_the_one_of_the_told_filter() -> None:
+def test_a_slow_error_in_the_bank_equals_that_of_the_matched_filter() -> None:
     """Coloured errors of one deviation and correlation time, all else nominal: both filters are one."""
     keywords: dict[str, Any] = {"sensor_coloured": (0.5, 0.5), "sensor_correlation_time": (2.0, 2.0)}
     changed = {"gusts": (1.0, 1.0), "gust_points": 1, "sensors": (1.0, 1.0), "sensor_points": 1}

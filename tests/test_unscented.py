@@ -94,20 +94,3 @@ def test_a_heading_is_updated_right_at_any_spread(updated, n, variance):
             # The process noise adds 1e-15, and sin and cos of a few rad round at 1e-16.
             np.testing.assert_allclose(estimate.mean[0], expected, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(estimate.covariance[0, 0], 1.0 / (1.0 / variance + 1.0 / R), rtol=1e-9)
-
-
-@pytest.mark.parametrize("distance", [1.0, 3.0, 10.0, 30.0])
-@pytest.mark.parametrize("variance", [1e-2, 1.0, 10.0, 100.0])
-def test_a_bearing_at_any_spread_leaves_an_honest_covariance(updated, distance, variance):
-    """Beside 400,000 weighted particles, whose mean has an error far below the deviations compared here."""
-    mean, covariance = np.array([distance, 0.3]), variance * np.eye(2)
-    estimate = updated(2, lambda x: [np.arctan2(x[1], x[0])], mean, covariance, 0.01, 0.4)
-    particles = mean + np.sqrt(variance) * np.random.default_rng(0).normal(size=(400_000, 2))
-    nu = (0.4 - np.arctan2(particles[:, 1], particles[:, 0]) + np.pi) % (2.0 * np.pi) - np.pi
-    weights = np.exp(-0.5 * nu**2 / 0.01)
-    errors = particles - estimate.mean
-    nees = np.average(
-        np.einsum("ki,ij,kj->k", errors, np.linalg.inv(estimate.covariance), errors), weights=weights
-    )
-    assert nees < 3.0  # 2 of an exact Gaussian posterior; the prior of a wide one is cut to a wedge
-    assert np.trace(estimate.covariance) <= np.trace(covariance) * (1.0 + 1e-9)

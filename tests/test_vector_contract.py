@@ -70,7 +70,6 @@ def assert_same_steps(ours, theirs, actions):
 
 
 def arrays_in(value):
-    """Every array of numbers inside."""
     if isinstance(value, dict | tuple | list) or (isinstance(value, np.ndarray) and value.dtype == object):
         for part in value.values() if isinstance(value, dict) else value:
             yield from arrays_in(part)
@@ -79,7 +78,6 @@ def arrays_in(value):
 
 
 def scribble(value):
-    """Overwrite every array inside."""
     for array in arrays_in(value):
         array[...] = ~array if array.dtype == bool else 77
 
@@ -241,7 +239,7 @@ def copies_go_on_as_the_original(subject):
             assert_copies_go_on(subject.single(backend=backend), 2, backend)
 
 
-def assert_copies_go_on(env, steps, told):
+def assert_copies_go_on(env, steps, message):
     """Copies from the middle of an episode return what the original does, in the next episode, too."""
     env.reset(seed=3)
     env.action_space.seed(0)
@@ -252,8 +250,8 @@ def assert_copies_go_on(env, steps, told):
     following = env.reset()[0]
     for other in others:
         for one, two in zip(expected, continued(other, then), strict=True):
-            np.testing.assert_array_equal(one, two, err_msg=told)
-        np.testing.assert_array_equal(following, other.reset()[0], err_msg=told)
+            np.testing.assert_array_equal(one, two, err_msg=message)
+        np.testing.assert_array_equal(following, other.reset()[0], err_msg=message)
 
 
 BY_KIND = (

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(
 )
 LAYERS = ("enter_namespaces", "filter_calls", "landlock_version")
 
-# Each probe reaches for something and raises OSError or ImportError where it is refused. The table says which of them
+# Each probe reaches for something and raises OSError or ImportError where it is refused. The table lists those which
 # a competitor may do, and the reason. JUDGE is the process that runs it; PLACE a folder with a file of its own.
 PROBES = """
 import array, ctypes, importlib, mmap, os, resource, socket, threading, time

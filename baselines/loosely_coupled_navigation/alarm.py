@@ -11,8 +11,9 @@ SYMLOG_VARIANCE = 0.38684360137
 
 
 class FusionAlarm(Alarm):
-    """Innovations of the augmented filter that are larger, smaller or to one side. An outage raises no alarm: every
-    filter observes it.
+    """Alarm for innovations of the augmented filter that are larger, smaller or to one side.
+
+    An outage raises no alarm, since every filter observes it.
 
     Under ``noise`` they are the steered filter's, over the deviation for the noise that the receiver reports, whatever
     noise the agent chooses. Under ``mode`` and ``weights`` they are those of an augmented filter in the bank, which no
@@ -26,7 +27,7 @@ class FusionAlarm(Alarm):
         self.axes: int = self.task.parameters.axes
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of the innovations of each axis."""
+        """Return the log-likelihood ratios of faulty innovations of each axis, ``(N, kinds)``."""
         innovation, available = self.innovation(observation)[:, -self.axes :], self.available(observation)
         # The observation contains the mean over a decision's measurements of the compressed value.
         measurements = self.measurements(before)

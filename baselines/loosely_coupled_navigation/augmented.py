@@ -19,7 +19,7 @@ from ..measurement_noise import RULES, MeasurementNoise
 from ..table import Tunable, Variant, tunable
 
 WINDOW = 25.0
-"""Measurements of a window without tuning: 0.25 s, the time constant of the averages in the observation."""
+"""Untuned length of a window, measurements: 0.25 s, the time constant of the averages in the observation."""
 
 _FADING = {"memory": (5.0, WINDOW, 200.0), "trust": (1.0, WINDOW, 200.0)}
 LIMITS = {"mehra": {"window": (5.0, WINDOW, 150.0)}, "sage-husa": _FADING, "variational-bayes": _FADING}
@@ -29,7 +29,7 @@ LIMITS = {"mehra": {"window": (5.0, WINDOW, 150.0)}, "sage-husa": _FADING, "vari
 def with_rules(
     host: type, name: str, description: str, rules: Iterable[str] = RULES
 ) -> tuple[dict[str, Variant], dict[str, Tunable]]:
-    """Return a policy or an estimator with each rule for the receiver's noise, and its tunable values, by name.
+    """Return variants of a policy or estimator with each rule for the receiver's noise, and their tunable values.
 
     Args:
         host: its class, which takes the task, a rule, and the arguments of the rule.
@@ -65,7 +65,8 @@ class AugmentedMemory(NamedTuple):
 
 
 class AugmentedFilter:
-    """The augmented filter without its position, which the caller stores.
+    """The augmented filter (INS error with drift and coloured rate error) without the position, which the caller
+    stores.
 
     Args:
         parameters: parameters of the task.
@@ -77,7 +78,7 @@ class AugmentedFilter:
         self.noise = noise
 
     def start(self, none: Array) -> AugmentedMemory:
-        """Return the memory at the start of the track.
+        """Return the filter's memory at the start of the track: zero errors with the prior covariance.
 
         Args:
             none: zeros, ``(A, N)``.
@@ -86,7 +87,7 @@ class AugmentedFilter:
         return AugmentedMemory(none, none, p.prior_covariance(zero), zero, self.noise.start(zero), zero)
 
     def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
-        """Return the displacement by the rate errors in a step, m, ``(A, N)``, and memory."""
+        """Return the displacement by the estimated rate errors in a step, m, ``(A, N)``, and the predicted memory."""
         p, s = self.parameters, self.parameters.sampling
         P = ins_gnss.predict_augmented(memory.covariance, s, *p.variance_growth)
         displacement = s.step * memory.drift + s.drive * memory.coloured
@@ -95,12 +96,12 @@ class AugmentedFilter:
     def update(
         self, memory: AugmentedMemory, innovation: Array, reported: Array, available: Array
     ) -> tuple[Array, AugmentedMemory]:
-        """Return the correction of the position, m, ``(A, N)``, and memory.
+        """Return the correction of the position by a measurement, m, ``(A, N)``, and the updated memory.
 
         Args:
-            memory: after :meth:`predict`.
+            memory: memory after :meth:`predict`.
             innovation: measurement less predicted position, zero where there is none, m, ``(A, N)``.
-            reported: variance as the receiver reports it, m^2, ``(N,)``.
+            reported: variance that the receiver reports, m^2, ``(N,)``.
             available: one where there is a measurement, ``(N,)``.
         """
         xp = namespace(innovation)

@@ -15,18 +15,18 @@ from .augmented import AugmentedFilter, AugmentedMemory
 
 
 class Navigator(NamedTuple):
-    """State of the augmented filter."""
+    """State of the augmented filter: position, and memory of its errors."""
 
     mean: Array
     """Position, ``(A, N)``, m."""
     covariance: Array
-    """``(A, A, N)``."""
+    """Covariance of the position, ``(A, A, N)``, m^2."""
     rates: AugmentedMemory
     likelihood: Likelihood
 
 
 def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: Any) -> Likelihood:
-    """Return the likelihood of a fix; NaN where there is none.
+    """Return log-likelihood and NIS of a fix; NaN where there is none.
 
     Args:
         innovation: measurement less prediction, m, ``(A, N)``.
@@ -52,13 +52,13 @@ class AugmentedEstimator(Filter[LooselyCoupledNavigation, Measurement, Navigator
         self.eye: Array = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial) -> Navigator:
-        """Start with equal positions of INS and reference."""
+        """Return the state at the start of the track, where INS and reference have equal positions."""
         rates = self.filter.start(0.0 * initial.mean)
         return Navigator(initial.mean, initial.covariance, rates, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: Navigator, given: FilterInput) -> Navigator:
-        """Predict by the increment of the INS, update by the fix where there is one."""
-        measurement = given.measurement
+    def update(self, state: Navigator, inputs: FilterInput) -> Navigator:
+        """Predict by the INS increment, update with the fix if there is one, and return the state."""
+        measurement = inputs.measurement
         displacement, predicted = self.filter.predict(state.rates)
         position = state.mean + (measurement.increment - displacement)
         innovation = self.xp.where(measurement.available > 0.0, measurement.fix - position, 0.0)

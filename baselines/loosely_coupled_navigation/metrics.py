@@ -18,7 +18,7 @@ from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...evaluation.running.metrics import chi_square_quantile, sums_of_present
 from ...evaluation.running.own_metrics import Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap, ratio
-from ...evaluation.statistics.cause_split import VARIABLE, held_causes
+from ...evaluation.statistics.cause_split import VARIABLE, active_causes
 from ...evaluation.storage.dataset import keywords_of
 
 if TYPE_CHECKING:
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 RECOVERY_ERROR = 0.25
 """Error over the nominal standard deviation of a measurement, for each axis, below which a run has recovered."""
 HOLD_TIME = 0.1
-"""Time for which the error must stay below the limit, s: shorter than the memory of any sensible gain, long for
-noise."""
+"""Time for which the error must stay below the limit, s: shorter than the memory of any sensible gain, long against
+noise.
+"""
 LONGEST = 1.0
 """Largest recovery time, s; a run that has not recovered by then counts with it."""
 WINDOW = 25
@@ -52,7 +53,7 @@ UNITS = {
 def recovery_times(
     error: numpy.ndarray, available: numpy.ndarray, limit: float, hold: int, longest: int
 ) -> numpy.ndarray:
-    """Return the samples from the end of an outage until the error stays small, for each episode.
+    """Return the number of samples from the end of an outage until the error stays small, ``(episodes,)``.
 
     Args:
         error: size of the error, ``(episodes, time)``.
@@ -80,7 +81,7 @@ def recovery_times(
 
 
 def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
-    """Return whether the innovations of the last ``WINDOW`` fixes are too large, booleans ``(episodes, time)``.
+    """Return a boolean mask ``(episodes, time)``: the NIS over the last ``WINDOW`` fixes exceeds its limit.
 
     Args:
         nis: normalised innovation squared, NaN without a fix, ``(episodes, time)``.
@@ -98,12 +99,12 @@ def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
 
 
 def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the delay until a fault is detected, in measurements, whether it is missed, and alarms before any fault.
+    """Return detection delay of a fault, measurements, missed faults, and alarms before any fault, by name.
 
     Args:
         alarm: ``(episodes, time)`` booleans.
-        fault: whether the fault is there, same shape.
-        others: whether another fault is there, same shape.
+        fault: whether the fault is present, same shape.
+        others: whether another fault is present, same shape.
 
     Returns:
         ``delay`` and ``missed`` ``(episodes, 1)``, NaN without a fault, the delay also where it is missed; ``false``
@@ -122,7 +123,7 @@ def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray)
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return the sums for the metrics of each episode and their numbers of terms; none for a bound."""
+    """Return each episode's sums for the metrics, and numbers of terms, by name; empty for a bound."""
     if "available" not in run or numpy.isnan(run["available"].values).all():
         return MetricInputs()
     task = make_task(LooselyCoupledNavigation, run.attrs["scenario"], **keywords_of(run))
@@ -143,7 +144,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     found["beyond_protection_level"] = numpy.where(numpy.isnan(nees), math.nan, nees > quantile)
     # A learned estimator reports no innovations.
     if VARIABLE in run and "nis" in run and not numpy.isnan(run["nis"].values).all():
-        causes = dict(held_causes(run))
+        causes = dict(active_causes(run))
         wrong = [causes[name] for name in run["cause"].values.tolist() if name not in ("spoofing", "outlier")]
         spoofed = detection(
             alarms(run["nis"].values, p.axes), causes["spoofing"], numpy.logical_or.reduce(wrong)
@@ -155,7 +156,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the measures of recovery, detection and integrity, without those of events that never happen.
+    """Return the metrics of recovery, detection and integrity from the episodes' sums, with intervals.
 
     ``recovery_time`` after an outage and the share of runs that do not recover within a second (``not_recovered``).
     ``detection_time`` of spoofing that is detected, the share that is not while it lasts (``missed_spoofing``), and

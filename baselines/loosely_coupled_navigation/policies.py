@@ -26,7 +26,7 @@ from .references import Matched, MatchedCovariance
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Return the bank of a task under control ``gain``."""
+    """Return the :class:`GainBank` inside a model, whose control must be ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 
@@ -98,7 +98,7 @@ class TimeVarying(Policy):
     control = "gain"
     traceable = True
     task_keywords: ClassVar[dict[str, Any]] = {"decision_interval": 1}
-    """It follows the Riccati equation measurement by measurement."""
+    """An action at every measurement, since the gain follows the Riccati equation."""
 
     def __init__(self, model: Model, intensity: float | None = None) -> None:
         super().__init__(model)
@@ -110,7 +110,7 @@ class TimeVarying(Policy):
         self.innovation: Reader = model.reader("innovation_in_metres")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Set the gain ``P / (P + R)``."""
+        """Return the gain ``P / (P + R)`` as action, and the memory."""
         axes = self.loose.parameters.axes
         zero = numpy.zeros((len(observation), axes))
         if state is None:
@@ -135,9 +135,7 @@ class TimeVarying(Policy):
         available: numpy.ndarray,
         observation: numpy.ndarray,
     ) -> tuple[_Variances, numpy.ndarray]:
-        """Return the memory and the variance of the measurement noise, ``(N, axes)`` or ``(N, 1)``: here the reported
-        one.
-        """
+        """Return the memory, and the variance of the measurement noise, ``(N, axes)`` or ``(N, 1)``, as reported."""
         return memory, reported
 
 
@@ -167,7 +165,7 @@ class InnovationAdaptive(TimeVarying):
         available: numpy.ndarray,
         observation: numpy.ndarray,
     ) -> tuple[_Variances, numpy.ndarray]:
-        """Average the squared innovations; R is at least a tenth of that average."""
+        """Return the memory with the average squared innovation, and R, at least a tenth of that average."""
         first = (memory.weight == 0)[:, None]
         before = numpy.where(first, P + reported, memory.squares)
         innovation = self.innovation(observation)
@@ -177,7 +175,7 @@ class InnovationAdaptive(TimeVarying):
 
 
 class _Offset(NamedTuple):
-    """Memory of :class:`AugmentedFilterGain`."""
+    """Memory of :class:`AugmentedGain`."""
 
     offset: numpy.ndarray
     """Estimate of the augmented filter less the steered one, ``(axes, N)``, m."""
@@ -202,7 +200,7 @@ class AugmentedGain(TimeVarying):
         self.filter: AugmentedFilter = AugmentedFilter(self.task.parameters, rule(**values))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Run the augmented filter and choose the gain that moves the estimate nearest to its estimate."""
+        """Run the augmented filter; return the gain that moves the steered estimate nearest to it, and the memory."""
         p = self.loose.parameters
         none = numpy.zeros((p.axes, len(observation)))
         memory = _Offset(none, self.filter.start(none))

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy
 
-from ...envs.contract.draws import within
+from ...envs.contract.draws import is_within
 from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
@@ -30,7 +30,7 @@ from .estimators import likelihood_of_fix
 
 
 class ErrorState(NamedTuple):
-    """State of the filter that is given the draw of the episode."""
+    """State of the reference filter, the INS error and the receiver's coloured error."""
 
     delta: Array
     """Estimate of the INS error, m, ``(A, N)``."""
@@ -41,13 +41,11 @@ class ErrorState(NamedTuple):
     receiver: Array
     """Estimate of the receiver's coloured error, m, ``(A, N)``."""
     covariance: receiver_faults.FaultCovariance
-    """``(N,)`` each, the same for every axis."""
+    """Covariance entries, ``(N,)`` each, the same for every axis."""
 
 
 class _Matched:
-    """The Kalman filter that is given the draw of the episode. Errors are then Gaussian, so it is the filter of least
-    mean square error.
-    """
+    """Kalman filter that knows the draw of the episode; errors are then Gaussian, and the filter is optimal."""
 
     traceable = True
     knows = (
@@ -62,7 +60,7 @@ class _Matched:
         self.eye: Array = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial, truth: Truth) -> ErrorState:
-        """Start where INS and reference agree, with the true prior of the rate errors and of the receiver's."""
+        """Return the state at the start of the track: zero INS error, with the true prior of all other errors."""
         xp, still, zero = self.xp, 0.0 * initial.mean, 0.0 * truth.number
         drift, coloured = truth.drift_deviation, truth.coloured_step / self.sampling.coloured
         P = ins_gnss.AugmentedCovariance(zero, zero, zero, drift * drift, zero, coloured * coloured)
@@ -77,7 +75,7 @@ class _Matched:
     def predict_and_update(
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[ErrorState, Likelihood]:
-        """Predict with the true noise levels, and update by the fix less its pull with the true variance."""
+        """Predict with the true noise levels, update with the fix less its spoofing; return state and likelihood."""
         xp, s = self.xp, self.sampling
         delta = memory.delta + s.step * memory.drift + s.drive * memory.coloured
         coloured = s.decay * memory.coloured
@@ -93,7 +91,7 @@ class _Matched:
         )
         spoofing = truth.disturbances["spoofing"]
         since = s.step * (truth.number - spoofing.window[0] + 1.0)
-        pull = xp.where(within(truth.number, spoofing.window), spoofing.strength * since, 0.0)
+        pull = xp.where(is_within(truth.number, spoofing.window), spoofing.strength * since, 0.0)
         available = measurement.available
         innovation = available * ((measurement.ins - (measurement.fix - pull)) - (delta - receiver))
         along = receiver_faults.measured_direction(P, xp.ones((1, 1)))
@@ -112,8 +110,10 @@ class _Matched:
 
 
 class Matched(_Matched):
-    """The Kalman filter that is given the draw of the episode, the estimate of least mean square error: the noise
-    levels of INS and receiver, sample by sample, that of the coloured error, and onset and rate of the spoofing.
+    """The Kalman filter that knows the draw of the episode: the estimate of least mean square error.
+
+    The draw is the noise levels of INS and receiver, sample by sample, that of the coloured error, and onset and rate
+    of the spoofing.
     """
 
     kind = "reference"
@@ -121,7 +121,7 @@ class Matched(_Matched):
     def update(
         self, memory: ErrorState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, ErrorState, Likelihood]:
-        """Report the INS less its estimated error."""
+        """Return mean and covariance of the position (INS less its estimated error), memory, and likelihood."""
         memory, likelihood = self.predict_and_update(measurement, truth, memory)
         return measurement.ins - memory.delta, self.eye * memory.covariance.ins.position, memory, likelihood
 
@@ -132,6 +132,6 @@ class MatchedCovariance(_Matched):
     kind = "bound"
 
     def update(self, memory: ErrorState, measurement: Measurement, truth: Truth) -> tuple[Array, ErrorState]:
-        """Return the variance of the error of every axis, m^2, ``(A, N)``."""
+        """Return the variance of the error of every axis, m^2, ``(A, N)``, and the memory."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

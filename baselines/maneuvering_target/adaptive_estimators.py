@@ -8,9 +8,9 @@ from typing import NamedTuple
 from ...envs.contract.filter import FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.banks import SHORTEST
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...filters import kalman, noise_adaptation
-from .estimators import KalmanModel
 
 
 class ProcessNoiseTrack(NamedTuple):
@@ -28,7 +28,7 @@ class SageHusaProcessNoise(KalmanModel):
     Args:
         task: the problem.
         acceleration: standard deviation of the acceleration at the start, m/s^2.
-        forgetting: weight of the past against one scan less of it.
+        forgetting: factor on the weight of the past at each scan.
         least: smallest standard deviation of the acceleration, m/s^2.
     """
 
@@ -41,14 +41,14 @@ class SageHusaProcessNoise(KalmanModel):
         self.least: float = least**2
 
     def start(self, initial: Initial) -> ProcessNoiseTrack:
-        """Start from the initial estimate."""
+        """Return the state at the initial estimate, with the untuned process noise."""
         nothing = 0.0 * initial.mean[0]
         level = noise_adaptation.Level(self.variance + nothing, 1.0 + nothing)
         return ProcessNoiseTrack(*self.first_track(initial), level)
 
-    def update(self, state: ProcessNoiseTrack, given: FilterInput) -> ProcessNoiseTrack:
-        """Predict with the noise estimated so far, update, and estimate the noise anew."""
-        measurement = given.measurement
+    def update(self, state: ProcessNoiseTrack, inputs: FilterInput) -> ProcessNoiseTrack:
+        """Predict with the process noise estimated so far, update, re-estimate the noise, and return the state."""
+        measurement = inputs.measurement
         F, unit = self.motion(measurement.interval)
         mean, carried = kalman.predict(state.mean, state.covariance, F, 0.0 * unit)
         predicted = carried + unit * state.level.value
@@ -65,7 +65,7 @@ class SageHusaProcessNoise(KalmanModel):
         return ProcessNoiseTrack(*self.track(measurement, result), level)
 
     def diagonal(self, covariance: Array) -> Array:
-        """Return the variances, ``(4, N)``."""
+        """Return the diagonal ``(4, N)`` of covariances ``(4, 4, N)``."""
         return self.xp.stack([covariance[i, i] for i in range(4)])
 
 
@@ -86,8 +86,8 @@ class VariationalBayes(KalmanModel):
     Args:
         task: the problem.
         acceleration: standard deviation of the acceleration, m/s^2.
-        forgetting: rho, the share of the information that lasts another scan.
-        shape: half the number of measurements for which the radar's own variance stands at the start.
+        forgetting: rho, factor on the information about the noise at each scan.
+        shape: half the number of measurements to which the radar's own variance is equivalent at the start.
     """
 
     iterations = 3
@@ -105,13 +105,13 @@ class VariationalBayes(KalmanModel):
         self.shape = shape
 
     def start(self, initial: Initial) -> MeasurementNoiseTrack:
-        """Start from the initial estimate, with the radar's variances."""
+        """Return the state at the initial estimate, with the radar's variances as noise."""
         shape = self.shape + 0.0 * initial.mean[:2]
         return MeasurementNoiseTrack(*self.first_track(initial), noise_adaptation.InverseGamma(shape, shape))
 
-    def update(self, state: MeasurementNoiseTrack, given: FilterInput) -> MeasurementNoiseTrack:
-        """Predict, and update state and noise together."""
-        measurement = given.measurement
+    def update(self, state: MeasurementNoiseTrack, inputs: FilterInput) -> MeasurementNoiseTrack:
+        """Predict, update mean and measurement noise together, and return the state."""
+        measurement = inputs.measurement
         xp, variance, available = self.xp, measurement.variance, measurement.available
         F, unit = self.motion(measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * unit)

@@ -13,10 +13,11 @@ ROUNDING = 1e-6
 
 
 class RadarAlarm(Alarm):
-    """Innovations of the filter with the lowest gain that are larger, smaller or to one side; a filter of higher gain
-    that explains the scans better; or a scan that missed the target or came early, which fixed gains do not model. For
-    a learned Kalman filter, and for all hypotheses together under control ``hypotheses``, only innovations count: these
-    filters model such scans.
+    """Alarm for a manoeuvre: faulty innovations, a better filter of higher gain, or missed and early scans.
+
+    The innovations are those of the filter with the lowest gain: larger, smaller or to one side. Fixed gains do not
+    model a scan that missed the target or came early. For a learned Kalman filter, and for all hypotheses together
+    under control ``hypotheses``, only innovations count: these filters model such scans.
     """
 
     window = 50
@@ -32,7 +33,7 @@ class RadarAlarm(Alarm):
         self.elapsed: Reader | None = model.reader("elapsed") if self.fixed_gains else None
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of the scans."""
+        """Return the log-likelihood ratios of a manoeuvre, faulty innovations and missed scans, ``(N, kinds)``."""
         there = self.available(observation) > 0.0
         innovation, *likelihood = (read(observation) for read in self.read)
         if self.bank:

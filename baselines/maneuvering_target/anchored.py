@@ -1,4 +1,4 @@
-"""A filter of positions with slow errors, anchored by a second sensor, and the start of its fit."""
+"""A Kalman filter of positions with slow errors that uses odometry, and the initial values of its fit."""
 
 import math
 from typing import Any
@@ -7,9 +7,10 @@ import numpy
 
 from ...envs.contract.filter import EstimateState, FilterInput, Initial
 from ...envs.data.recording import Recording
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.unscented_turn import DEGREE
 from ...filters import dead_reckoning
-from .estimators import DEGREE, KalmanModel
 
 STEP = 10.0
 """Time over which displacements by both sensors are compared, s: over shorter times noise dominates."""
@@ -26,7 +27,7 @@ class DeadReckoning(KalmanModel):
         task: the problem.
         error_deviation: standard deviation of the slow error of the measured positions, m.
         correlation_time: correlation time of that error, s.
-        drift: drift of dead reckoning, m over the root of a metre of way.
+        drift: drift of dead reckoning, m over the root of a metre of travelled distance.
         scale: factor on its displacements.
         heading_offset: clockwise rotation of its displacements, degrees.
     """
@@ -52,12 +53,12 @@ class DeadReckoning(KalmanModel):
         self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate, with an unknown slow error."""
+        """Return the state at the initial estimate, with the prior of the slow error."""
         return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Move by the odometry and update with the measured position."""
-        measurement = given.measurement
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
+        """Predict by the odometry, update with the measured position, and return the state."""
+        measurement = inputs.measurement
         odometry = measurement.odometry
         if odometry is None:
             raise ValueError(
@@ -76,8 +77,7 @@ class DeadReckoning(KalmanModel):
 
 
 def regress_odometry(recording: Recording) -> tuple[float, float]:
-    """Return the scale and heading offset (degrees) of the odometry, from displacements of the measured positions over
-    ``STEP``.
+    """Return scale and heading offset (degrees) of a recording's odometry, by robust regression on positions.
 
     Iteratively reweighted least squares: a displacement off by e counts as ``|e|^-1.5``, so that excursions of the
     fixes hardly count. Where the target does not move, 1 and 0.

@@ -5,6 +5,7 @@ Equations: ``filters/data_association.py``. Without clutter each equals the esti
 
 from ...envs.contract.filter import Likelihood
 from ...envs.contract.observation import Array
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...envs.maneuvering_target.semi_markov import SemiMarkov
 from ...envs.maneuvering_target.task import ManeuveringTarget
@@ -13,11 +14,11 @@ from ...filters import data_association, kalman
 from ...filters.data_association import Plots
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import AgedHypotheses
-from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, KalmanModel
+from .estimators import ConstantVelocity, KalmanInteractingMultipleModel
 
 
 class AllPlots(KalmanModel):
-    """Probabilistic data association in place of the nearest plot.
+    """Base of filters with probabilistic data association in place of the nearest plot.
 
     The density of false plots is unknown; it is estimated by that of the plots of the scan (nonparametric; Bar-Shalom
     and Fortmann 1988, section 6.4).
@@ -26,7 +27,7 @@ class AllPlots(KalmanModel):
     detection_probability: float = 0.9
 
     def density(self, plots: Plots) -> Array:
-        """Return the density of the plots of the scan over the window, with at least one plot, 1/m^2, ``(N,)``."""
+        """Return the density of a scan's plots in its window, counted as at least one plot, 1/m^2, ``(N,)``."""
         parameters: ManeuveringTargetParameters = self.task.parameters
         count = ordered_sum(plots.available[i] for i in range(plots.available.shape[0]))
         return self.xp.clip(count, 1.0, None) / parameters.window_area
@@ -34,7 +35,7 @@ class AllPlots(KalmanModel):
     def update_estimate(
         self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
     ) -> kalman.Update:
-        """Update with all plots; with the only one where a measurement contains one."""
+        """Return the update of a predicted estimate with all plots of a scan, weighted by their probabilities."""
         plots = measurement.plots
         if plots is None:
             return super().update_estimate(predicted, measurement, H)
@@ -42,9 +43,7 @@ class AllPlots(KalmanModel):
         return data_association.update_position(*predicted, plots, self.detection_probability, density)
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
-        """Return the likelihood of a single plot; NaN for several, since densities of different numbers of plots cannot
-        be compared.
-        """
+        """Return the likelihood of a scan with a single plot; NaN for several, whose densities are not comparable."""
         if measurement.plots is None:
             return super().likelihood(measurement, log_likelihood, nis)
         return Likelihood.unknown(log_likelihood)
@@ -70,7 +69,7 @@ class SemiMarkovDataAssociation(SemiMarkov, AllPlots):
     """The semi-Markov Gaussian sum, each of whose hypotheses weighs all plots of a scan."""
 
     def update_table(self, table: AgedHypotheses, measurement: Measurement) -> kalman.Update:
-        """Update every hypothesis with all plots; with the only one where a measurement contains one."""
+        """Return the update of every hypothesis of a table with all plots of a scan."""
         plots = measurement.plots
         if plots is None:
             return super().update_table(table, measurement)

@@ -1,45 +1,19 @@
-"""Estimators of ManeuveringTarget that no action steers.
+"""Estimators of ManeuveringTarget: Kalman filters and IMMs without actions.
 
-They predict over the actual time between two scans; for a scan that missed the target they only predict.
+They predict over the actual time between two scans, and do not update for a scan that missed the target.
 """
 
-import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from ...envs.contract.filter import EstimateState, Filter, FilterInput, Initial, Likelihood
+from ...envs.contract.filter import EstimateState, FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
-from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.unscented_turn import DEGREE, TurnModel
 from ...envs.maneuvering_target.world import Measurement
-from ...filters import coordinated_turn, imm, kalman, unscented
+from ...filters import coordinated_turn, imm, kalman
 from ...filters.ordered_sums import weighted_sum
-
-DEGREE = math.pi / 180.0
-
-
-class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
-    """Base of the estimators with the constant-velocity model."""
-
-    def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate."""
-        return self.first_track(initial)
-
-    def first_track(self, initial: Initial) -> EstimateState:
-        """Return the estimate before the first scan."""
-        return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
-
-    def mean(self, state: Any) -> Array:
-        """Return the position and velocity, without further states."""
-        return state.mean[:4]
-
-    def covariance(self, state: Any) -> Array:
-        """Return the covariance of position and velocity, without further states."""
-        return state.covariance[:4, :4]
-
-    def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
-        """Return the state after an update."""
-        return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))
 
 
 class ConstantVelocity(KalmanModel):
@@ -54,15 +28,15 @@ class ConstantVelocity(KalmanModel):
         super().__init__(task)
         self.variance: float = acceleration**2
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Predict and update."""
-        F, Q = self.motion(given.measurement.interval)
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
+        """Predict to a scan, update with its measurement, and return the state."""
+        F, Q = self.motion(inputs.measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
+        return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))
 
 
 class KalmanMixture(NamedTuple):
-    """State of the IMM over Kalman filters."""
+    """State of the IMM over Kalman filters: their estimates and mode probabilities."""
 
     mean: Array
     covariance: Array
@@ -98,13 +72,13 @@ class KalmanInteractingMultipleModel(KalmanModel):
         self.probabilities: Array = task.constant([scans / sum(lasting) for scans in lasting])
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Extend an estimate of position and velocity to the state in which the filters are mixed."""
+        """Return an estimate of position and velocity extended to the common state of all filters, ``(n, N)``."""
         return mean, covariance
 
     def predict_and_update(
         self, mean: Array, covariance: Array, measurement: Measurement
     ) -> list[kalman.Update]:
-        """Predict and update every filter from its mixed state ``(n, M, N)``."""
+        """Predict and update every filter from its mixed state ``(n, M, N)``; return the updates."""
         F, Q = self.motion(measurement.interval)
         return [
             self.update_estimate(
@@ -114,7 +88,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         ]
 
     def start(self, initial: Initial) -> KalmanMixture:
-        """Start all filters from the initial estimate."""
+        """Return the state at the start of a track: all filters at the initial estimate, with prior probabilities."""
         xp, M = self.xp, self.probabilities.shape[0]
         mean, covariance = self.augment(initial.mean, initial.covariance)
         return KalmanMixture(
@@ -125,9 +99,12 @@ class KalmanInteractingMultipleModel(KalmanModel):
             + 0.0 * mean[:1],
         )
 
-    def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
-        """Run one IMM cycle. Its normalised innovation squared is the filters' mean by their posterior weights."""
-        xp, measurement = self.xp, given.measurement
+    def update(self, state: KalmanMixture, inputs: FilterInput) -> KalmanMixture:
+        """Run one IMM cycle (mix, predict, update) with a scan, and return the state.
+
+        The normalised innovation squared is the filters' mean by their posterior weights.
+        """
+        xp, measurement = self.xp, inputs.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
         mixed = imm.mix(state.means, state.covariances, prediction.mixing)
         results = self.predict_and_update(*mixed, measurement)
@@ -141,31 +118,6 @@ class KalmanInteractingMultipleModel(KalmanModel):
         nis = weighted_sum(probabilities, xp.stack([r.squared_distance for r in results]))
         likelihood = self.likelihood(measurement, density, nis)
         return KalmanMixture(mean[:4], covariance[:4, :4], likelihood, means, covariances, probabilities)
-
-
-class TurnModel(ConstantVelocityModel):
-    """The nearly coordinated turn, with the turn rate as fifth state.
-
-    Args:
-        task: the problem.
-        acceleration: standard deviation of the acceleration along x and y, m/s^2.
-        turn_rate_change: standard deviation of the change of the turn rate from scan to scan, degrees/s.
-    """
-
-    def __init__(self, task: ManeuveringTarget, acceleration: float, turn_rate_change: float) -> None:
-        super().__init__(task)
-        self.variance: float = acceleration**2
-        self.change: float = DEGREE * turn_rate_change / task.parameters.sampling_interval
-        self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
-
-    def noise(self, T: Array) -> Array:
-        """Return the covariance of the process noise over intervals, s, ``(5, 5, N)``."""
-        Q = self.variance * self.motion(T)[1]
-        return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, (T * self.change) ** 2)[1]
-
-    def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-        """Apply the time update of the extended Kalman filter over intervals, s."""
-        return coordinated_turn.predict(mean, covariance, T, self.noise(T))
 
 
 class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
@@ -197,52 +149,16 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Add the turn rate of straight flight."""
+        """Return an estimate with the turn rate of straight flight as fifth component."""
         return coordinated_turn.augment_turn_rate(mean, covariance, self.turn_variance)
 
     def predict_and_update(
         self, mean: Array, covariance: Array, measurement: Measurement
     ) -> list[kalman.Update]:
-        """Predict and update every filter from its mixed state ``(5, 3, N)``."""
+        """Predict and update every filter from its mixed state ``(5, 3, N)``; return the updates."""
         results = []
         for straight in super().predict_and_update(mean[:4], covariance[:4, :4], measurement):
             mean5, covariance5 = self.augment(straight.mean, straight.covariance)
             results.append(straight._replace(mean=mean5, covariance=covariance5))
         predicted = self.turn.predict_turn(mean[:, 2], covariance[:, :, 2], measurement.interval)
         return [*results, self.turn.update_estimate(predicted, measurement)]
-
-
-class UnscentedTurn(TurnModel, KalmanModel):
-    """Unscented Kalman filter of position, velocity and turn rate, always in a nearly coordinated turn.
-
-    The measurement is linear, so only the prediction takes the unscented transform; the update is Kalman's.
-
-    Args:
-        task: the problem.
-        acceleration: standard deviation of the acceleration along x and y, m/s^2.
-        turn_rate_change: standard deviation of the change of the turn rate from scan to scan, degrees/s.
-        turn_rate_start: standard deviation of the turn rate at the start of the track, degrees/s.
-    """
-
-    def __init__(
-        self,
-        task: ManeuveringTarget,
-        acceleration: float = 0.3,
-        turn_rate_change: float = 0.3,
-        turn_rate_start: float = 2.0,
-    ) -> None:
-        super().__init__(task, acceleration, turn_rate_change)
-        self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
-
-    def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate, with a turn rate of mean zero."""
-        return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
-
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Propagate the sigma points through the turn and update with the measured position."""
-        T = given.measurement.interval
-        mean, covariance = unscented.transform(
-            state.mean, state.covariance, lambda points: coordinated_turn.propagate(points, T)
-        )
-        predicted = mean, covariance + self.noise(T)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))

@@ -14,7 +14,9 @@ import numpy
 
 from ...envs.contract.filter import EstimateState, FilterInput, Initial
 from ...envs.data.recording import Recording
+from ...envs.maneuvering_target.constant_velocity import KalmanModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.unscented_turn import UnscentedTurn
 from ...filters import kalman
 from ..table import Tunable, tunable, without_logarithms
 from .adaptive_estimators import SageHusaProcessNoise, VariationalBayes
@@ -22,9 +24,7 @@ from .anchored import DeadReckoning, regress_odometry
 from .estimators import (
     ConstantVelocity,
     KalmanInteractingMultipleModel,
-    KalmanModel,
     KalmanTurnInteractingMultipleModel,
-    UnscentedTurn,
 )
 
 
@@ -44,7 +44,7 @@ class ConstantAcceleration(KalmanModel):
         self.H = task.constant([[float(i == j) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate, with an acceleration of mean zero."""
+        """Return the state at the initial estimate, with an acceleration of mean zero."""
         xp = self.xp
         zero = 0.0 * initial.mean
         right = xp.concat([initial.covariance, zero[:, None][:, :, :] + 0.0 * zero[None, :2]], axis=1)
@@ -55,9 +55,9 @@ class ConstantAcceleration(KalmanModel):
         augmented = xp.concat([initial.mean, zero[:2]], axis=0), xp.concat([right, below], axis=0)
         return super().start(Initial(*augmented))
 
-    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
-        """Predict and update."""
-        xp, T = self.xp, given.measurement.interval
+    def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
+        """Predict to a scan, update with its measurement, and return the state."""
+        xp, T = self.xp, inputs.measurement.interval
         none, one = 0.0 * T, 1.0 + 0.0 * T
         half = 0.5 * T**2
         kinematic = [[one, T, half], [none, one, T], [none, none, one]]
@@ -76,7 +76,7 @@ class ConstantAcceleration(KalmanModel):
             ]
         )
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
-        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
+        return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))
 
 
 def _imm(values: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
@@ -129,7 +129,7 @@ BEYOND = {
 
 
 def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
-    """Return the families that can be fitted to a log of positions, the simplest first.
+    """Return the filter families that can be fitted to a log of positions, by name, the simplest first.
 
     Args:
         recording: recording of ManeuveringTarget, whose intervals and deviations set the limits; None: 1 s and 1 m.
@@ -193,12 +193,12 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
 
 
 def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable:
-    """Return the dead reckoning by a second sensor, with slow errors of the positions.
+    """Return the family of the filter that uses odometry and models slow errors of the positions.
 
     Limits are narrow where a log contains little information. In a log of an hour an error that lasts for more than
-    five minutes cannot be distinguished from another place. Dead reckoning errs by 3 to 10 m after a hundred. A smaller
-    drift is dangerous, and the likelihood may prefer it where errors are no Gauss-Markov process; a larger drift costs
-    little.
+    five minutes cannot be distinguished from another position. Dead reckoning errs by 3 to 10 m after a hundred. A
+    drift fitted too small harms more than one too large, and the likelihood may prefer it where errors are no
+    Gauss-Markov process.
 
     Args:
         recording: recording with a second sensor; None: any.

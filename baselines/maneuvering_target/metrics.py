@@ -26,7 +26,7 @@ LASTING = 10
 
 
 def gospa(distance: numpy.ndarray, cutoff: float = CUTOFF) -> numpy.ndarray:
-    """Return the GOSPA of one target and one track, m; NaN stays.
+    """Return the GOSPA metric of one target and one track, ``min(distance, cutoff)``, m; NaN stays NaN.
 
     Args:
         distance: distance between them, m.
@@ -50,7 +50,7 @@ def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return the terms of the metrics for each episode; none without clutter, and none for a bound."""
+    """Return each episode's terms of the metrics, by name; empty without clutter and for a bound."""
     if "false_association" not in run or str(run["kind"].values) == "bound":
         return MetricInputs()
     distance = numpy.sqrt(squared_errors(run, "position", groups_of(run)))
@@ -64,7 +64,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the measures of tracks in clutter, of one policy.
+    """Return the metrics of tracks in clutter from the episodes' terms, with intervals.
 
     ``gospa``: mean over scans and episodes, m. ``track_loss_rate``: share of episodes with ``LASTING`` scans in a row
     whose error exceeds ``CUTOFF``; ``track_loss_scan``: median of the first of them, over the tracks lost.

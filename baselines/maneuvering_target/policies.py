@@ -40,12 +40,12 @@ class InteractingMultipleModel(Policy):
         self.log_predicted: Reader = model.reader("log_predicted")
 
     def probabilities(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the posterior mode probabilities, ``(N, M)``."""
+        """Return the posterior mode probabilities ``(N, M)`` from an observation, by Bayes' rule."""
         log_predicted, log_likelihood = self.log_predicted(observation), self.log_likelihood(observation)
         return imm.mode_posterior(log_predicted.T, log_likelihood.T).T
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the posterior probabilities as weights."""
+        """Return the posterior mode probabilities as action, the weights of the filters."""
         return self.probabilities(observation), None
 
 
@@ -65,7 +65,7 @@ class ZeroEvidence(PaperAction):
 
 
 def gain_bank(model: Model) -> GainBank:
-    """Return the bank of a task under control ``gain``."""
+    """Return the :class:`GainBank` inside a model, whose control must be ``gain``."""
     assert isinstance(model.filter, GainBank)
     return model.filter
 
@@ -124,9 +124,7 @@ class AdaptiveGain(Policy):
         self.available: Reader = model.reader("available")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Decrease the gain along the ramp, or restart the ramp at an alarm; a scan that missed the target does not
-        count.
-        """
+        """Return the next gain of the ramp as action, restarted at an alarm, and the memory."""
         step = numpy.where(start, 0, 0 if state is None else state)
         alarm = self.squared(observation)[:, 0] > self.threshold
         may = (step > 0) if self.rearm else (step >= self.ramp_scans)

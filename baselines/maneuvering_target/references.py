@@ -5,15 +5,15 @@ from typing import NamedTuple
 from ...envs.contract.faults import GaussMarkov
 from ...envs.contract.filter import FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
-from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
+from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel, KalmanModel
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
 from ...filters import bounds, kalman
 from ...filters.small_matrices import apply
-from .estimators import KalmanModel
 
 DISTURBANCES = ("glint", "coloured", "bias", "clutter")
-"""The reference is given all of them. The bound ignores them: each but false plots, which it never uses, adds
-errors."""
+"""Disturbances that the reference knows. The bound ignores them: each adds errors, except false plots, which it never
+uses.
+"""
 
 
 class TurnMemory(NamedTuple):
@@ -27,7 +27,7 @@ class TurnMemory(NamedTuple):
 
 
 class KnownTurn(KalmanModel):
-    """The Kalman filter that is given the manoeuvres of the episode: the optimal one, given these.
+    """The Kalman filter that knows the manoeuvres of the episode: the optimal one, given these.
 
     It knows begin, end and kind of each: the acceleration of thrust, the rate of a turn. Then the flight has no random
     disturbance. With x the state, z the given state of the target and F the transition that turns a deviation of the
@@ -37,8 +37,8 @@ class KnownTurn(KalmanModel):
     clutter the plot of the target. Of a coloured error it knows deviation and correlation time, and estimates its level
     as two more states.
 
-    Flights that are tables, such as those of aircraft, have no turn rates: there it is given the acceleration from scan
-    to scan, which counts as thrust.
+    Flights that are tables, such as those of aircraft, have no turn rates: there it knows the acceleration from scan to
+    scan, which counts as thrust.
     """
 
     kind = "reference"
@@ -49,9 +49,9 @@ class KnownTurn(KalmanModel):
 
     disturbances = DISTURBANCES
 
-    def initialise(self, given: FilterInput) -> TurnMemory:
-        """Start from the initial estimate; a coloured error is stationary from the start."""
-        (mean, covariance), truth = given.measurement, given.truth
+    def initialise(self, inputs: FilterInput) -> TurnMemory:
+        """Return the state at the initial estimate; a coloured error is stationary from the start."""
+        (mean, covariance), truth = inputs.measurement, inputs.truth
         if "coloured" in truth.disturbances:
             none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2
             mean = self.xp.concat([mean, none])
@@ -59,7 +59,7 @@ class KnownTurn(KalmanModel):
         return TurnMemory(mean, covariance, Likelihood.unknown(mean[0]), truth)
 
     def block_diagonal(self, first: Array, second: Array) -> Array:
-        """Return the block-diagonal matrix of two blocks, ``(n + m, n + m, N)``."""
+        """Return the block-diagonal matrix ``(n + m, n + m, N)`` of blocks ``(n, n, N)`` and ``(m, m, N)``."""
         corner = 0.0 * first[:, :1] + 0.0 * second[:1]
         return self.xp.concat(
             [
@@ -68,9 +68,11 @@ class KnownTurn(KalmanModel):
             ]
         )
 
-    def update(self, state: TurnMemory, given: FilterInput) -> TurnMemory:
-        """Predict with the known flight since the scan before, and update with the measured position."""
-        measurement, truth = given.measurement, given.truth
+    def update(self, state: TurnMemory, inputs: FilterInput) -> TurnMemory:
+        """Predict with the known flight since the last scan, update with the measured position, and return the
+        state.
+        """
+        measurement, truth = inputs.measurement, inputs.truth
         xp, world, disturbances = self.xp, self.task.world, truth.disturbances
         assert isinstance(world, RadarWorld)
         early = None
@@ -105,7 +107,7 @@ class KnownTurn(KalmanModel):
 
 
 class KnownInputBound(ConstantVelocityModel):
-    """Posterior Cramér-Rao bound of an estimator that is given the whole acceleration: no process noise."""
+    """Posterior Cramér-Rao bound of an estimator that knows the whole acceleration: no process noise."""
 
     kind = "bound"
     traceable = True
@@ -113,12 +115,13 @@ class KnownInputBound(ConstantVelocityModel):
     disturbances = DISTURBANCES
 
     def start(self, initial: Initial, truth: Truth) -> Array:
-        """Return the covariance of the start."""
+        """Return the bound's memory at the start of the track, the initial covariance."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
-        """Return the bound after this scan: the diagonal of the covariance recursion at the true position. A scan that
-        missed the target adds no information.
+        """Return the bound on the variances after this scan, and the memory, by the recursion at the true position.
+
+        A scan that missed the target adds no information.
         """
         world = self.task.world
         assert isinstance(world, RadarWorld)

@@ -44,7 +44,7 @@ class ConstantVelocitySmoother(ConstantVelocity):
     def smooth(
         self, measurements: Sequence[Measurement], states: Sequence[EstimateState]
     ) -> tuple[Array, Array]:
-        """Smooth the whole track, or with the fixed lag."""
+        """Return means and covariances of the whole track, smoothed with all later scans or those within the lag."""
         filtered = smoothing.Gaussian(*scans.stack_scans(states)[:2])
         motion = scans.by_stretches(self._motion, filtered.mean, scans.stack_scans(measurements))
         smoothed = smoothing.smooth(filtered, motion, self.lag)
@@ -57,7 +57,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
     Args:
         task: the problem.
         lag: number of later scans that each estimate uses; default: all of them.
-        **arguments: of :class:`.KalmanInteractingMultipleModel`.
+        **arguments: arguments of :class:`.KalmanInteractingMultipleModel`.
     """
 
     kind = "smoother"
@@ -67,11 +67,11 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         self.lag = lag
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """Return the motion of every filter over intervals.
+        """Return transition and process noise of every filter over intervals.
 
         Args:
-            mixed: mean from which each starts, ``(n, M, N)``.
-            T: s, ``(N,)``.
+            mixed: mean from which each filter starts, ``(n, M, N)``.
+            T: intervals, s, ``(N,)``.
         """
         F, unit = self.motion(T)
         Q = self.xp.stack([variance * unit for variance in self.variances], axis=2)
@@ -95,7 +95,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
     def smooth(
         self, measurements: Sequence[Measurement], states: Sequence[KalmanMixture]
     ) -> tuple[Array, Array]:
-        """Smooth the whole track, or with the fixed lag."""
+        """Return means and covariances of the whole track, smoothed with all later scans or those within the lag."""
         filtered = smoothing.GaussianMixture(*scans.stack_scans(states)[3:])
         arrival = scans.by_stretches(self._arrival, filtered, scans.stack_scans(measurements))
 
@@ -116,11 +116,11 @@ class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleMode
     Args:
         task: the problem.
         lag: number of later scans that each estimate uses; default: all of them.
-        **arguments: of :class:`.KalmanTurnInteractingMultipleModel`.
+        **arguments: arguments of :class:`.KalmanTurnInteractingMultipleModel`.
     """
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """Return the motion of every filter; arguments of :meth:`KalmanIMMSmoother.motions`."""
+        """Return transition and process noise of every filter; arguments of :meth:`KalmanIMMSmoother.motions`."""
         xp = self.xp
         F, unit = self.motion(T)
         nothing = 0.0 * unit[0]

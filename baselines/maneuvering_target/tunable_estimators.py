@@ -17,6 +17,7 @@ from ...envs.maneuvering_target.semi_markov import (
     SemiMarkovPrior,
     training_prior,
 )
+from ...envs.maneuvering_target.unscented_turn import UnscentedTurn
 from ..table import Tunable, Variant, tunable, without_logarithms
 from .adaptive_estimators import SageHusaProcessNoise, VariationalBayes
 from .data_association import (
@@ -24,7 +25,7 @@ from .data_association import (
     ProbabilisticDataAssociation,
     SemiMarkovDataAssociation,
 )
-from .estimators import KalmanInteractingMultipleModel, KalmanTurnInteractingMultipleModel, UnscentedTurn
+from .estimators import KalmanInteractingMultipleModel, KalmanTurnInteractingMultipleModel
 
 Settings = tuple[dict[str, Any], Callable[[Any], Any]]
 

@@ -12,19 +12,22 @@ from ...filters import class_fusion, imm
 from ..alarm import Alarm, innovation_evidence
 
 REFUSAL_SHARE = 0.5
-"""Share of decisions that the gate refuses where a second emitter is received; ours."""
+"""Share of decisions that the gate rejects where a second emitter is received; our choice."""
 NIS_LIMIT = 9.2
 """Normalised innovation squared of two channels that one scan in a hundred exceeds: beyond it no class explains the
-innovation."""
+innovation.
+"""
 MOST = 2.0
-"""Largest log-likelihood ratio of one scan for another class, nats; ours, so that one outlier raises no alarm."""
+"""Largest log-likelihood ratio of one scan for another class, nats; our choice, so that one outlier raises no alarm."""
 LEAST = 1e-300
 """Smallest likelihood whose logarithm is taken."""
 
 
 class ClassAlarm(Alarm):
-    """Alarm on a class that explains the radar better than the weights in force, on decisions that are all about one
-    type, where the paper draws the type anew every time, and on too many decisions that the bearing gate refuses.
+    """Alarm for a wrong class, for ESM decisions that are all on one type, and for too many rejected decisions.
+
+    A class is wrong where another one explains the radar better than the weights in force. The paper draws the type of
+    a decision anew every time. The bearing gate rejects decisions.
 
     Radar errors that no class explains raise no alarm: other weights of the classes cannot correct them.
     """
@@ -50,7 +53,7 @@ class ClassAlarm(Alarm):
         self.refusal: float = p.association_error
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of radar and ESM."""
+        """Return the log-likelihood ratios of a wrong class, of ESM decisions on one type, and of rejected ones."""
         likelihood = numpy.exp(self.log_likelihood(observation))
         expected = (self.last_weight(observation) * likelihood).sum(axis=1)
         another = numpy.log(likelihood.mean(axis=1) / numpy.maximum(expected, LEAST))
@@ -66,7 +69,7 @@ class ClassAlarm(Alarm):
         return numpy.stack([another, one_type, refusals], axis=1)
 
     def _one_type(self, used_count: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratio of one type to types drawn anew, of all decisions so far."""
+        """Return the log-likelihood ratio, from all ESM decisions so far, of one type to types drawn anew."""
         counts = COUNT_UNIT * used_count.T
         fixed = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         redrawn = self.log_esm @ counts
@@ -76,7 +79,7 @@ class ClassAlarm(Alarm):
 
 
 class InnovationsAlarm(Alarm):
-    """Innovations of all hypotheses of control ``hypotheses`` together that are larger, smaller or to one side."""
+    """Alarm for innovations of all hypotheses together that are larger, smaller or to one side (``hypotheses``)."""
 
     window = 50
 
@@ -85,11 +88,11 @@ class InnovationsAlarm(Alarm):
         self.innovation: Reader = model.reader("innovation")
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of range and range rate."""
+        """Return the log-likelihood ratios of faulty innovations of range and range rate, ``(N, kinds)``."""
         innovation = self.innovation(observation)
         return innovation_evidence(innovation, numpy.ones_like(innovation, dtype=bool))
 
 
 def make_alarm(model: Model) -> Alarm:
-    """Return the alarm of a model's control."""
+    """Return the alarm for a model: :class:`InnovationsAlarm` under ``hypotheses``, else :class:`ClassAlarm`."""
     return InnovationsAlarm(model) if model.control == "hypotheses" else ClassAlarm(model)

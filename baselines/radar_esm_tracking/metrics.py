@@ -18,19 +18,23 @@ CLASSES = 3
 SURE = 0.9
 """Probability from which a class counts as recognised."""
 LEAST = 1e-6
-"""Probability of the true class whose logarithm is the lowest score."""
+"""Smallest probability of the true class in the logarithmic score."""
 TIMES = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 """Seconds at which the probability of the true class is reported."""
 
 
 def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
-    """Return the ratio of means over episodes, ``(1 + resamples,)``; NaN where the denominator is zero."""
+    """Return the ratio of means over episodes to shares, ``(1 + resamples,)``; NaN where a share is zero."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return means / shares
 
 
 def time_quantile(
-    bootstrap: Bootstrap, first: numpy.ndarray, chosen: numpy.ndarray, seconds: numpy.ndarray, share: float
+    bootstrap: Bootstrap,
+    first: numpy.ndarray,
+    is_counted: numpy.ndarray,
+    seconds: numpy.ndarray,
+    share: float,
 ) -> IntervalEstimate:
     """Return the time by which a condition holds in a share of the chosen episodes; infinite where too few reach it,
     NaN without any.
@@ -38,12 +42,12 @@ def time_quantile(
     Args:
         bootstrap: resamples of the episodes.
         first: index of the first time at which the condition holds, or the number of times, ``(episodes,)``.
-        chosen: whether an episode counts, ``(episodes,)`` booleans.
+        is_counted: whether an episode counts, ``(episodes,)`` booleans.
         seconds: times, s, ``(T,)``.
         share: share, such as 0.5 for the median.
     """
     times = numpy.append(seconds, math.inf)[first]
-    return bootstrap.interval(bootstrap.quantiles(times, share, chosen))
+    return bootstrap.interval(bootstrap.quantiles(times, share, is_counted))
 
 
 def _first(condition: numpy.ndarray) -> numpy.ndarray:
@@ -72,13 +76,13 @@ def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
     return numpy.asarray(true_class[..., None] == numpy.arange(CLASSES))
 
 
-def _of_group(true_class: numpy.ndarray) -> numpy.ndarray:
-    """Return whether a target is of each group, ``(..., 1 + classes)``: all targets, and each class."""
+def _group_masks(true_class: numpy.ndarray) -> numpy.ndarray:
+    """Return boolean masks ``(..., 1 + classes)``: true for all targets, then for each true class."""
     return numpy.concatenate([numpy.ones((*true_class.shape, 1), bool), _of_class(true_class)], axis=-1)
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return the terms of the metrics for each episode; none for a bound, and no beliefs for a reference."""
+    """Return each episode's terms of the metrics, by name; none for a bound, no probabilities for a reference."""
     if _missing(run, "true_class"):
         return MetricInputs()
     true_class = run["true_class"].values.astype(int)
@@ -114,7 +118,10 @@ def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
     detected = _first(stays & (numpy.arange(len(seconds)) >= change[:, None]))
     false = right[:, :-1] & ~right[:, 1:] & (true_class[:, 1:] == true_class[:, :-1])
     score = numpy.log(numpy.maximum(true_probability, LEAST))
-    at_moments, at_last = _of_group(true_class[:, list(moments.values())]), _of_group(true_class[:, last])
+    at_moments, at_last = (
+        _group_masks(true_class[:, list(moments.values())]),
+        _group_masks(true_class[:, last]),
+    )
     averaged = {
         "probability": true_probability[:, list(moments.values()), None] * at_moments,
         "share_at_moments": at_moments,
@@ -137,7 +144,7 @@ def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
 
 
 def _moments(seconds: numpy.ndarray) -> dict[float, int]:
-    """Return the indices of the times of :data:`TIMES` within the episode."""
+    """Return the index of each of :data:`TIMES` within the episode, by its time, s."""
     found = {moment: numpy.flatnonzero(numpy.isclose(seconds, moment)) for moment in TIMES}
     return {moment: int(at[0]) for moment, at in found.items() if len(at)}
 
@@ -147,7 +154,7 @@ def _last(seconds: numpy.ndarray) -> int:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the errors by true class, recognition of the class, and calibration, of one policy.
+    """Return the metrics from the episodes' terms: errors by true class, recognition, and calibration.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
     ``time_to_recognise_median``, ``_90_quantile`` (first P(true class) >= 0.9) and ``_censored``, the share of
@@ -192,7 +199,7 @@ def _beliefs(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
         for i in numpy.flatnonzero(shares[0]):
             value = bootstrap.interval(_ratio(probability[:, i], shares[:, i]))
             yield Measure("mean_true_class_probability", GROUPS[i], f"{moment:g} s", value, "1")
-    for mode, chosen in zip(GROUPS, _of_group(each["first_class"]).T, strict=True):
+    for mode, chosen in zip(GROUPS, _group_masks(each["first_class"]).T, strict=True):
         if chosen.any():
             yield from _recognition("time_to_recognise", bootstrap, each["recognised"], chosen, seconds, mode)
     changed = each["change"] < len(seconds)

@@ -39,14 +39,12 @@ class FixedWeights(ConstantPolicy):
 
 
 class _Posterior(Policy):
-    """Base of the policies with class probabilities: log-likelihoods of the classes from the observation, ``(M, N)``
-    each.
-    """
+    """Base of the policies whose weights are class probabilities, from log-likelihoods in the observation."""
 
     control = "weights"
     traceable = True
     task_keywords: ClassVar[dict[str, Any]] = {"decision_interval": 1}
-    """Its posterior changes at every scan."""
+    """An action at every scan, since the posterior changes."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -62,20 +60,20 @@ class _Posterior(Policy):
         )
 
     def radar(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood of all radar measurements so far, up to a constant."""
+        """Return the log-likelihood of each class from all radar measurements so far, up to a constant, ``(M, N)``."""
         return self.accumulated(observation).T
 
     def counts(self, observation: numpy.ndarray, refused: float = 0.0) -> numpy.ndarray:
-        """Return how often the ESM decided for each type, with weight ``refused`` for refused decisions, ``(J, N)``."""
+        """Return the counts of ESM decisions for each type, with weight ``refused`` for rejected ones, ``(J, N)``."""
         shown = self.used_count(observation) + refused * self.refused_count(observation)
         return COUNT_UNIT * shown.T
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability of the classes, up to a constant."""
+        """Return the log-probability of each class from an observation, up to a constant, ``(M, N)``."""
         raise NotImplementedError
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the probabilities as weights."""
+        """Return the class probabilities as action, the weights of the filters."""
         return imm.softmax(self.log_posterior(observation)).T, None
 
 
@@ -83,7 +81,7 @@ class RadarOnly(_Posterior):
     """Class probabilities from the radar's innovations alone."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability from prior and radar."""
+        """Return the log-probability of each class from prior and radar, up to a constant, ``(M, N)``."""
         return self.log_prior + self.radar(observation)
 
 
@@ -91,19 +89,19 @@ class EsmOnly(_Posterior):
     """Class probabilities from the ESM decisions alone, each taken as new evidence, as in (8)."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability from prior and ESM."""
+        """Return the log-probability of each class from prior and ESM decisions, up to a constant, ``(M, N)``."""
         return self.log_prior + self.log_esm @ self.counts(observation)
 
 
 class Ungated(_Posterior):
-    """The paper's rule with every ESM decision, also those that the gate refuses.
+    """The paper's rule with every ESM decision, also those that the gate rejects.
 
-    With a single emitter a refused decision is as good as any: on ``paper`` this is the exact posterior given the
+    With a single emitter a rejected decision is as good as any: on ``paper`` this is the exact posterior given the
     observations, which no policy can beat. With a second emitter the gate is needed.
     """
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability of the classes from prior, radar, and all ESM decisions, also the refused ones."""
+        """Return the log-probability of each class from prior, radar, and all ESM decisions, ``(M, N)``."""
         return self.log_prior + self.radar(observation) + self.log_esm @ self.counts(observation, 1.0)
 
 
@@ -112,7 +110,7 @@ class JointType(_Posterior):
 
     Args:
         model: the environment's model for the policy.
-        refused: weight of a decision that the gate refuses, 0 to 1.
+        refused: weight of a decision that the gate rejects, 0 to 1.
         esm: weight of any decision, 0 to 1.
     """
 
@@ -122,7 +120,7 @@ class JointType(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability from prior, radar, and all decisions as measurements of one type."""
+        """Return the log-probability of each class from prior, radar, and all decisions on one type, ``(M, N)``."""
         counts = self.esm * self.counts(observation, self.refused)
         esm = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         return self.log_prior + self.radar(observation) + esm
@@ -135,7 +133,7 @@ class ForgettingJointType(JointType):
         model: the environment's model for the policy.
         change: probability that the class changes from one decision to the next; by default once in 500 scans,
             four times the length of an episode.
-        refused: as in :class:`JointType`.
+        refused: weight of a decision that the gate rejects, 0 to 1.
         esm: weight of any decision, 0 to 1.
     """
 
@@ -147,9 +145,7 @@ class ForgettingJointType(JointType):
         self.log_start: numpy.ndarray = self.log_prior[:, None] + self.log_composition[..., None]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Update by the radar under the class before, change of class, and decisions about the type now; return the
-        weights.
-        """
+        """Update the joint posterior by radar, change of class and decisions; return class probabilities and memory."""
         radar, counts = self.radar(observation), self.esm * self.counts(observation, self.refused)
         joint, last_radar, last_counts = (self.log_start, 0.0, 0.0) if state is None else state
         joint = numpy.where(start, self.log_start, joint)
@@ -185,7 +181,7 @@ class Leaky(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Update the last weights by this scan's radar measurement, the transition, and this scan's decision."""
+        """Return the log of the last weights after radar measurement, class transition and decision, ``(M, N)``."""
         last = imm.log_probabilities(self.last_weight(observation).T)
         this_scan = self.log_likelihood(observation).T
         predicted = self.transition.T @ imm.mode_posterior(last, this_scan)
@@ -216,7 +212,7 @@ ESTIMATORS = {
 
 
 def _tunable_bayes(name: str, prior: ClassPrior, **limits: tuple[float, float, float]) -> Tunable:
-    """Return the tunable values; each candidate runs alone, since values determine tables."""
+    """Return the tunable values of the filter that uses Bayes' rule over classes and types."""
     change = (-4.0, math.log10(prior.change_rate), -1.0)
     found = tunable(
         ESTIMATORS[name], log10_change_rate=change, coloured=(0.05, prior.coloured, 0.7), **limits

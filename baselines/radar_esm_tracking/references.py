@@ -23,15 +23,15 @@ class KnownClassState(NamedTuple):
     """Estimate, and the class that governs the next motion."""
 
     mean: Array
-    """``(n, N)``; n = 3, or 5 with the radar's coloured errors."""
+    """Mean of the state, ``(n, N)``; n = 3, or 5 with the radar's coloured errors."""
     covariance: Array
-    """``(n, n, N)``."""
+    """Covariance of the state, ``(n, n, N)``."""
     target_class: Array
-    """``(N,)``."""
+    """Index of the class that governs the next motion, ``(N,)``."""
 
 
 class _KnownDraw:
-    """Base of reference and bound: the draw of the episode selects the models scan by scan."""
+    """Base of reference and bound: the episode's true class selects the model at every scan."""
 
     knows = (
         "the true class at every scan, in which scans there is glint, how strong and how lasting the radar's coloured "
@@ -53,7 +53,7 @@ class _KnownDraw:
         )
 
     def start(self, initial: Start, truth: Truth) -> KnownClassState:
-        """Start as the filter of the true class, with the true correlation of the first measurement's errors."""
+        """Return the initial estimate of the true class's filter, with the true correlation of the first errors."""
         mean, P = initial.mean, self.of(self.start_covariance, truth.target_class)
         white, zero = self.white(truth), 0.0 * truth.radar_correlation
         start = [[P[i, j] if i == j else zero for j in range(3)] for i in range(3)]
@@ -74,11 +74,11 @@ class _KnownDraw:
         return KnownClassState(mean, self.matrix(start), truth.target_class)
 
     def matrix(self, rows: list[list[Array]]) -> Array:
-        """Return a matrix from its entries."""
+        """Return a matrix ``(n, m, N)`` from rows of entries ``(N,)``."""
         return self.xp.stack([self.xp.stack(row) for row in rows])
 
     def of(self, matrices: Array, target_class: Array) -> Array:
-        """Return the matrix of each lane's class, ``(3, 3, N)``."""
+        """Return the matrix of each lane's class, ``(3, 3, N)``, chosen from those of all classes ``(3, 3, M)``."""
         return self.xp.take(matrices, target_class, axis=-1)
 
     def white(self, truth: Truth) -> Array:
@@ -88,9 +88,7 @@ class _KnownDraw:
         return self.matrix([[a * a * factor, cross], [cross, b * b * factor]])
 
     def motion(self, truth: Truth, governed: Array) -> tuple[Array, Array]:
-        """Return the transition and noise of the scan before this one, ``(n, n, N)``, under the class that governed
-        it.
-        """
+        """Return transition and process noise from the last scan to this one, ``(n, n, N)``, of the class in force."""
         models = self.task.models
         F, Q = self.of(models.Phi, governed), self.of(models.Q, governed)
         if not self.coloured:
@@ -113,14 +111,14 @@ class _KnownDraw:
 
 
 class Ideal(_KnownDraw):
-    """The Kalman filter that is given the draw of the episode: the optimal one, given it."""
+    """The Kalman filter that knows the draw of the episode: the optimal one, given it."""
 
     kind = "reference"
 
     def update(
         self, memory: KnownClassState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, KnownClassState, Likelihood]:
-        """Predict under the class that governed the motion, and update."""
+        """Predict under the true class, update; return mean, covariance, memory and likelihood."""
         F, Q = self.motion(truth, memory.target_class)
         mean, covariance = kalman.predict(memory.mean, memory.covariance, F, Q)
         result = kalman.update(mean, covariance, measurement.radar, self.H, self.white(truth))
@@ -138,7 +136,7 @@ class KnownDrawBound(_KnownDraw):
     def update(
         self, memory: KnownClassState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, KnownClassState]:
-        """Return the bound after this scan: the diagonal of the covariance."""
+        """Return the bound on the variances after this scan, and the memory."""
         F, Q = self.motion(truth, memory.target_class)
         P = bounds.predict_bound(memory.covariance, F, Q)
         P = bounds.posterior_cramer_rao_bound(P, self.H, self.white(truth))

@@ -8,8 +8,9 @@ from ..alarm import LARGER, Alarm, fault_evidence, scale_ratio
 
 
 class SensorAlarm(Alarm):
-    """Innovations of a group of sensors too large under every hypothesis, or accelerometers that repeat their last
-    reading exactly: noise never does. Hidden satellites raise no alarm: the filters observe which are hidden.
+    """Alarm for sensors: too large innovations under every hypothesis, or accelerometers that repeat a reading.
+
+    Noise never repeats exactly. Hidden satellites raise no alarm, since the filters observe which are hidden.
     """
 
     window = 20
@@ -22,7 +23,7 @@ class SensorAlarm(Alarm):
         self.others = [sensor.readings.stop - sensor.readings.start for sensor in self.task.sensors[2:]]
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood ratios of every group of sensors."""
+        """Return the log-likelihood ratios of a noisy or stuck sensor of every group, ``(N, kinds)``."""
         count = len(observation)
         here = [read(observation).sum(axis=1) for read in self.available]
         here += [numpy.full(count, float(readings)) for readings in self.others]

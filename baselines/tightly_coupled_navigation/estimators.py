@@ -1,4 +1,4 @@
-"""Estimators of TightlyCoupledNavigation: the paper's bank with updates that no action can select."""
+"""Estimators of TightlyCoupledNavigation: the paper's bank with robust updates."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ class HuberBank(HypothesisBank):
         ]
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array]:
-        """Return the threshold of every reading, ``(N,)`` each; infinity where updates are plain."""
+        """Return the Huber threshold of every reading, ``(N,)`` each; infinity where updates are plain."""
         xp, forces = self.xp, self.task.sensors[2].readings
         there = xp.all(measurement.available[forces] > 0.0, axis=0)
         robust = there | (xp.min(state.average_nis[1], axis=0) < self.manoeuvre)
@@ -72,12 +72,12 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         self.bank: HuberBank = HuberBank(task, everywhere if thresholds is None else thresholds, manoeuvre)
 
     def start(self, initial: Initial) -> HuberState:
-        """Start all filters from the initial estimate."""
+        """Return the state at the start of a track: all filters of the bank at the initial estimate."""
         return HuberState(self.bank.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: HuberState, given: FilterInput) -> HuberState:
-        """Run one cycle of the bank."""
-        xp, measurement = self.xp, given.measurement
+    def update(self, state: HuberState, inputs: FilterInput) -> HuberState:
+        """Predict and update all filters of the bank with a measurement, and return the state."""
+        xp, measurement = self.xp, inputs.measurement
         readings = xp.where(xp.isnan(measurement.readings), 0.0, measurement.readings)
         measurement = measurement._replace(readings=readings)  # the bank weighs each by its availability
         filters = self.bank.predict(state.filters, measurement)
@@ -85,11 +85,11 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         return HuberState(filters, Likelihood.of_records(self.bank.records(filters, measurement)))
 
     def mean(self, state: HuberState) -> Array:
-        """Return the mean of the bank."""
+        """Return the mean of the bank's combined estimate, ``(n, N)``."""
         return self.bank.mean(state.filters)
 
     def covariance(self, state: HuberState) -> Array:
-        """Return the covariance of the bank."""
+        """Return the covariance of the bank's combined estimate, ``(n, n, N)``."""
         return self.bank.covariance(state.filters)
 
 
@@ -111,9 +111,9 @@ class HuberStuckCheck(Huber):
     ) -> None:
         super().__init__(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
 
-    def update(self, state: HuberState, given: FilterInput) -> HuberState:
-        """Run one cycle of the bank without repeated readings."""
-        xp, forces, measurement = self.xp, self.task.sensors[2].readings, given.measurement
+    def update(self, state: HuberState, inputs: FilterInput) -> HuberState:
+        """Predict and update all filters of the bank, without repeated accelerometer readings; return the state."""
+        xp, forces, measurement = self.xp, self.task.sensors[2].readings, inputs.measurement
         available = measurement.available
         fresh = xp.any(measurement.readings[forces] != state.filters.accelerometers, axis=0)
         kept = available[forces] * xp.astype(fresh, available.dtype)

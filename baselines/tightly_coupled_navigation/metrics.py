@@ -25,13 +25,13 @@ LASTING = 10
 
 
 def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -> IntervalEstimate:
-    """Return the ratio of means over episodes, with its interval."""
+    """Return the mean of values over the mean of counts, over episodes, with its interval."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
 
 
 def find_lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
-    """Return where a condition begins to hold for some steps in a row; false where the end is too near.
+    """Return a boolean mask of the times at which a condition begins to hold for ``steps`` steps in a row.
 
     Args:
         condition: ``(episodes, time)`` booleans.
@@ -45,17 +45,17 @@ def find_lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarra
 
 
 class Switch(NamedTuple):
-    """One change of the true hypothesis."""
+    """One change of the true hypothesis, with the bank's delay in following it."""
 
     episode: int
     before: int
     after: int
     wait: float
-    """Steps until the new hypothesis has more than one half, the first one counted; infinite where it never has."""
+    """Steps until the probability of the new hypothesis exceeds one half, the first one counted; infinite: never."""
 
 
 def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switch]:
-    """Return every change of the true hypothesis and the delay of the bank.
+    """Return every change of the true hypothesis, with the bank's delay in following it.
 
     The delay ends at the first step from which the probability of the new hypothesis exceeds one half for
     ``LASTING`` steps (or until the next change, if that comes sooner).
@@ -79,7 +79,7 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return the terms of the metrics for each episode; none for a bound."""
+    """Return each episode's terms of the metrics, by name; empty for a bound."""
     if str(run["kind"].values) == "bound":
         return MetricInputs()
     true_mode = run["true_mode"].values.astype(int)
@@ -110,9 +110,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def _integrity(run: "xarray.Dataset") -> Arrays:
-    """Return the number of errors outside the covariance's region, the correlation of innovations, and the results of a
-    test of them, for each episode.
-    """
+    """Return each episode's terms of integrity, innovation correlation and fault detection, by name."""
     limit = chi_square_quantile(1.0 - RISK, run.sizes["component"])
     found: dict[str, numpy.ndarray] = {"misleading": (run["nees"].values > limit).mean(axis=1)}
     if "nis" not in run or numpy.isnan(run["nis"].values).all() or "sensor_fails" not in run:
@@ -132,10 +130,10 @@ def _integrity(run: "xarray.Dataset") -> Arrays:
 
 
 def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarray:
-    """Return where the normalised innovation squared, summed over the last steps, exceeds the limit of the test.
+    """Return a boolean mask of the steps at which the NIS, summed over the last ``TESTED`` steps, exceeds its limit.
 
     Args:
-        nis: ``(episodes, time)``.
+        nis: normalised innovation squared, ``(episodes, time)``.
         degrees: its degrees of freedom, ``(episodes, time)``.
     """
 
@@ -148,7 +146,7 @@ def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarra
 
 
 def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Arrays:
-    """Return the false alarms, and whether and when the first fault of each episode is detected while it lasts."""
+    """Return each episode's false alarms, and whether and when its first fault is detected, by name."""
     fault, first = numpy.logical_or.reduce(fails, axis=1), fails.argmax(axis=1)
     steps, length = numpy.arange(alarm.shape[1]), alarm.shape[1]
     # A fault has effects after its end: only alarms before the first fault are false.
@@ -167,8 +165,7 @@ def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Array
 
 
 def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
-    """Return the numbers of changes and of missed ones, and the delay of the others in seconds, from and to each
-    hypothesis.
+    """Return counts of changes, of missed ones, and summed delays, s, from and to each hypothesis.
 
     Returns:
         ``(episodes, M, M, 3)``.
@@ -181,14 +178,14 @@ def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> num
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
+    """Return the metrics from the episodes' terms: errors by hypothesis, adaptation, loss of track, integrity.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,
     whose mean a few lost tracks dominate; ``adaptation_time`` (mean) from the first step that carries a new motion to
-    the first on which its hypothesis has more than one half and keeps it for ten steps, and ``adaptation_censored``,
-    the share of switches where that never comes; ``track_loss_rate`` and ``track_loss_time`` (median of the tracks
-    lost) of ten steps in a row with a pseudorange rate further than the aperture from the combined prediction, from the
-    first change of motion on. Those from ``adaptation_time`` on need the records of a bank: references have none.
+    the first on which its hypothesis has more than one half for ten steps, and ``adaptation_censored``, the share of
+    switches without such a step; ``track_loss_rate`` and ``track_loss_time`` (median of the tracks lost) of ten steps
+    in a row with a pseudorange rate further than the aperture from the combined prediction, from the first change of
+    motion on. Those from ``adaptation_time`` on need the records of a bank: references have none.
 
     ``misleading_information`` is the share of steps whose error lies outside a region of the reported covariance; with
     a correct covariance it is one in a thousand. ``innovation_correlation``, of the root of the normalised innovation

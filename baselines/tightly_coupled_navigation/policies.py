@@ -35,9 +35,7 @@ class MultiHypothesis(PaperAction):
 
 
 def chain(stay: float) -> tuple[tuple[float, ...], ...]:
-    """Return the transition matrix of the hypotheses: each stays with one probability, and all others are equally
-    likely next.
-    """
+    """Return the hypotheses' transition matrix with ``stay`` on the diagonal and equal entries elsewhere."""
     leave = (1.0 - stay) / (len(HYPOTHESES) - 1)
     return tuple(
         tuple(stay if i == j else leave for j in range(len(HYPOTHESES))) for i in range(len(HYPOTHESES))
@@ -54,7 +52,8 @@ class Sticky(MultiHypothesis):
 
 
 class FixedRobust(ConstantPolicy):
-    """The paper's probabilities over a robust update, always; accelerometers are left out while they repeat themselves.
+    """The paper's probabilities over a robust update, always; accelerometers are left out while they repeat their
+    reading.
 
     The robust update ignores an outlier, and also a manoeuvre that begins; see ``HuberBank``.
 
@@ -115,7 +114,7 @@ class NisAdaptive(Policy):
         self.base = base
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the logarithms of factors for the excesses."""
+        """Return the action, logarithms of factors on the sensors' noise from the excess of their NIS."""
         nis = self.average_nis(observation).reshape(len(observation), -1, len(HYPOTHESES)).min(axis=2)
         ranges, rates, forces, attitude = numpy.log(numpy.maximum(nis.T / self.threshold, 1.0)) / self.nats
         action = [
@@ -143,7 +142,7 @@ HYPOTHESES_ON_FAULTS = {
 
 
 def _tunable_hypotheses(name: str, prior: FaultPrior) -> Tunable:
-    """Return the tunable values; each candidate runs alone, since values determine tables."""
+    """Return the tunable values of the bank with hypotheses on faults."""
     found = tunable(
         HYPOTHESES_ON_FAULTS[name],
         leg=(1.0, prior.leg, 10.0),

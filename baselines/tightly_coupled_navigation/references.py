@@ -15,7 +15,7 @@ from ...filters.ordered_sums import ordered_sum
 from ...filters.packed_covariance import diagonal, pack, unpack
 
 KNOWN_ACCELERATION_SIGMA = 0.01
-"""Standard deviation of a given acceleration in the reference, m/s^2, so that its covariance stays invertible."""
+"""Standard deviation of a known acceleration in the reference, m/s^2, so that its covariance stays invertible."""
 KNOWN_INCREMENT_SIGMA = 1e-3
 """Standard deviation of steady increments of the velocity on the fixed courses, m/s."""
 
@@ -24,9 +24,9 @@ class KnownModeState(NamedTuple):
     """State of reference and bound; n = 17 + S states (``filters/range_errors.py``)."""
 
     mean: Array
-    """``(n, N)``."""
+    """Mean of the state, ``(n, N)``."""
     covariance: Array
-    """Packed (:mod:`~filtergym.filters.packed_covariance`), ``(n (n + 1) / 2, N)``."""
+    """Covariance of the state, packed (:mod:`~filtergym.filters.packed_covariance`), ``(n (n + 1) / 2, N)``."""
     mode: Array
     """True hypothesis at the last measurement, ``(N,)``."""
 
@@ -35,16 +35,16 @@ class _KnownMode:
     """Base of reference and bound: the true hypothesis selects the models step by step, and the state of the sensors is
     known.
 
-    From the step on which a manoeuvre begins, the acceleration is independent of the past; it is given. A manoeuvre
-    that follows another one, or that the task announces by a jump, takes its new acceleration at the end of a
+    From the step on which a manoeuvre begins, the acceleration is independent of the past; the filter knows it. A
+    manoeuvre that follows another one, or that the task announces by a jump, takes its new acceleration at the end of a
     step; on the course "kinematic" the first one is there from the beginning of its step. Standard deviation and
-    correlation time of coloured errors of the pseudoranges are given; the errors are states.
+    correlation time of coloured errors of the pseudoranges are known; the errors are states.
     """
 
     traceable = True
     disturbances = ("stuck", "noisy", "hidden", "no_rates", "coloured", "reflections", "ramp", "aperture")
     knows_acceleration: float = 0.0
-    """Standard deviation of the given acceleration, m/s^2."""
+    """Standard deviation of the known acceleration, m/s^2."""
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         self.task = task
@@ -52,7 +52,7 @@ class _KnownMode:
         self.size: int = gnss_ins.SIZE + task.satellites
 
     def start(self, initial: Initial, truth: Truth) -> KnownModeState:
-        """Start from the initial estimate."""
+        """Return the state at the initial estimate, with the true hypothesis."""
         mean, covariance = range_errors.start(
             initial.mean,
             initial.covariance,
@@ -62,7 +62,7 @@ class _KnownMode:
         return KnownModeState(mean, pack(covariance), truth.mode)
 
     def reset_acceleration(self, track: KnownModeState, lanes: Array, acceleration: Array) -> KnownModeState:
-        """Return the track with a given acceleration in some lanes."""
+        """Return the state with the acceleration set to a known one in the lanes of a boolean mask."""
         xp, a = self.task.xp, gnss_ins.ACCELERATION
         new = numpy.zeros(self.size)
         new[a] = 1.0
@@ -80,11 +80,11 @@ class _KnownMode:
         )
 
     def predict_track(self, truth: Truth, track: KnownModeState, noises: Array) -> KnownModeState:
-        """Return the prediction to the present measurement.
+        """Return the state predicted to the present measurement under the true hypothesis.
 
         Args:
-            truth: at that measurement.
-            track: after the one before.
+            truth: truth at that measurement.
+            track: state after the last measurement.
             noises: covariance of the process noise of every hypothesis, ``(n, n, M)``.
         """
         xp, task, T = self.task.xp, self.task, self.task.common.T
@@ -120,7 +120,7 @@ class _KnownMode:
         return self.reset_acceleration(track, jumped, push)
 
     def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
-        """Return the readings of a state and the rows of their Jacobian there."""
+        """Return the expected sensor readings of a state, and the rows of their Jacobian there."""
         return range_errors.observe(
             state,
             measurement.satellite_position,
@@ -130,7 +130,7 @@ class _KnownMode:
         )
 
     def process_noises(self, models: Sequence[gnss_ins.AxisModel]) -> Array:
-        """Return the covariances of the process noise, ``(n, n, M)``."""
+        """Return the covariances of the process noise of every hypothesis, ``(n, n, M)``."""
         noises, known = numpy.zeros((self.size, self.size, len(models))), gnss_ins.SIZE
         for i, model in enumerate(models):
             noises[:known, :known, i] = gnss_ins.process_noise(model, self.task.common)
@@ -150,7 +150,7 @@ class _KnownMode:
 
 
 class KnownMode(_KnownMode):
-    """One extended Kalman filter that is given the draw of the episode: legs, faults, and all noise levels.
+    """One extended Kalman filter that knows the draw of the episode: legs, faults, and all noise levels.
 
     At rest, and in straight flight on the fixed courses, which has steady increments and no noise, the bank's small
     regularising noise remains, so that the reported covariance stays invertible.
@@ -175,7 +175,9 @@ class KnownMode(_KnownMode):
     def update(
         self, memory: KnownModeState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, KnownModeState, Likelihood]:
-        """Predict under the true hypothesis and update with the sensors that work."""
+        """Predict under the true hypothesis, update with working sensors; return mean, covariance, memory,
+        likelihood.
+        """
         xp, task, known = self.task.xp, self.task, gnss_ins.SIZE
         track = self.predict_track(truth, memory, self.noises)
         expected, rows = self.readings_and_jacobian(measurement, track.mean)
@@ -195,7 +197,7 @@ class KnownMode(_KnownMode):
 
 
 class KnownModeBound(_KnownMode):
-    """Posterior Cramér-Rao bound of an estimator that is given the hypothesis and the beginnings of manoeuvres.
+    """Posterior Cramér-Rao bound of an estimator that knows the hypothesis and the beginnings of manoeuvres.
 
     The covariance recursion of the motion that generates the truth, along the true states: no motion noise
     at rest, that of the increments on random straight flight (none on the fixed courses, whose increments are
@@ -220,7 +222,7 @@ class KnownModeBound(_KnownMode):
     def update(
         self, memory: KnownModeState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, KnownModeState]:
-        """Return the bound after this measurement: the diagonal of the covariance."""
+        """Return the bound on the variances after this measurement, and the memory."""
         xp = self.task.xp
         track = self.predict_track(truth, memory, self.noises)
         state = xp.concat([truth.state, truth.disturbances["coloured"].level])

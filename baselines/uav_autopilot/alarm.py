@@ -4,8 +4,9 @@ from ..alarm import InnovationAlarm
 
 
 class AutopilotAlarm(InnovationAlarm):
-    """Innovations of a sensor that are larger, smaller or to one side. A dropout raises no alarm: the filter observes
-    it.
+    """Alarm for innovations of a sensor that are larger, smaller or to one side.
+
+    A dropout raises no alarm, since the filter observes it.
     """
 
     window = 100

@@ -1,8 +1,8 @@
 """Estimators of UavAutopilot: the settled filter, and some that estimate the noise of sensors and gusts in flight.
 
-Each closes the loop and flies its own truth. No action is equivalent to the latter: an action scales the whole process
-noise, but a noisier sensor requires another change of the filter than stronger gusts. Equation numbers are those of
-``filters/noise_adaptation.py``, for the settled filter those of the task's paper.
+Each closes the loop around its own truth. No action is equivalent to the adaptive ones: an action scales the whole
+process noise, but a noisier sensor requires another change of the filter than stronger gusts. Equation numbers are
+those of ``filters/noise_adaptation.py``, for the settled filter those of the task's paper.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -25,7 +25,7 @@ from ..table import Variant
 
 
 class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
-    """The nominal filter with its settled, constant gain; it ignores missing readings."""
+    """The nominal filter with its steady-state, constant gain; it ignores missing readings."""
 
     def __init__(self, task: UavAutopilot) -> None:
         super().__init__(task)
@@ -34,12 +34,12 @@ class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
         self.settled: Array = task.constant(steady.posterior)[:, :, None]
 
     def start(self, initial: Start) -> Initial:
-        """Start from the initial estimate."""
+        """Return the filter's state at the start of a track, from the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
-    def update(self, state: Initial, given: FilterInput) -> Initial:
-        """Apply equations (10), (11) with the gain of the algebraic Riccati equation."""
-        measurement = given.measurement
+    def update(self, state: Initial, inputs: FilterInput) -> Initial:
+        """Return the state predicted and updated by (10) and (11), with the gain of the algebraic Riccati equation."""
+        measurement = inputs.measurement
         predicted = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         innovation = measurement.reading - self.task.readings_of(predicted)
         innovation = self.xp.where(measurement.available > 0.0, innovation, 0.0)
@@ -51,15 +51,15 @@ class SensorAware(NamedTuple):
     """State of one filter with its estimate of the sensors' noise."""
 
     mean: Array
-    """``(n, N)``."""
+    """Mean of the state, ``(n, N)``."""
     covariance: Array
-    """Packed."""
+    """Covariance of the state, packed."""
     noise: tuple[Any, ...]
     """Memory of the estimate of each sensor's noise."""
 
 
 class Step(NamedTuple):
-    """Result of the update with one measurement."""
+    """Result of a prediction and the update with one measurement."""
 
     filter: SensorAware
     log_likelihood: Array
@@ -76,9 +76,9 @@ class AdaptiveState(NamedTuple):
     """State of a filter that estimates noise."""
 
     mean: Array
-    """``(n, N)``."""
+    """Mean of the state, ``(n, N)``."""
     covariance: Array
-    """``(n, n, N)``."""
+    """Covariance of the state, ``(n, n, N)``."""
     likelihood: Likelihood
     memory: Any
     """Memory of the filter, with the filters of an IMM."""
@@ -101,7 +101,7 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         self.n: int = len(model.F)
 
     def start_filter(self, initial: Start) -> SensorAware:
-        """Return a filter at the initial estimate with the stated sensor noise."""
+        """Return the state of one filter at the initial estimate, with the stated sensor noise."""
         zero = 0.0 * initial.mean[0]
         noise = tuple(self.sensor_noise.start(zero + R) for R in self.task.sensor_variances)
         return SensorAware(initial.mean, packed_covariance.pack(initial.covariance), noise)
@@ -109,7 +109,7 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
     def predict_and_update(
         self, before: SensorAware, measurement: Measurement, factor: Array | float
     ) -> Step:
-        """Predict with a factor on the disturbance's covariance, and update with one sensor after the other."""
+        """Predict with a factor on the disturbance's covariance, update sensor by sensor, and return the results."""
         predicted = self.xp.matmul(self.F, before.mean) + self.B * measurement.control
         carried = self.xp.matmul(self.propagator, before.covariance) + self.other
         mean, covariance = predicted, carried + factor * self.scaled
@@ -134,18 +134,18 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         )
 
     def start(self, initial: Start) -> AdaptiveState:
-        """Start from the initial estimate."""
+        """Return the filter's state at the start of a track, from the initial estimate."""
         unknown = Likelihood.unknown(initial.mean[0])
         return AdaptiveState(initial.mean, initial.covariance, unknown, self.first_memory(initial))
 
     def first_memory(self, initial: Start) -> Any:
-        """Return the memory at the start."""
+        """Return the memory at the start of a track: one filter at the initial estimate."""
         return self.start_filter(initial)
 
-    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
-        """Update with one measurement, with gusts as designed."""
-        after, log_likelihood, nis, *_ = self.predict_and_update(state.memory, given.measurement, 1.0)
-        likelihood = likelihood_of(given.measurement, log_likelihood, nis, self.xp)
+    def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
+        """Predict with gusts as designed, update with a measurement, and return the state."""
+        after, log_likelihood, nis, *_ = self.predict_and_update(state.memory, inputs.measurement, 1.0)
+        likelihood = likelihood_of(inputs.measurement, log_likelihood, nis, self.xp)
         return AdaptiveState(
             after.mean, packed_covariance.unpack(after.covariance, self.n), likelihood, after
         )
@@ -169,13 +169,13 @@ class AdaptiveGusts(AdaptiveKalman):
         self.last: int = packed_covariance.position(self.n, self.n - 1, self.n - 1)
 
     def first_memory(self, initial: Start) -> tuple[SensorAware, adaptation.Level]:
-        """Return the memory with gusts as designed."""
+        """Return the memory at the start: the filter, and the gusts' level as designed."""
         one = 0.0 * initial.mean[0] + 1.0
         return self.start_filter(initial), adaptation.Level(one, self.gust_memory * one)
 
-    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
-        """Update with one measurement, and estimate the factor for the next."""
-        (before, level), measurement = state.memory, given.measurement
+    def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
+        """Predict, update with a measurement, estimate the gusts' factor for the next one, and return the state."""
+        (before, level), measurement = state.memory, inputs.measurement
         after, log_likelihood, nis, correction, carried = self.predict_and_update(
             before, measurement, level.value
         )
@@ -219,13 +219,13 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         self.transition = task.constant([[stay if i == j else change for j in range(3)] for i in range(3)])
 
     def first_memory(self, initial: Start) -> GustModels:
-        """Return all filters at the initial estimate, with equal probabilities."""
+        """Return the memory at the start: all filters at the initial estimate, with equal probabilities."""
         third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
         return GustModels((self.start_filter(initial),) * 3, third)
 
-    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
-        """Run one IMM cycle; each model has its own estimate of the sensors' noise."""
-        xp, memory, measurement = self.xp, state.memory, given.measurement
+    def update(self, state: AdaptiveState, inputs: FilterInput) -> AdaptiveState:
+        """Run one IMM cycle over the gust levels, each with its own sensor noise, and return the state."""
+        xp, memory, measurement = self.xp, state.memory, inputs.measurement
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
         mean, covariance = imm.mix(*self.stack_filters(memory.filters), prediction.mixing)
         steps = [
@@ -247,7 +247,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         return AdaptiveState(*combined, likelihood, after)
 
     def stack_filters(self, filters: tuple[SensorAware, ...]) -> tuple[Array, Array]:
-        """Return the means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""
+        """Return the filters' means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``, stacked."""
         xp = self.xp
         covariances = [packed_covariance.unpack(f.covariance, self.n) for f in filters]
         return xp.stack([f.mean for f in filters], axis=1), xp.stack(covariances, axis=2)
@@ -277,4 +277,4 @@ ESTIMATORS: dict[str, Any] = {
     "gust-imm": GustInteractingMultipleModel,
     "steady-kalman": SteadyKalman,
 }
-"""Estimators by their names in the table."""
+"""Classes of the estimators by name."""

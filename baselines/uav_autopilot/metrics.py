@@ -10,7 +10,7 @@ from ...envs.engine.scenario_choice import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.running.own_metrics import Arrays, Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
-from ...evaluation.statistics.cause_split import held_causes
+from ...evaluation.statistics.cause_split import active_causes
 from ...evaluation.storage.dataset import keywords_of, slices_of
 from ..alarm import LARGER, scale_ratio
 from .theory import stationary
@@ -30,7 +30,7 @@ def _task(evaluation: "xarray.Dataset") -> UavAutopilot:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return the terms of the metrics for each episode; none for a bound, and no innovations for a reference."""
+    """Return each episode's terms of the metrics, by name; none for a bound, no innovations for a reference."""
     if "output" not in run or numpy.isnan(run["output"].values).all():
         return MetricInputs()
     task, slices = _task(run), slices_of(run)
@@ -55,14 +55,14 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
         parts = [_lag_products(run["innovation"].values[:, times]) for times in slices.values()]
         each["innovation"] = numpy.stack(parts, axis=1)
     if "causes" in run and "nis" in run and not numpy.isnan(run["nis"].values).all():
-        held = dict(held_causes(run))
+        held = dict(active_causes(run))
         raised = held["disturbance"] | held["sensor noise"]
         each["detection"] = detect_raised_noise(run["nis"].values, run["nis_degrees"].values, raised)
     return MetricInputs(each, averaged)
 
 
 def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: numpy.ndarray) -> numpy.ndarray:
-    """Judge an alarm on a filter's own innovations, ``(episodes, 6)``.
+    """Return each episode's results ``(episodes, 6)`` of a test that detects raised noise from innovations.
 
     The alarm is Page's cumulative sum of the log-likelihood ratio of innovations with ``LARGER`` times their variance
     (E. S. Page, Continuous inspection schemes, Biometrika 41 (1954), 100-115), its limit by G. Lorden, Annals of
@@ -98,14 +98,14 @@ def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: nump
 
 
 def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean product of neighbours and the mean square, ``(episodes, 2)``; NaN without neighbours."""
+    """Return mean product of successive values, and mean square, ``(episodes, 2)``; NaN without pairs."""
     if values.shape[1] < 2:
         return numpy.full((len(values), 2), math.nan)
     return numpy.stack([(values[:, 1:] * values[:, :-1]).mean(axis=1), (values**2).mean(axis=1)], axis=1)
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the measures of the loop.
+    """Return the metrics of the control loop from the episodes' terms, with intervals.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
     measurement, mean over the window. ``tracking_rmse``: root mean square of output minus command.
@@ -167,7 +167,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
 
 
 def _variance(averaged: Arrays, of: str, episodes: int) -> numpy.ndarray:
-    """Return the unbiased variance across episodes at each time, of the data and of every resample."""
+    """Return the unbiased variance across episodes at each time, of the data and of every bootstrap resample."""
     biased = averaged[f"{of}_square"] - averaged[of] ** 2
     return numpy.asarray(biased * (episodes / max(episodes - 1, 1)))
 

@@ -16,7 +16,7 @@ from ...filters import packed_covariance
 
 
 class TrueState:
-    """The true state as the estimate: no estimator is better for this loop."""
+    """Reference whose estimate is the true state: no estimator is better for this loop."""
 
     kind = "reference"
     traceable = True
@@ -27,11 +27,11 @@ class TrueState:
         self.task = task
 
     def start(self, initial: Start, truth: Truth) -> Array:
-        """Return the covariance of the start, which is reported at all times: the error is zero and has no density."""
+        """Return the initial covariance, which is reported at all times, since the error is zero."""
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Array]:
-        """Replace the estimate by the truth."""
+        """Return the true state as mean, the covariance, and the memory."""
         return truth.state, memory, memory
 
 
@@ -39,7 +39,7 @@ class _KnownNoise:
     """The covariance (12) of the true plant with the present noise and the coloured errors of the sensors.
 
     A coloured error is a further coordinate of the state, which its sensor reads together with its own; its decay and
-    its noise are given (A. E. Bryson and L. J. Henrikson, "Estimation using sampled data containing sequentially
+    its noise are known (A. E. Bryson and L. J. Henrikson, "Estimation using sampled data containing sequentially
     correlated noise", Journal of Spacecraft and Rockets 5 (1968), 662-665, by augmentation).
     """
 
@@ -71,7 +71,7 @@ class _KnownNoise:
         placed = numpy.zeros((size * (size + 1) // 2, errors))
         placed[self.diagonal[n:], range(errors)] = 1.0
         self.placed: Array = task.constant(placed)
-        """Return the places of the errors' variances in the packed triangle."""
+        """Places of the coloured errors' variances in the packed triangle."""
         self.initial_covariance: Array = task.constant(
             pack(enlarge(numpy.diag(numpy.square(task.parameters.value("initial_sigmas")))))[:, None]
         )
@@ -82,7 +82,7 @@ class _KnownNoise:
         self.size: int = size
 
     def start_covariance(self, truth: Truth) -> Array:
-        """Return the packed covariance of the start: the gust starts at the level of the first part."""
+        """Return the packed initial covariance; the gust has the level of the episode's first part."""
         covariance = self.initial_covariance * (1.0 + self.gust * (truth.level**2 - 1.0))
         if self.size == self.n:
             return covariance
@@ -91,11 +91,11 @@ class _KnownNoise:
         return covariance + self.xp.matmul(self.placed, stationary)
 
     def decays(self, truth: Truth) -> Array:
-        """Return the decay of each coordinate in addition to F, ``(size, N)``."""
+        """Return the factor on each coordinate in a step beside F, ``(size, N)``: decay of gust and coloured errors."""
         return self.xp.concat([self.xp.ones_like(truth.state), truth.disturbances["coloured"].process.decay])
 
     def predict_covariance(self, covariance: Array, truth: Truth) -> Array:
-        """Return the packed covariance predicted with the disturbance of the interval before this measurement."""
+        """Return the packed covariance predicted to this measurement, with the true disturbance."""
         predicted = self.xp.matmul(self.propagator, covariance)
         noise = truth.level**2 * self.scaled + self.other
         if self.size > self.n:
@@ -107,7 +107,7 @@ class _KnownNoise:
     def update_covariance(
         self, mean: Array, covariance: Array, measurement: Measurement, truth: Truth
     ) -> packed_covariance.PackedUpdate:
-        """Update with the readings without their constant errors, with the noise of this measurement."""
+        """Return the update with the readings less their constant errors, with the true sensor noise."""
         return packed_covariance.update_coordinates(
             mean,
             covariance,
@@ -135,12 +135,12 @@ class Matched(_KnownNoise):
     )
 
     def start(self, initial: Start, truth: Truth) -> Initial:
-        """Start from the initial estimate, with the true covariance, packed."""
+        """Return the state at the initial estimate, with the true covariance, packed."""
         mean = self.xp.concat([initial.mean, 0.0 * truth.disturbances["bias"]])[: self.size]
         return Initial(mean, self.start_covariance(truth))
 
     def predict(self, measurement: Measurement, truth: Truth, memory: Initial) -> Initial:
-        """Apply equations (10), (12) with the true disturbance; the covariance is packed."""
+        """Return the state predicted by (10) and (12) with the true disturbance; the covariance is packed."""
         mean = self.xp.matmul(self.F, memory.mean) + self.B * measurement.control
         if self.size > self.n:
             mean = self.decays(truth) * mean
@@ -149,7 +149,7 @@ class Matched(_KnownNoise):
     def update(
         self, memory: Initial, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, Initial, Likelihood]:
-        """Apply equations (12), (11) with the noise of this measurement."""
+        """Update by (12), (11) with the true sensor noise; return mean, covariance, memory and likelihood."""
         n = self.n
         updated = self.update_covariance(*self.predict(measurement, truth, memory), measurement, truth)
         covariance = packed_covariance.unpack(updated.covariance, self.size)[:n, :n]
@@ -158,7 +158,7 @@ class Matched(_KnownNoise):
 
 
 class KnownNoiseBound(_KnownNoise):
-    """Covariance of the best estimator that is given plant and noise: the Riccati recursion.
+    """Covariance of the best estimator that knows plant and noise: the Riccati recursion.
 
     The problem is linear and Gaussian with a known control. So this is the posterior Cramer-Rao bound, it is attained,
     and it does not depend on the control: the filters of all policies have the same bound.
@@ -168,11 +168,11 @@ class KnownNoiseBound(_KnownNoise):
     knows: str = Matched.knows
 
     def start(self, initial: Start, truth: Truth) -> Array:
-        """Return the covariance of the state's own distribution at the start, packed."""
+        """Return the covariance of the true state's distribution at the start, packed, as memory."""
         return self.start_covariance(truth)
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
-        """Return the bound after this measurement."""
+        """Return the bound on the variances after this measurement, and the memory."""
         zero = self.xp.zeros_like(self.xp.concat([truth.state, truth.disturbances["bias"]])[: self.size])
         predicted = self.predict_covariance(memory, truth)
         after = self.update_covariance(zero, predicted, measurement, truth).covariance

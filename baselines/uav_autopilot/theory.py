@@ -1,4 +1,4 @@
-"""The settled loop of UavAutopilot without command, by the Lyapunov equation."""
+"""The steady-state loop of UavAutopilot without command, by the Lyapunov equation."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from ...filters import linear_systems
 
 
 class Stationary(NamedTuple):
-    """Second moments of a settled linear loop without command."""
+    """Second moments of a steady-state linear loop without command."""
 
     output_variance: float
     control_variance: float
@@ -18,7 +18,7 @@ class Stationary(NamedTuple):
 
 
 def stationary(task: UavAutopilot, name: str) -> Stationary | None:
-    """Solve the discrete Lyapunov equation of a policy's or reference's loop.
+    """Return cost and variances of a policy's or reference's steady-state loop, by the Lyapunov equation; or None.
 
     Returns:
         None where the loop is not linear with constant coefficients (levels that change, dropouts, actions

@@ -13,12 +13,12 @@ KINDS = {str: "TEXT", int: "INTEGER", float: "NUMBER", Path: "PATH"}
 
 
 def command_functions() -> dict[str, Callable[..., None]]:
-    """Return the functions of all commands, by their names."""
+    """Return the function of each command of ``filtergym``, by its name."""
     return {name: import_command(own) for commands in GROUPS.values() for name, own in commands.items()}
 
 
 def command_line_markdown() -> str:
-    """Return the ``--help`` of every command, as sections of a page."""
+    """Return the ``--help`` of every command in Markdown, as sections of a page."""
     program = application()
     lines = [*_options(_general_options(program), program.callback)]
     for name, function in command_functions().items():
@@ -32,7 +32,7 @@ def command_line_markdown() -> str:
 
 
 def _general_options(program: Any) -> list[Any]:
-    """Return the options before the command, without those of the shell's completion."""
+    """Return the program's own options, before the command, without those of the shell's completion."""
     return [parameter for parameter in program.params if parameter.name in ("version", "no_cache")]
 
 

@@ -11,7 +11,7 @@ import typer
 from front import draw_fronts, panels_of
 from notebooks import notebook_files, write_executed
 from playground import FILTERS, compile_filter, has_compiler, module_file
-from readme import with_numbers, with_printed
+from readme import insert_numbers, insert_outputs
 from records import (
     BENCHMARK,
     FOLDER,
@@ -19,12 +19,12 @@ from records import (
     ResultRecord,
     benchmark_data,
     markdown_tables,
+    merge_competitors,
     read_benchmark,
     read_record,
     recorded_environments,
+    strip_folders,
     today,
-    with_competitors,
-    without_place,
     write_record,
 )
 
@@ -58,7 +58,7 @@ from filtergym.reports.tables.results import read_results, settings_of
 PROGRAM = "python docs/make"
 
 
-Note = Annotated[str, typer.Option(help="What a reader must know before they use the numbers.")]
+Note = Annotated[str, typer.Option(help="Note on the use of the numbers.")]
 Folder = Annotated[Path, typer.Option("--into", help="Folder of the records.")]
 
 
@@ -87,11 +87,11 @@ def record(
             found.setdefault(result.environment, []).extend(result.records)
         for id, records in found.items():
             data = benchmark_data(problem_of(id), records)
-            made = ResultRecord(without_place(settings.command), today(), settings.versions, note, data)
+            made = ResultRecord(strip_folders(settings.command), today(), settings.versions, note, data)
             name = f"{BENCHMARK}/{bare_name(id)}"
             if add:
                 whole = read_record(name, into)
-                made = whole._replace(note=note or whole.note, data=with_competitors(whole.data, data, add))
+                made = whole._replace(note=note or whole.note, data=merge_competitors(whole.data, data, add))
             console.print(
                 f"{write_record(name, made, into)}: {len(data['scenarios'])} scenarios", soft_wrap=True
             )
@@ -111,7 +111,7 @@ def table(
     tables = markdown_tables(text.read_text(encoding="utf-8")) if text.is_file() else []
     if len(tables) != len(name):
         raise ValueError(
-            f"{text} holds {len(tables)} tables, and there are {len(name)} names: say --name for each"
+            f"{text} holds {len(tables)} tables, and there are {len(name)} names: give --name for each"
         )
     for own, data in zip(name, tables, strict=True):
         made = ResultRecord(command, today(), settings_of(command).versions, note, data)
@@ -125,7 +125,7 @@ def readme(
     ] = Path("docs/images/front.png"),
     columns: Columns = 2,
     printed: Annotated[
-        bool, typer.Option("--printed", help="Run the page's commands, and put in what they print.")
+        bool, typer.Option("--printed", help="Run the page's commands, and insert their output.")
     ] = False,
 ) -> None:
     """Put the numbers into README, which is not rendered, and draw its picture, both from the records.
@@ -134,14 +134,14 @@ def readme(
     """
     check_columns(columns)
     check_formats([picture.suffix.removeprefix(".").lower()])
-    text = with_numbers(page)
+    text = insert_numbers(page)
     panels = panels_of([read_benchmark(name)[0] for name in recorded_environments()])
     if not panels:
         raise ValueError("the records hold no times: make them by filtergym benchmark")
     save(draw_fronts(panels, columns=columns), picture)
     write_text(page, text)
     if printed:
-        write_text(page, with_printed(page))
+        write_text(page, insert_outputs(page))
 
 
 def notebooks(
@@ -182,7 +182,7 @@ def seeds(
     ] = None,
     add: Annotated[
         bool,
-        typer.Option(help="Keep the other algorithms of the record that there is, of the same episodes."),
+        typer.Option(help="Keep the other algorithms of the existing record, of the same episodes."),
     ] = False,
     note: Note = "",
     curves: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF file for the learning curves.")] = None,
@@ -227,7 +227,7 @@ def seeds(
         data = training_seeds.seeds_data(study, records)
         name = f"{SEEDS}/{bare_name(problem.id)}"
         if add:
-            data = training_seeds.with_runs(read_record(name, into).data, data)
+            data = training_seeds.merge_runs(read_record(name, into).data, data)
         made = ResultRecord(command, today(), settings_of(command).versions, note, data)
         write_record(name, made, into)
     store.clear()
@@ -241,7 +241,7 @@ def _algorithm(seed: training_seeds.SeedRun) -> str:
 
 def ship(
     runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
-    into: Annotated[Path, typer.Option(help="Folder of what is shipped.")] = Path("agents/pretrained"),
+    into: Annotated[Path, typer.Option(help="Folder of the shipped agents.")] = Path("agents/pretrained"),
     trust: Trust = False,
 ) -> None:
     """Export the run of lowest validation cost of every algorithm, in place of the shipped one.
@@ -282,5 +282,5 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 
 def main() -> None:
-    """Run a command; errors end as those of ``filtergym`` do."""
+    """Run the command line of ``docs/make``; errors end as those of ``filtergym`` do."""
     run(lambda: program_of({"Commands": COMMANDS}), PROGRAM)

@@ -16,33 +16,33 @@ from filtergym.reports.tables.ranking import HARM, best_competitor, ranking, ran
 from filtergym.reports.tables.terminal_tables import (
     HEADLINE,
     INCONSISTENT,
-    against_paper,
     consistency,
+    paper_cells,
     score_text,
     with_interval,
 )
 
 STRONGEST = 4
-"""Classical competitors that the page shows."""
+"""Number of classical competitors that the page shows."""
 
 
 class Comparison(NamedTuple):
-    """The shown results of one environment."""
+    """Tables and figure of one environment on the comparison page."""
 
     environment: str
     grids: list[Grid]
     figure: Any
 
 
-def compared_policies(measured: BenchmarkRecords) -> list[str]:
-    """Return the names on the page, among those in the records, in the order of its columns.
+def compared_policies(benchmark: BenchmarkRecords) -> list[str]:
+    """Return the names of the competitors that the comparison page shows, in the order of its columns.
 
     Learned agents; the cheapest of all others in the training distribution, of any control and kind; the paper's
     algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
     are in the records. A narrow screen shows only the first columns without scrolling.
     """
-    problem, records = measured
-    known, paper = problem.baselines, measured.paper
+    problem, records = benchmark
+    known, paper = problem.baselines, benchmark.paper
     of_default = [record for record in records if record.scenario == problem.task.default_scenario]
     agents = pretrained_agents(problem.id)
     ranked = [place.policy for place in ranking(of_default or records)]
@@ -56,27 +56,25 @@ def compared_policies(measured: BenchmarkRecords) -> list[str]:
 
 
 def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
-    """Return the records of one scenario over all times, by competitor, metric and component."""
+    """Return the records over whole episodes, by competitor, metric, component and window."""
     return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Return cost against the paper's algorithm, lost tracks, means, ANEES and time of a competitor in one scenario."""
+    """Return a competitor's cells: cost against the paper's, lost tracks, means, ANEES and time in one scenario."""
     values = _by_name(records)
     return [
         with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),
-        *against_paper(values, name),
+        *paper_cells(values, name),
         consistency(values.get((name, "anees", "state", "all"))),
         column_of_times(records).get(name, "-"),
     ]
 
 
-def summary(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Return a table of the best of every origin on the training distribution of each environment, and the
-    reference.
-    """
+def summary(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
+    """Return a table of the best competitor of every origin in each environment, and the reference."""
     rows = []
-    for problem, every in found:
+    for problem, every in benchmarks:
         reference, learned = problem.baselines.score_reference, pretrained_agents(problem.id)
         records = [record for record in every if record.scenario == problem.task.default_scenario]
         values, kinds = _by_name(records), {record.policy: record.kind for record in records}
@@ -110,10 +108,10 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
     return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
 
 
-def harm(found: Sequence[BenchmarkRecords]) -> Grid:
+def harm(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
     """Return a table of the scenario in which each learned agent is worst against the paper's algorithm."""
     rows = []
-    for problem, records in found:
+    for problem, records in benchmarks:
         for name in pretrained_agents(problem.id):
             own = [r for r in records if (r.policy, r.metric) == (name, HEADLINE) and r.value is not None]
             if not own:
@@ -134,12 +132,10 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
     return Grid("Where learned agents do worst", [*header, "means, %", "ANEES", TIME_TITLE, last], rows)
 
 
-def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Return a table of the competitors whose covariance does not fit the errors on the training distribution, of all
-    ranked but random actions.
-    """
+def covariances(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
+    """Return a table of the ranked competitors whose covariance does not fit their errors, without random actions."""
     rows = []
-    for measured in found:
+    for measured in benchmarks:
         records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
         values = _by_name(records)
         for place in ranking(records):
@@ -153,19 +149,19 @@ def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
     return Grid(title, ["environment", "name", "ANEES, mean", "ANEES, median episode"], rows)
 
 
-def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
+def compare_environment(benchmark: BenchmarkRecords, width: int = 2) -> Comparison:
     """Return the tables of one environment: cost against the paper's algorithm, and the physical error.
 
     Args:
-        measured: the environment and its records.
+        benchmark: the environment and its records.
         width: width of the figure, 1 or 2 columns of a paper.
 
     Raises:
         ValueError: if the paper's algorithm, or its opponents, are not among the records.
     """
-    problem, records = measured
+    problem, records = benchmark
     cls, known = problem.task, problem.baselines
-    paper, columns = measured.paper, compared_policies(measured)
+    paper, columns = benchmark.paper, compared_policies(benchmark)
     if paper not in columns:
         raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
     others = [name for name in columns if name != paper]
@@ -186,7 +182,10 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
     times = {s: column_of_times([record for record in records if record.scenario == s]) for s in sizes}
 
     def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
-        """Return the table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
+        """Return a table with a row for each scenario and the cell ``text(scenario, name)`` for each name.
+
+        With ``judged`` the first column is the verdict.
+        """
         heads = [f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in names]
         return Grid(
             title,
@@ -202,7 +201,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
         )
 
     def tail(scenario: str, name: str) -> str:
-        lost, means = against_paper(by_window, name, (scenario,))
+        lost, means = paper_cells(by_window, name, (scenario,))
         return "-" if means == "-" else f"{lost}<br>{means}"
 
     quantity = f"{metric} {component}".replace("_", " ").replace("rmse", "RMSE").strip()
@@ -230,7 +229,8 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             lambda scenario, name: consistency(found.get((scenario, name, "anees", "state"))),
         ),
         grid(
-            f"Nanoseconds a measurement on one core, with the simulated world; {PYTHON_MARK}: asked in Python; "
+            f"Nanoseconds a measurement on one core, without the simulated world; {PYTHON_MARK}: in Python, not "
+            "compiled; "
             f"{FRONT_MARK}: on the front, where no other competitor has a lower error cost in as much time",
             columns,
             lambda scenario, name: times[scenario].get(name, "-"),
@@ -261,30 +261,29 @@ def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
 
 
 def _two_lines(record: Record | None, scale: float) -> str:
-    """Return the value above its interval, so that columns stay narrow."""
+    """Return a record's value and interval as text of two lines, for a narrow column."""
     # Percentages to a hundredth: smaller values are rounding.
     negligible = 0.005 if scale == 100.0 else 0.0
     shown = with_interval(record, scale, negligible=negligible)
     return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
 
 
-def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
-    """Return the table over all environments, in Markdown: "best" of every origin, where agents do "harm", or
-    "covariances".
+def overview_markdown(benchmarks: Sequence[BenchmarkRecords], which: str) -> str:
+    """Return the overview table called "best", "harm" or "covariances", over all environments, in Markdown.
 
     Raises:
-        ValueError: for another word.
+        ValueError: for another name.
     """
     tables = {"best": summary, "harm": harm, "covariances": covariances}
     if which not in tables:
         raise ValueError(f"no table {which!r}: there are {', '.join(tables)}")
-    grid = tables[which](found)
+    grid = tables[which](benchmarks)
     return "\n".join([f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows)])
 
 
-def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
-    """Return the sentences and tables of one environment, with the command of the records."""
-    records, paper = measured.records, measured.paper
+def comparison_markdown(comparison: Comparison, benchmark: BenchmarkRecords, record: ResultRecord) -> str:
+    """Return the sentences and tables of one environment in Markdown, with the command of the records."""
+    records, paper = benchmark.records, benchmark.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})
     count = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"

@@ -2,7 +2,7 @@
 
 Texts are those of the code: the meaning of controls (:class:`.Actions`), the observation blocks, the docstrings under
 the fields of parameters and measurement, the scenarios' descriptions, the first lines of policies' docstrings
-and what references know.
+and the knowledge of references.
 """
 
 import inspect
@@ -21,11 +21,11 @@ from filtergym.envs.engine.catalogue import catalogue, nearest
 from filtergym.papers.grid import markdown_table
 
 PARTS_SHOWN = 4
-"""Fields of one block that are named one by one; of more their endings are named."""
+"""Largest number of fields of a block that are named one by one; of more, the endings are named."""
 
 
 def field_documentation(cls: type) -> dict[str, str]:
-    """Return the docstrings under the fields of a NamedTuple or dataclass, in one line each, inherited ones first."""
+    """Return the docstring of each field of a NamedTuple or dataclass, in one line, by name, inherited ones first."""
     texts = (item for base in reversed(cls.__mro__) for item in field_texts(base).items())
     return {name: text.replace("``", "`") for name, text in texts}
 
@@ -93,7 +93,7 @@ def _fields(cls: type[Task]) -> list[str]:
 
 def _measurement(cls: type[Task]) -> list[str]:
     rows = [(f"`{name}`", text) for name, text in field_documentation(measurement_class(cls)).items()]
-    return markdown_table(("field", "what it is"), rows)
+    return markdown_table(("field", "meaning"), rows)
 
 
 def _limits(limits: ParameterLimits) -> str:
@@ -159,7 +159,7 @@ TABLES = {
     "parameters": _parameters,
     "scenarios": _scenarios,
 }
-"""Tables of the task, by their names; the table of the policies is beside them."""
+"""Functions that make a task's tables in Markdown, by the tables' names."""
 
 
 def causes_table() -> str:
@@ -173,7 +173,7 @@ def causes_table() -> str:
 
 
 def environment_table(problem: Problem, name: str) -> str:
-    """Return one table of an environment in Markdown.
+    """Return the table of an environment called ``name`` (actions, fields, ...), in Markdown.
 
     Raises:
         ValueError: if there is no table of that name.

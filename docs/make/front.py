@@ -19,10 +19,10 @@ BUDGETS = (100, 300, 1000, 5000)
 """Time limits of a measurement, ns."""
 
 
-def panels_of(found: Sequence[BenchmarkRecords]) -> list[FrontPanel]:
-    """Return the panel of each environment with times in the records, in its training distribution."""
+def panels_of(benchmarks: Sequence[BenchmarkRecords]) -> list[FrontPanel]:
+    """Return the picture's panel of each environment whose records contain times, in its training distribution."""
     panels = []
-    for measured in found:
+    for measured in benchmarks:
         problem, records = measured
         own = [r for r in records if r.scenario == problem.task.default_scenario]
         if points := points_of_records(own):
@@ -38,7 +38,7 @@ def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
     """Draw the fronts of several environments in one picture, with its legend in the empty place.
 
     Args:
-        panels: at least one.
+        panels: one or several panels.
         columns: width of the picture in columns of a paper.
     """
     figure, axes = figure_with_pairs(len(panels) // 2 + 1, columns)
@@ -52,14 +52,14 @@ def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
     return figure
 
 
-def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
-    """Return the competitor of lowest error cost within each time, classical and learned, in Markdown.
+def budgets_markdown(benchmarks: Sequence[BenchmarkRecords]) -> str:
+    """Return a table in Markdown: the classical and the learned competitor of lowest error cost within each time.
 
     A learned one is bold where its whole interval lies below that of the classical one, and a classical one in the
     opposite case.
     """
     rows = []
-    for problem, records in found:
+    for problem, records in benchmarks:
         own = [r for r in records if r.scenario == problem.task.default_scenario]
         times, learned = times_of_records(own), pretrained_agents(problem.id)
         costs = [r for r in own if r.metric == HEADLINE and r.kind in RANKED and r.value is not None]

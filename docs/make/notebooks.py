@@ -12,13 +12,13 @@ from typing import Any
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 KEPT = ("text/html", "text/plain", "image/png")
-"""Committed forms of an output."""
+"""Media types of a cell's output that are committed."""
 SECONDS = 600
 """Time limit of a cell, s."""
 
 
 def notebook_files() -> list[Path]:
-    """Return the notebooks."""
+    """Return the paths of the documentation's notebooks."""
     return sorted(FOLDER.glob("*.ipynb"))
 
 

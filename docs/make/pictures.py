@@ -155,7 +155,7 @@ def draw_differences(
 
 
 PUBLIC_FILTERS = ("extended", "extended, tuned", "kalman-imm, tuned", "OKF", "kalman-net", "known-model")
-"""Filters on KalmanNet's problems: as written, tuned rivals, the learned one, and the reference."""
+"""Filters drawn on KalmanNet's problems: the model's own, tuned rivals, the learned one, and the reference."""
 LEARNED = "kalman-net", "KalmanNet"
 
 

@@ -65,7 +65,7 @@ EXPORT("update") int update(void) {{
     return became;
 }}
 """
-"""What a page calls: one track, whose structures it writes and reads as rows of doubles."""
+"""C functions that a page calls for one track; it writes and reads the structs as rows of doubles."""
 FLAGS = (
     *("-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c99", "-Oz", "-s"),
     *("-Wl,--no-entry", "-Wl,-z,stack-size=65536"),
@@ -78,7 +78,7 @@ def has_compiler() -> bool:
 
 
 def compile_filter(name: str) -> bytes:
-    """Export a filter as C, and compile it.
+    """Export a filter as C, compile it to WebAssembly, and return the module's bytes.
 
     Raises:
         subprocess.CalledProcessError: if the compiler fails.
@@ -99,7 +99,7 @@ def compile_filter(name: str) -> bytes:
 
 
 def page_script(modules: dict[str, bytes]) -> str:
-    """Return the script of the filters: their names, their weights, and WebAssembly in base 64."""
+    """Return the JavaScript text with the filters' names, weights, and WebAssembly modules in base64."""
     filters = {
         name: {"weights": list(FILTERS[name]), "module": base64.b64encode(module).decode("ascii")}
         for name, module in modules.items()
@@ -108,12 +108,12 @@ def page_script(modules: dict[str, bytes]) -> str:
 
 
 def module_file(name: str) -> Path:
-    """Return the path of a filter's committed module."""
+    """Return the path of a filter's committed WebAssembly module."""
     return FOLDER / f"{name}.wasm"
 
 
 def read_modules() -> dict[str, bytes]:
-    """Return the filters compiled anew, or the committed ones where no compiler is installed."""
+    """Return each filter's WebAssembly module by name, compiled anew or, without a compiler, the committed one."""
     if has_compiler():
         return {name: compile_filter(name) for name in FILTERS}
     return {name: module_file(name).read_bytes() for name in FILTERS}

@@ -19,8 +19,8 @@ from sentence_numbers import number_text
 NUMBER = re.compile(r"(<!-- (value|number): (\S+(?: \S+)*?) -->).*?(<!-- end -->)", re.S)
 
 
-def with_numbers(page: Path) -> str:
-    """Return the text of a page with every number as in its record.
+def insert_numbers(page: Path) -> str:
+    """Return the text of a page with every number replaced by that of its record.
 
     Raises:
         ValueError: if there is no such page, it contains no number of a record, a number begins a line, or a path leads
@@ -40,14 +40,14 @@ def with_numbers(page: Path) -> str:
 PRINTED = re.compile(
     r"(```sh\n(filtergym [^\n]+)\n```\n\n<!-- printed: begin -->\n)(.*?)(<!-- printed: end -->)", re.S
 )
-"""A command of one line, and its output."""
+"""Pattern of a command of one line, and its output."""
 MODULE = re.compile(r"In `(\w+\.py)`:\n\n```python\n(.*?)```", re.S)
-"""A file that the page asks readers to write."""
+"""Pattern of a file that the page contains for readers to write."""
 WIDTH = 100
 
 
-def with_printed(page: Path) -> str:
-    """Return the text of a page with the output of its commands, run beside the files of the page.
+def insert_outputs(page: Path) -> str:
+    """Return the text of a page with the output of its commands replaced, run in a folder with its files.
 
     Raises:
         ValueError: if it has no such command, or one fails.

@@ -47,27 +47,27 @@ def _words(text: str) -> list[str]:
 
 
 class _Rendered(SphinxDirective):
-    """A directive that renders Markdown from :meth:`markdown`, and the picture of :meth:`figure`, if any."""
+    """Base of directives that render the Markdown of :meth:`markdown` and the picture of :meth:`figure`."""
 
     required_arguments = 0
     optional_arguments = 1
     final_argument_whitespace = True
 
     @property
-    def name_given(self) -> str:
-        """The argument, or empty."""
+    def argument_text(self) -> str:
+        """Argument of the directive; empty without one."""
         return self.arguments[0].strip() if self.arguments else ""
 
     def markdown(self) -> str:
-        """Return the Markdown."""
+        """Return the directive's text in Markdown; empty by default."""
         return ""
 
     def figure(self) -> tuple[str, str, Any] | None:
-        """Return a name, an alternative text, and the figure."""
+        """Return a file name, an alternative text, and the Matplotlib figure; None: no figure."""
         return None
 
     def run(self) -> list[nodes.Node]:
-        """Render; report a mistake at its place on the page."""
+        """Return the rendered nodes; report a mistake at its place on the page."""
         try:
             text, drawn = self.markdown(), self.figure()
         except ValueError as error:
@@ -83,12 +83,12 @@ class _Rendered(SphinxDirective):
     with_headings: ClassVar[bool] = False
 
     def benchmark(self, name: str) -> tuple[BenchmarkRecords, ResultRecord]:
-        """Read the record of a benchmark, on which the page depends from now on."""
+        """Return the record of a benchmark, and register it as a dependency of the page."""
         self.env.note_dependency(record_file(f"{BENCHMARK}/{name}"))
         return read_benchmark(name)
 
     def record(self, name: str) -> ResultRecord:
-        """Read a record, on which the page depends from now on."""
+        """Return a record, and register it as a dependency of the page."""
         self.env.note_dependency(record_file(name))
         return read_record(name)
 
@@ -110,8 +110,8 @@ class ResultsTable(_Rendered):
     }
 
     def markdown(self) -> str:
-        """Return one table."""
-        names = self.name_given.split() or recorded_environments()
+        """Return the directive's table in Markdown."""
+        names = self.argument_text.split() or recorded_environments()
         scenario = self.options.get("scenario", "")
         policies, columns = (
             _words(self.options[key]) if key in self.options else () for key in ("policies", "columns")
@@ -125,44 +125,44 @@ class ComparisonTables(_Rendered):
     """``{comparison} ENVIRONMENT``: every scenario, in sentences, tables and a figure."""
 
     def markdown(self) -> str:
-        """Return sentences and tables."""
-        measured, record = self.benchmark(self.name_given)
+        """Return sentences and tables in Markdown."""
+        measured, record = self.benchmark(self.argument_text)
         self.compared = comparison.compare_environment(measured)
         return comparison.comparison_markdown(self.compared, measured, record)
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the cost in every scenario."""
-        words = f"Cost against the paper's algorithm in every scenario, {self.name_given}"
-        return f"comparison_{self.name_given}", words, self.compared.figure
+        """Return the figure of cost in every scenario, with name and alternative text."""
+        words = f"Cost against the paper's algorithm in every scenario, {self.argument_text}"
+        return f"comparison_{self.argument_text}", words, self.compared.figure
 
 
 class ComparisonOverview(_Rendered):
     """``{comparison-overview} best`` or ``harm``: over all environments."""
 
     def markdown(self) -> str:
-        """Return one table."""
+        """Return the directive's table in Markdown."""
         found = [self.benchmark(name)[0] for name in recorded_environments()]
-        return comparison.overview_markdown(found, self.name_given)
+        return comparison.overview_markdown(found, self.argument_text)
 
 
 class FrontFigure(_Rendered):
     """``{front-figure} ENVIRONMENT ...``: accuracy against time; default: all environments."""
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the fronts."""
-        names = self.name_given.split() or recorded_environments()
+        """Return the figure of the fronts, with name and alternative text."""
+        names = self.argument_text.split() or recorded_environments()
         panels = panels_of([self.benchmark(name)[0] for name in names])
         if not panels:
             raise ValueError(f"the records of {', '.join(names)} hold no times")
         words = f"Cost against processor time of every competitor: {', '.join(names)}"
-        return "_".join(["front", *self.name_given.split()]), words, draw_fronts(panels)
+        return "_".join(["front", *self.argument_text.split()]), words, draw_fronts(panels)
 
 
 class PublicFigure(_Rendered):
     """``{public-figure}``: KalmanNet's problems, with rivals that are tuned."""
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return all problems in one picture."""
+        """Return the figure of all problems, with name and alternative text."""
         figures = {name: self.record(f"public_{name}").data for name in ("problems", "optimised", "drives")}
         rows = [row for name in ("problems", "optimised") for row in figures[name]["figures"]["rows"]]
         drives = {
@@ -180,7 +180,7 @@ class UpdateTimes(_Rendered):
     """``{update-times}``: the time of an update of running filters, beside those of other libraries."""
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the bars."""
+        """Return the figure of bars, with name and alternative text."""
         rows = self.record("online_time").data["rows"]
         return "update_times", "Bars: median time of an update of each filter", draw_update_times(rows)
 
@@ -189,7 +189,7 @@ class BudgetsTable(_Rendered):
     """``{budgets-table}``: the lowest error cost within a time, of classical and learned competitors, everywhere."""
 
     def markdown(self) -> str:
-        """Return one table."""
+        """Return the directive's table in Markdown."""
         return budgets_markdown([self.benchmark(name)[0] for name in recorded_environments()])
 
 
@@ -197,24 +197,24 @@ class SeedsTables(_Rendered):
     """``{seeds} ENVIRONMENT``: every training run, and the spread of each algorithm; without a name, all means."""
 
     def markdown(self) -> str:
-        """Return the tables."""
-        if not self.name_given:
+        """Return the tables in Markdown."""
+        if not self.argument_text:
             return seeds_overview([self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)])
-        environment_id(self.name_given)
-        return seeds_markdown(self.record(f"{SEEDS}/{self.name_given}"))
+        environment_id(self.argument_text)
+        return seeds_markdown(self.record(f"{SEEDS}/{self.argument_text}"))
 
 
 class SeedProfiles(_Rendered):
     """``{seed-profiles} ALGORITHM ...``: interquartile means and performance profiles; default: all algorithms."""
 
     def markdown(self) -> str:
-        """Return one table."""
+        """Return the directive's table in Markdown."""
         records = [self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)]
-        self.scores = recorded_scores(records, self.name_given.split())
+        self.scores = recorded_scores(records, self.argument_text.split())
         return interquartile_table(self.scores)
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return the profiles."""
+        """Return the figure of the profiles, with name and alternative text."""
         words = f"Share of training runs above each score: {', '.join(self.scores)}"
         return "_".join(["profiles", *self.scores]), words, profile_figure(self.scores)
 
@@ -224,24 +224,24 @@ class TrainingCurves(_Rendered):
 
     @property
     def data(self) -> dict[str, Any]:
-        """Data of the record, without runs that have no curve."""
-        environment_id(self.name_given)
-        data = self.record(f"{SEEDS}/{self.name_given}").data
+        """Data of the record of training seeds, without runs that have no curve."""
+        environment_id(self.argument_text)
+        data = self.record(f"{SEEDS}/{self.argument_text}").data
         return {**data, "runs": [run for run in data["runs"] if run[0] in data.get("curves", {})]}
 
     def markdown(self) -> str:
-        """Return a sentence on the runs without a curve."""
+        """Return a sentence on the runs without a curve; empty without such runs."""
         shown = {run[1] for run in self.data["runs"]}
-        every = dict.fromkeys(run[1] for run in self.record(f"{SEEDS}/{self.name_given}").data["runs"])
+        every = dict.fromkeys(run[1] for run in self.record(f"{SEEDS}/{self.argument_text}").data["runs"])
         missing = ", ".join(f"`{name}`" for name in every if name not in shown)
         return f"Curves of {missing} were not kept." if missing else ""
 
     def figure(self) -> tuple[str, str, Any] | None:
-        """Return the curves of the record."""
+        """Return the figure of the record's curves, with name and alternative text; None without curves."""
         if not self.data["runs"]:
             return None
-        words = f"Validation cost over training, median and range over training seeds, {self.name_given}"
-        return f"training_{self.name_given}", words, learning_curves(self.data)
+        words = f"Validation cost over training, median and range over training seeds, {self.argument_text}"
+        return f"training_{self.argument_text}", words, learning_curves(self.data)
 
 
 class RecordTable(_Rendered):
@@ -250,8 +250,8 @@ class RecordTable(_Rendered):
     option_spec: ClassVar[Any] = {"columns": directives.unchanged, "bare": directives.flag}
 
     def markdown(self) -> str:
-        """Return the table, and unless it is bare its origin."""
-        record = self.record(self.name_given)
+        """Return the table in Markdown, with a sentence on its origin unless the option ``bare`` is set."""
+        record = self.record(self.argument_text)
         titles, rows = record.data["columns"], record.data["rows"]
         if "columns" in self.options:
             places = [titles.index(title) for title in _words(self.options["columns"])]
@@ -268,12 +268,12 @@ class EnvironmentTable(_Rendered):
     option_spec: ClassVar[Any] = {"environment": directives.unchanged_required}
 
     def markdown(self) -> str:
-        """Return the table."""
-        if self.name_given == "causes":
+        """Return the table in Markdown."""
+        if self.argument_text == "causes":
             return causes_table()
         if "environment" not in self.options:
             raise ValueError("the option environment is missing, such as `:environment: ManeuveringTarget`")
-        return environment_table(problem_of(environment_id(self.options["environment"])), self.name_given)
+        return environment_table(problem_of(environment_id(self.options["environment"])), self.argument_text)
 
 
 class CommandLine(_Rendered):
@@ -282,7 +282,7 @@ class CommandLine(_Rendered):
     with_headings: ClassVar[bool] = True
 
     def markdown(self) -> str:
-        """Return the ``--help`` of all commands."""
+        """Return the ``--help`` of all commands in Markdown."""
         return command_line_markdown()
 
 
@@ -293,7 +293,7 @@ class NumberRole(SphinxRole):
         self.interval = interval
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-        """Render one number."""
+        """Return the node of a number, or of an error message."""
         return _in_sentence(
             self, lambda: [nodes.Text(number_text(self.text, self.interval))], record_of(self.text)
         )
@@ -303,7 +303,7 @@ class RecordRole(SphinxRole):
     """``{record}`NAME```: the record of a section's numbers, as a link."""
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-        """Render a link with the command of the record."""
+        """Return the node of a link to the record, with its command."""
         return _in_sentence(self, self._link, self.text)
 
     def _link(self) -> Sequence[nodes.Node]:
@@ -323,7 +323,7 @@ class Playground(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Return the playground's element, scripts and colours."""
+        """Return a node with the playground's element, scripts and colours."""
         page = Path(self.env.doc2path(self.env.docname)).parent
         static = os.path.relpath(Path(self.env.srcdir) / "_static", page)
         picture = nodes.image(uri=self.arguments[0], alt="Tracks of four filters, their errors and weights")
@@ -374,7 +374,7 @@ def _write_playground(app: Any) -> None:
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Register all of them."""
+    """Register all directives and roles of this module with Sphinx."""
     for name, directive in DIRECTIVES.items():
         app.add_directive(name, directive)
     app.add_role("number", NumberRole(interval=True))

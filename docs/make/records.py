@@ -44,7 +44,7 @@ DIGITS = 6
 
 
 class ResultRecord(NamedTuple):
-    """One file."""
+    """Content of a record's file."""
 
     command: str
     """Command that makes the data again."""
@@ -53,12 +53,12 @@ class ResultRecord(NamedTuple):
     versions: dict[str, str]
     """Versions of Python and the libraries."""
     note: str
-    """Note that readers need before they use it; empty: none."""
+    """Note on the use of the data; empty: none."""
     data: dict[str, Any]
 
     @property
     def origin(self) -> str:
-        """Sentences below a table on its origin, in Markdown."""
+        """Sentences on the origin of the data, in Markdown, for the place below a table."""
         note = f" **{self.note}**" if self.note else ""
         return f"Made by `{self.command}` on {self.made}.{note}"
 
@@ -76,7 +76,7 @@ class BenchmarkRecords(NamedTuple):
 
 
 def environment_id(name: str) -> str:
-    """Return the id of an environment with a short name.
+    """Return the Gymnasium id of an environment with a short name, such as ``ManeuveringTarget``.
 
     Raises:
         ValueError: if there is none.
@@ -88,7 +88,7 @@ def environment_id(name: str) -> str:
 
 
 def record_file(name: str, folder: Path = FOLDER) -> Path:
-    """Return the file of a record.
+    """Return the path of a record's file.
 
     Raises:
         ValueError: if there is no such name of a record, such as ``benchmark/ManeuveringTarget`` or ``plain_ppo``.
@@ -99,7 +99,7 @@ def record_file(name: str, folder: Path = FOLDER) -> Path:
 
 
 def write_record(name: str, record: ResultRecord, folder: Path = FOLDER) -> Path:
-    """Write a record, a line for each of its entries, and return its file."""
+    """Write a record as JSON, a line for each entry, and return the path of its file."""
     path = record_file(name, folder)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, _lines(record._asdict()) + "\n")
@@ -107,7 +107,7 @@ def write_record(name: str, record: ResultRecord, folder: Path = FOLDER) -> Path
 
 
 def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
-    """Read a record.
+    """Return a record, read from its file.
 
     Raises:
         ValueError: if there is none of that name, or the file has other content.
@@ -121,23 +121,23 @@ def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
     return ResultRecord(**values)
 
 
-def without_place(command: str) -> str:
+def strip_folders(command: str) -> str:
     """Return a command without folders and number of processes, which do not affect its results."""
     return re.sub(r" --(out|jobs|threads|cluster)[ =]\S+", "", command)
 
 
 def today() -> str:
-    """Return the day, ISO 8601."""
+    """Return today's date, ISO 8601."""
     return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
 
 
 def round_number(value: float | None) -> float | None:
-    """Return a number in the stored digits."""
+    """Return a number rounded to ``DIGITS`` significant digits; None stays None."""
     return None if value is None else float(f"{value:.{DIGITS}g}")
 
 
 def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
-    """Return JSON in lines, with a line for each flat or deeply nested entry."""
+    """Return a value as JSON text, with a line for each flat or deeply nested entry."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     if depth == 0 or not any(isinstance(each, (dict, list)) for each in inside):
         return json.dumps(value, ensure_ascii=False)
@@ -152,7 +152,7 @@ def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
 
 
 def benchmark_data(problem: Problem, records: Sequence[Record]) -> dict[str, Any]:
-    """Return the shown results of a benchmark in one environment: over whole episodes, by scenario and competitor.
+    """Return a record's data from a benchmark of one environment: results by scenario and competitor.
 
     Raises:
         ValueError: if scenarios are unknown, or the records are of several experiments.
@@ -183,7 +183,7 @@ def benchmark_data(problem: Problem, records: Sequence[Record]) -> dict[str, Any
     return {"environment": problem.id, "split": split, "seed": seed, "units": units, "scenarios": scenarios}
 
 
-def with_competitors(
+def merge_competitors(
     data: Mapping[str, Any], added: Mapping[str, Any], names: Collection[str]
 ) -> dict[str, Any]:
     """Return a benchmark's data with the rows of competitors that were measured later, over the same episodes.
@@ -270,14 +270,14 @@ def benchmark_records(data: Mapping[str, Any]) -> BenchmarkRecords:
 
 
 def read_benchmark(name: str, folder: Path = FOLDER) -> tuple[BenchmarkRecords, ResultRecord]:
-    """Read the record of an environment's benchmark, by the short name of the environment."""
+    """Return the tidy records and the record of an environment's benchmark, by the environment's short name."""
     environment_id(name)
     record = read_record(f"{BENCHMARK}/{name}", folder)
     return benchmark_records(record.data), record
 
 
 def recorded_environments(kind: str = BENCHMARK, folder: Path = FOLDER) -> list[str]:
-    """Return the short names of all environments with a record of that kind, in the catalogue's order."""
+    """Return the short names of all environments that have a record of a kind, in the catalogue's order."""
     names = map(bare_name, catalogue())
     return [name for name in names if record_file(f"{kind}/{name}", folder).is_file()]
 
@@ -286,7 +286,7 @@ def recorded_environments(kind: str = BENCHMARK, folder: Path = FOLDER) -> list[
 
 
 def markdown_tables(text: str) -> list[dict[str, Any]]:
-    """Return every Markdown table of a text as data: its columns and rows."""
+    """Return columns and rows of every Markdown table in a text."""
     blocks: list[list[list[str]]] = []
     before = ""
     for line in text.splitlines():
@@ -299,13 +299,13 @@ def markdown_tables(text: str) -> list[dict[str, Any]]:
 
 
 def table_cell(data: Mapping[str, Any], row: str, column: str) -> str:
-    """Return a cell of a table of text.
+    """Return the text of a cell of a record's table.
 
     Args:
         data: data of the record.
-        row: its first cell without marks of code, or first and second cell with a space between; an empty first cell
-            is that of the row above.
-        column: its title, or a beginning of it that no other column has.
+        row: first cell of the row without marks of code, or first and second cell with a space between; an empty first
+            cell equals that of the row above.
+        column: title of the column, or a beginning of it that no other column has.
 
     Raises:
         ValueError: if there is no such cell, or several.

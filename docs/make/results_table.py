@@ -13,9 +13,9 @@ from filtergym.reports.tables.terminal_tables import (
     COST_NOTE,
     HEADLINE,
     INCONSISTENT,
-    against_paper,
     consistency,
     main_components,
+    paper_cells,
     rank_competitors,
     score_text,
     with_interval,
@@ -26,28 +26,28 @@ COLUMNS = ("difference", "lost", "means", "ns", "control", "cost", "rmse", "anee
 
 
 def scenario_records(
-    found: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
+    benchmark: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
 ) -> list[Record]:
-    """Return the results of a benchmark in one scenario, of all but random actions.
+    """Return the records of a benchmark in one scenario, without random actions.
 
     Args:
-        found: results in an environment.
-        scenario: default: the training distribution.
+        benchmark: results in an environment.
+        scenario: name of the scenario; default: the training distribution.
         policies: names of competitors. Default: all.
 
     Raises:
         ValueError: if there are no results.
     """
-    scenario = scenario or found.problem.task.default_scenario
+    scenario = scenario or benchmark.problem.task.default_scenario
     records = [
         record
-        for record in found.records
+        for record in benchmark.records
         if record.scenario == scenario
         and (record.policy in policies if policies else record.policy != "random")
     ]
     if not records:
         raise ValueError(
-            f"no records of {found.problem.id} in scenario {scenario!r}"
+            f"no records of {benchmark.problem.id} in scenario {scenario!r}"
             + (f" of {', '.join(policies)}" if policies else "")
             + ": make them by filtergym benchmark --full"
         )
@@ -57,10 +57,10 @@ def scenario_records(
 def results_grid(
     records: Sequence[Record], paper: str, columns: Sequence[str] = COLUMNS
 ) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of the table of one environment.
+    """Return header and rows of the table of results in one environment and scenario, lowest cost first.
 
     Args:
-        records: of one scenario.
+        records: records of one scenario.
         paper: name of the paper's algorithm.
         columns: some of :data:`COLUMNS`.
     """
@@ -77,8 +77,8 @@ def results_grid(
                 found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
             )
         },
-        "lost": {"lost tracks, %": lambda name: against_paper(found, name)[0]},
-        "means": {"means, %": lambda name: against_paper(found, name)[1]},
+        "lost": {"lost tracks, %": lambda name: paper_cells(found, name)[0]},
+        "means": {"means, %": lambda name: paper_cells(found, name)[1]},
         "ns": {TIME_TITLE: lambda name: times.get(name, "-")},
         "control": {"control": lambda name: controls[name]},
         "cost": {"mean cost": number("cost")},
@@ -95,11 +95,9 @@ def results_grid(
     return ["policy", *(title for title, _ in shown)], rows
 
 
-def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
-    """Return the whole table of one environment and scenario, the best competitor, and the meaning of the columns, in
-    Markdown.
-    """
-    records, paper = scenario_records(found, scenario), found.paper
+def results_markdown(benchmark: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
+    """Return the table of results in Markdown, with sentences on the best competitor and on the columns."""
+    records, paper = scenario_records(benchmark, scenario), benchmark.paper
     note = (
         f"{ranking_sentence(records, paper)} Lowest cost first. {COST_NOTE} ANEES is the mean NEES over the dimension; "
         f"{INCONSISTENT} marks a covariance that is off by more than a factor of two. {TIME_NOTE}\n\n{_where(records)} "
@@ -109,16 +107,16 @@ def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: st
 
 
 def chosen_markdown(
-    found: Mapping[str, tuple[BenchmarkRecords, ResultRecord]],
+    benchmarks: Mapping[str, tuple[BenchmarkRecords, ResultRecord]],
     scenario: str = "",
     policies: Sequence[str] = (),
     columns: Sequence[str] = (),
 ) -> str:
-    """Return one table of several environments, or of some competitors or columns, in Markdown.
+    """Return one table of results in Markdown over several environments, or with some competitors or columns.
 
     Args:
-        found: records of the environments by their short names.
-        scenario: default: the training distribution of each.
+        benchmarks: records of the environments by their short names.
+        scenario: name of the scenario; default: the training distribution of each.
         policies: names of competitors. Default: all.
         columns: some of :data:`COLUMNS`. Default: those whose titles are the same in every environment.
 
@@ -128,27 +126,28 @@ def chosen_markdown(
     columns = columns or ("difference", "lost", "means", "ns", "anees", "score")
     if wrong := [column for column in columns if column not in COLUMNS]:
         raise ValueError(f"no column {wrong[0]!r}: there are {', '.join(COLUMNS)}")
-    if "rmse" in columns and len(found) > 1:
+    if "rmse" in columns and len(benchmarks) > 1:
         raise ValueError(
             "the errors of several environments are of different quantities: leave out the column rmse"
         )
     header: list[str] = []
     rows, notes = [], []
-    for name, (own, record) in found.items():
+    for name, (own, record) in benchmarks.items():
         records = scenario_records(own, scenario, policies)
         # With everybody's records, so that the front and the best are those of the whole table.
         titles, lines = results_grid(scenario_records(own, scenario), own.paper, columns)
         wanted = {f"`{record.policy}`" for record in records}
         header = [
-            title if len(found) == 1 else title.replace(f"`{own.paper}`", "the paper's") for title in titles
+            title if len(benchmarks) == 1 else title.replace(f"`{own.paper}`", "the paper's")
+            for title in titles
         ]
-        first = [name] if len(found) > 1 else []
+        first = [name] if len(benchmarks) > 1 else []
         rows += [[*first, *line] for line in lines if line[0] in wanted]
         notes.append(
-            f"{_where(records)} {record.origin}" if len(found) == 1 else f"{name} {records[0].episodes}"
+            f"{_where(records)} {record.origin}" if len(benchmarks) == 1 else f"{name} {records[0].episodes}"
         )
-    table = markdown_table([*(["environment"] if len(found) > 1 else []), *header], rows)
-    if len(found) > 1:
+    table = markdown_table([*(["environment"] if len(benchmarks) > 1 else []), *header], rows)
+    if len(benchmarks) > 1:
         notes = [
             f"Episodes: {', '.join(notes)}; with 95 % bootstrap intervals, from the records of the benchmark."
         ]

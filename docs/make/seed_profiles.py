@@ -37,7 +37,7 @@ Scores = Mapping[str, Mapping[str, numpy.ndarray]]
 
 
 def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] = ()) -> Scores:
-    """Return the scores of all runs in the environments in which every algorithm has runs.
+    """Return the scores of all training runs, by algorithm and environment, where every algorithm has runs.
 
     Agents are not distinguished by a gate or by a policy that they correct.
 
@@ -71,8 +71,7 @@ def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] =
 
 
 def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndarray:
-    """Return the weights of runs (1), and those of every resample within environments, ``(1 + resamples, sum of
-    counts)``.
+    """Return the weights of runs (1), then of each bootstrap resample, ``(1 + resamples, sum of counts)``.
 
     Args:
         counts: runs of each environment.
@@ -83,7 +82,7 @@ def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndar
 
 
 def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean of the middle half of weighted scores (2), ``(n,)``.
+    """Return the interquartile mean (2) of scores under each row of weights, ``(n,)``.
 
     Args:
         scores: ``(runs,)``.
@@ -99,15 +98,13 @@ def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.n
 def performance_profile(
     scores: numpy.ndarray, weights: numpy.ndarray, limits: numpy.ndarray
 ) -> numpy.ndarray:
-    """Return the share of runs with a score above each limit (2), ``(n, limits)``; arguments as of
-    :func:`interquartile_mean`.
-    """
+    """Return the weighted share of runs with a score above each limit (2), ``(n, limits)``."""
     found: numpy.ndarray = weights @ (scores[:, None] > limits)
     return found
 
 
 def interquartile_table(scores: Scores) -> str:
-    """Return the interquartile mean of every algorithm with its interval, and over which environments, in Markdown."""
+    """Return a table in Markdown: interquartile mean of every algorithm with interval, over its environments."""
     rows = []
     for name, own in scores.items():
         weights = run_weights([len(values) for values in own.values()])
@@ -120,7 +117,7 @@ def interquartile_table(scores: Scores) -> str:
 
 
 def profile_figure(scores: Scores) -> Any:
-    """Return the performance profile of every algorithm."""
+    """Return a figure with the performance profile of every algorithm."""
     everything = numpy.concatenate([_pooled(own) for own in scores.values()])
     limits = numpy.linspace(min(0.0, everything.min()), max(1.0, everything.max()), 401)
     profiles = {}

@@ -17,7 +17,7 @@ from filtergym.reports.tables.terminal_tables import with_interval
 
 
 class Number(NamedTuple):
-    """A value with its interval."""
+    """A number of a record, with its interval and unit."""
 
     value: float | None
     low: float | None
@@ -33,11 +33,11 @@ QUANTITIES = {
     "anees": ("anees state", 1.0, ""),
     "score": ("score", 1.0, ""),
 }
-"""Key in the record, scale and unit, by the word in a path; beside them ``ns`` and ``rmse COMPONENT``."""
+"""Key in the record, scale and unit of each quantity, by its word in a path."""
 
 
 def record_of(path: str) -> str:
-    """Return the name of the record of a path."""
+    """Return the name of the record that contains the number of a path."""
     first, _, rest = path.partition("/")
     if first == SEEDS:
         return f"{SEEDS}/{rest.partition('/')[0]}"
@@ -45,7 +45,7 @@ def record_of(path: str) -> str:
 
 
 def number_text(path: str, interval: bool = True, folder: Path = FOLDER) -> str:
-    """Return a number in words of a sentence: ``-43.6 % [-45.0, -42.1]``.
+    """Return the number of a path as text for a sentence: ``-43.6 % [-45.0, -42.1]``.
 
     Args:
         path: path of the number.
@@ -73,7 +73,7 @@ def _of_benchmark(data: Any, path: str, interval: bool) -> str:
             [(value, compiled)] = [
                 (m[0], k.endswith("compiled")) for k, m in metrics.items() if k.startswith("nanos")
             ]
-            return f"{time_text(ProcessorTime(value, True))} ns" + ("" if compiled else ", asked in Python")
+            return f"{time_text(ProcessorTime(value, True))} ns" + ("" if compiled else ", in Python")
         key, scale, unit = QUANTITIES.get(quantity, (quantity, 1.0, data["units"].get(quantity, "")))
         # The difference to the best one names it.
         [found] = [values for own, values in metrics.items() if own == key or own.startswith(f"{key} ")]

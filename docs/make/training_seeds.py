@@ -28,7 +28,7 @@ from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.evaluate import check_sendable
 from filtergym.evaluation.running.metrics import components_and_groups, mean_over_time, score, squared_errors
 from filtergym.evaluation.running.parallel import Workers, check_workers
-from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes, stem_of
+from filtergym.evaluation.running.summary import EvaluationRequest, file_stem, reduce_episodes
 from filtergym.evaluation.statistics.bootstrap import CONFIDENCE, Bootstrap, IntervalEstimate
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.evaluation.storage.code import files_digest
@@ -73,7 +73,7 @@ class SeedRun(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name among the policies, different from all opponents."""
+        """Name of the run in tables, algorithm and seed."""
         return f"{self.algorithm} seed {self.run.seed}"
 
 
@@ -90,22 +90,22 @@ class Trained(NamedTuple):
 
 
 class EpisodeMeans(NamedTuple):
-    """Means over every episode of one scenario, from which all statistics follow."""
+    """All policies' mean costs and squared errors of every episode in one scenario."""
 
     cost: dict[str, numpy.ndarray]
-    """Policy -> ``(episodes,)``."""
+    """Mean cost of every episode, ``(episodes,)``, by policy."""
     squares: dict[str, dict[str, numpy.ndarray]]
-    """Component -> policy -> squared error, ``(episodes,)``."""
+    """Mean squared error of every episode, ``(episodes,)``, by component and policy."""
     units: dict[str, str]
 
 
 class PolicyMeans(NamedTuple):
-    """Means over every episode of one policy."""
+    """One policy's mean cost and squared errors of every episode."""
 
     cost: numpy.ndarray
-    """``(episodes,)``."""
+    """Mean cost of every episode, ``(episodes,)``."""
     squares: dict[str, numpy.ndarray]
-    """Component -> squared error, ``(episodes,)``."""
+    """Mean squared error of every episode, ``(episodes,)``, by component."""
     units: dict[str, str]
 
 
@@ -120,14 +120,14 @@ class Spread(NamedTuple):
 
 
 def spread(values: numpy.ndarray) -> Spread:
-    """Separate the variances of training seeds and of episodes (two-way random effects, one value a cell).
+    """Return the mean with interval, and its variation over training seeds and over episodes (random effects).
 
     The moment estimates are those of the analysis of variance. The interval of the mean covers new seeds
     and new episodes: Student's t with Satterthwaite's degrees of freedom. A bootstrap over five seeds would
     give too narrow an interval.
 
     Args:
-        values: ``(seeds, episodes)``.
+        values: a number for each seed and episode, ``(seeds, episodes)``.
     """
     seeds, episodes = values.shape
     by_seed, by_episode, mean = values.mean(axis=1), values.mean(axis=0), values.mean()
@@ -152,7 +152,7 @@ def spread(values: numpy.ndarray) -> Spread:
 
 
 def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
-    """Read training runs of one environment, sorted by algorithm and seed.
+    """Return the training runs in some folders, all of one environment, sorted by algorithm and seed.
 
     Args:
         folders: folders of the runs.
@@ -189,13 +189,13 @@ def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
 
 
 def _algorithm(run: TrainingRun) -> str:
-    """Return the name of a run's algorithm, with its gate or corrected policy."""
+    """Return the name of a run's algorithm, with a mark of its gate and of the policy that it corrects."""
     around = f" on {run.residual_to}" if run.residual_to else ""
     return run.algorithm + around + (" gated" if run.gated else "")
 
 
 def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
-    """Return environment steps and relative cost differences of a run's validations; None: it has none."""
+    """Return environment steps and relative cost differences of a run's validations; None without any."""
     entries = run.validation
     relative = [entry.get("relative_cost_difference") for entry in entries]
     differences = [float(f"{difference[0]:.4g}") for difference in relative if difference]
@@ -205,7 +205,7 @@ def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
 
 
 def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
-    """Draw the validations of every algorithm, 1 or 2 columns of a paper wide.
+    """Return a figure of the validation cost of every algorithm over training.
 
     Args:
         data: data of a record of training seeds, or from :func:`runs_data`.
@@ -225,7 +225,7 @@ def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
 
 
 def default_opponents(problem: Problem) -> list[str]:
-    """Return the names that runs are compared with: paper, strong policies, untuned and tuned, references."""
+    """Return the names of the default opponents of runs: paper's algorithm, strong policies, reference."""
     known = problem.baselines
     untuned = [name for name in known.tunable if name != known.best_constant]
     names = [problem.paper, *known.compared, *untuned, *problem.tuned_policies, *known.references]
@@ -246,7 +246,7 @@ class Study(NamedTuple):
 
     @property
     def problem(self) -> Problem:
-        """Problem of all runs."""
+        """Problem (task and baselines) of all runs."""
         return self.runs[0].run.problem
 
 
@@ -257,7 +257,7 @@ def episode_means(
     store: Store | None = None,
     workers: Workers | None = None,
 ) -> EpisodeMeans:
-    """Evaluate runs and opponents on the same episodes, one by one to save memory.
+    """Evaluate runs and opponents on the same episodes of a scenario, and return their means over each episode.
 
     Args:
         study: runs, opponents and episodes.
@@ -299,7 +299,7 @@ def episode_means(
 
 
 def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationRequest, Work | None]]:
-    """Return every run and opponent over the episodes of a scenario, with the work item of its means."""
+    """Return for each run and opponent, by name, the evaluation request, and the work item of its means or None."""
     problem = study.problem
     entered = {m.name: find_competitor(problem, str(m.agent), study.trust) for m in study.runs}
     for name in dict.fromkeys([problem.paper, *study.opponents]):
@@ -319,7 +319,7 @@ def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[Evaluati
         if identity is not None:
             agent = hashlib.sha256(member.agent.read_bytes()).hexdigest() if member else ""
             content = json.dumps([identity, agent, name, repr(experiment), _own_digest()])
-            work = Work(f"{stem_of(experiment)}.seeds", content)
+            work = Work(f"{file_stem(experiment)}.seeds", content)
         # An agent's name may be that of a competitor.
         found[name] = EvaluationRequest(experiment, "agent" if member else name, maker, horizon=horizon), work
     return found
@@ -327,7 +327,7 @@ def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[Evaluati
 
 @functools.cache
 def _own_digest() -> str:
-    """Return a digest of the code of this folder, which is outside the package."""
+    """Return a SHA-256 digest of the code in this folder, part of the keys of stored means."""
     return files_digest([Path(__file__).parent])
 
 
@@ -339,7 +339,7 @@ def _means_of(asked: EvaluationRequest, tick: Callable[[int], None]) -> PolicyMe
 
 
 def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
-    """Return statistics for the mean cost of every episode, and the mean square of every shown component."""
+    """Yield the statistics of an evaluation: mean cost of every episode, and mean square of every component."""
     yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     first, last = windows_of(run)["all"]
     for component in select_components(list(components_and_groups(run))):
@@ -348,7 +348,7 @@ def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
 
 
 def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison]:
-    """Return every number of the tables, from the episodes' means.
+    """Return every number of the tables of one scenario, with interval, from the episodes' means.
 
     Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; only
     the mean's interval is over training seeds as well (:func:`spread`).
@@ -372,7 +372,7 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
         values: Any,
         component: str = "",
     ) -> None:
-        """Add an estimate, or the interval of a statistic and its resamples."""
+        """Append a comparison: an estimate, or an interval from a statistic and its bootstrap resamples."""
         estimate = values if isinstance(values, IntervalEstimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
         where = (problem.id, scenario, study.split, study.seed, episodes)
@@ -435,9 +435,7 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
 def comparison_grids(
     problem: Problem, runs: Sequence[Trained], comparisons: Sequence[Comparison]
 ) -> list[Grid]:
-    """Return the tables of one scenario: every run and opponent; the spread of each algorithm; medians and
-    opponents.
-    """
+    """Return the tables of one scenario: all runs and opponents, spread of each algorithm, and medians."""
     first = comparisons[0]
     paper, references = problem.paper, problem.baselines.references
     found = {(c.policy, c.statistic, c.against, c.metric, c.component): c for c in comparisons}
@@ -503,13 +501,13 @@ def compare_scenarios(
     store: Store | None = None,
     workers: Workers | None = None,
 ) -> tuple[list[Comparison], list[Grid]]:
-    """Evaluate runs and opponents in every scenario; return all numbers, and their tables.
+    """Evaluate runs and opponents in several scenarios; return all numbers, and their tables.
 
     Arguments as of :func:`episode_means`.
     """
     records: list[Comparison] = []
     grids: list[Grid] = []
-    runs = trained_of(study.runs)
+    runs = describe_runs(study.runs)
     for scenario in scenarios:
         means = episode_means(study, scenario, progress, store, workers)
         comparisons = compare(study, means, scenario)
@@ -518,8 +516,8 @@ def compare_scenarios(
     return records, grids
 
 
-def trained_of(runs: Sequence[SeedRun]) -> list[Trained]:
-    """Return the descriptions of training runs."""
+def describe_runs(runs: Sequence[SeedRun]) -> list[Trained]:
+    """Return a description of each training run, for pages."""
     return [
         Trained(
             member.name,
@@ -538,7 +536,7 @@ def runs_data(runs: Sequence[SeedRun]) -> dict[str, Any]:
     return {
         "environment": runs[0].run.problem.id,
         "paper": runs[0].run.problem.paper,
-        "runs": [list(each) for each in trained_of(runs)],
+        "runs": [list(each) for each in describe_runs(runs)],
         "curves": {name: list(curve) for name, curve in curves.items() if curve is not None},
     }
 
@@ -561,8 +559,8 @@ def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any
     }
 
 
-def with_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record's data with algorithms that were scored later, over the same episodes: added or replaced.
+def merge_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's data with algorithms added or replaced that were scored later over the same episodes.
 
     Raises:
         ValueError: if environment, episodes or scenarios differ.
@@ -603,7 +601,7 @@ def seeds_markdown(record: ResultRecord) -> str:
 
 
 def seeds_overview(records: Sequence[ResultRecord]) -> str:
-    """Return the mean over training seeds of every algorithm in every environment, in Markdown.
+    """Return a table in Markdown: mean cost over training seeds of every algorithm in every environment.
 
     Beside them stands the opponent of the lowest cost that is no reference. Agents are not distinguished by a gate or
     by a policy that they correct.
@@ -637,7 +635,7 @@ def _percent(values: Sequence[float | None]) -> str:
 
 
 def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[Trained], origin: str) -> str:
-    """Return the tables, the first shown and the others folded, and the commands of the tables and the runs."""
+    """Return tables in Markdown, all but the first folded, with the commands of the tables and the runs."""
     lines: list[str] = []
     for i, grid in enumerate(grids):
         table = markdown_table(grid.header, grid.rows)

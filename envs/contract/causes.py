@@ -15,8 +15,8 @@ from .companions import find_companion
 from .observation import Array
 
 LARGE_ERROR = 4.0
-"""Stated standard deviations beyond which the error of a reading is an outlier: of white normal errors that state them
-rightly, one of 16,000."""
+"""Number of stated standard deviations beyond which the error of a reading is an outlier: one of 16,000 white
+normal errors with the stated deviation."""
 
 
 MOST_CAUSES = 50
@@ -41,28 +41,26 @@ class Moment(NamedTuple):
     deviations: Array | None
     """Standard deviations that are stated for their errors, ``(C, N)``."""
 
-    def knows(self, *names: str) -> bool:
-        """Return whether the context has all of these names, none of them empty: without commands there are no
-        times.
-        """
+    def has_context(self, *names: str) -> bool:
+        """Return whether the context has an array under each of these names and none of these arrays is empty."""
         return all(name in self.context and 0 not in self.context[name].shape for name in names)
 
 
 class Cause(NamedTuple):
-    """A circumstance that may cost an estimate something."""
+    """A circumstance of a measurement, such as a turn, by which an evaluation splits the costs of estimates."""
 
     name: str
     """One word or a few, of the rows of a table: ``turn``."""
     phrase: str
     """Completion of the phrase "most of its cost falls", with its preposition: ``in turns``."""
     holds: Callable[[Moment], Array | None]
-    """From a moment to booleans, ``(N,)``; None where it cannot be computed."""
+    """Function from a moment to booleans, ``(N,)``; None where the cause cannot be computed."""
 
 
 def bins(
     name: str, unit: str, phrase: str, edges: tuple[float, ...], value: Callable[[Moment], Array | None]
 ) -> tuple[Cause, ...]:
-    """Return a cause for each interval of a quantity: below the first edge, between two, and from the last on.
+    """Return one :class:`Cause` for each interval of a quantity: below the first edge, between edges, above the last.
 
     Args:
         name: of the quantity, such as ``range``.
@@ -92,20 +90,20 @@ def _is_between(
 
 
 def context_flag(name: str) -> Callable[[Moment], Array | None]:
-    """Return the condition that a number of the context is above zero.
+    """Return a function from a :class:`Moment` to booleans ``(N,)``: whether a number of the context is above zero.
 
     Args:
         name: name of that number, ``(N,)``.
     """
 
     def holds(moment: Moment) -> Array | None:
-        return moment.context[name] > 0.0 if moment.knows(name) else None
+        return moment.context[name] > 0.0 if moment.has_context(name) else None
 
     return holds
 
 
 def _is_missed(moment: Moment) -> Array | None:
-    """Return whether something that is available at other times is not, ``(N,)``."""
+    """Return booleans ``(N,)``: whether any part of the measurement is unavailable; None if it has no availability."""
     available = getattr(moment.measurement, "available", None)
     if available is None:
         return None
@@ -116,7 +114,7 @@ def _is_missed(moment: Moment) -> Array | None:
 
 
 def _is_outlier(moment: Moment) -> Array | None:
-    """Return whether the error of a reading is beyond ``LARGE_ERROR`` stated deviations, ``(N,)``."""
+    """Return booleans ``(N,)``: whether the error of a reading exceeds ``LARGE_ERROR`` stated standard deviations."""
     if moment.readings is None or moment.deviations is None:
         return None
     error = moment.xp.abs(moment.readings - moment.state)
@@ -129,20 +127,20 @@ OUTLIER = Cause("outlier", f"on outliers beyond {LARGE_ERROR:g} stated sigma", _
 
 
 class Causes(NamedTuple):
-    """Circumstances by which an evaluation splits what estimates cost."""
+    """The causes by which an evaluation splits the costs of estimates."""
 
     causes: tuple[Cause, ...] = (MISSED,)
     start: int = 10
-    """How many measurements are the start of a track, which is one cause more."""
+    """Number of measurements that form the start of a track, which is a further cause."""
 
     @classmethod
     def of(cls, task: Any) -> "Causes":
-        """Return the causes of a task, by default missed measurements."""
+        """Return the :class:`Causes` that a task declares; by default missed measurements alone."""
         return find_companion(task, cls) or cls()
 
 
 def cause_number(causes: tuple[Cause, ...], moment: Moment) -> Array:
-    """Encode the true causes in one number: the sum of 2 to the power of the index of each, ``(N,)``.
+    """Encode the causes that are true at a moment as one number ``(N,)``: the sum of ``2 ** index`` over them.
 
     Args:
         causes: of the task, at most ``MOST_CAUSES``.

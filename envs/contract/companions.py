@@ -14,7 +14,7 @@ Companion = TypeVar("Companion")
 
 
 def find_companion(task: Any, kind: type[Companion]) -> Companion | None:
-    """Return the first companion of a type; None where the problem has none.
+    """Return the first companion object of a task that is an instance of a type; None without one.
 
     Args:
         task: a task, or a class of tasks.
@@ -24,25 +24,26 @@ def find_companion(task: Any, kind: type[Companion]) -> Companion | None:
 
 
 class Paper(NamedTuple):
-    """Source of a problem."""
+    """Source paper of a problem."""
 
     source: str
     """Reference of the paper."""
 
 
 class Actions(NamedTuple):
-    """Meanings of actions."""
+    """Descriptions of a task's actions by control, and the parameters that set their range."""
 
     meanings: Mapping[str, str]
-    """Return the meaning of an action under each control, in words."""
+    """Meaning of an action in words, by the name of the control."""
     reach: Mapping[str, tuple[str, ...]] = {}
     """Parameters that fix the range of an action, or its duration, by control or trained bank. A learned policy runs
     with those that it was trained with: with others the same numbers would be other actions."""
 
 
 class TrainedBanks(NamedTuple):
-    """Filters that a network of their own steers: learned estimators. An environment steers them like any bank, to
-    train them; no other policy acts in them.
+    """Banks of filters that a trained network steers: learned estimators.
+
+    Training treats them as any other bank. No other policy acts in them.
     """
 
     banks: Mapping[str, type]
@@ -55,8 +56,9 @@ class LostTracks(NamedTuple):
     cost: float | None = None
     """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
     explain: Callable[[Any, Array, Array, Any], str] | None = None
-    """From the task, the last valid mean ``(C, N)``, its covariance ``(C, C, N)`` and the measurement that the filter
-    took in, of N lanes: a sentence on why it lost an episode there, empty where there is none."""
+    """Function of the task, the last valid mean ``(C, N)``, its covariance ``(C, C, N)`` and the following measurement,
+    of N
+    lanes. It returns a sentence on why the filter lost an episode there, empty if there is no explanation."""
 
 
 class ArrayMeanings(NamedTuple):
@@ -70,53 +72,55 @@ class ArrayMeanings(NamedTuple):
 
 
 class PictureMaker(NamedTuple):
-    """Class that draws an episode where the general picture is not enough."""
+    """Function that creates the picture of an episode where the general picture is not enough."""
 
     make: Callable[[Any], Any]
-    """From a model to its :class:`~.rendering.Picture`, or None for the general one. It imports the drawing library."""
+    """Function from a model to its :class:`~.rendering.Picture`, or None for the general one. It imports the drawing
+    library."""
 
 
 class FlightScenarios(NamedTuple):
     """Function that makes a scenario in which every episode flies one of a user's flights."""
 
     make: Callable[[Any, Mapping[str, Any]], Any]
-    """From a :class:`~.trajectory.Trajectory` or :class:`~.flights.Flights` and the keywords of ``gym.make`` beside the
-    scenario to a :class:`~.task.Scenario`; raises :class:`ValueError` for flights that cannot be flown."""
+    """Function from a :class:`~.trajectory.Trajectory` or :class:`~.flights.Flights` and the keywords of ``gym.make``
+    beside
+    the scenario to a :class:`~.task.Scenario`; raises :class:`ValueError` for flights that cannot be flown."""
 
 
 class LoopRecords(NamedTuple):
     """Further records of each measurement, beside those of filter and world."""
 
     report: Callable[[Any, Any, dict[str, Array]], dict[str, Array]]
-    """From the model, the episode after the action and what filter and world report, see :meth:`.Filter.records`."""
+    """Function of the model, the episode after the action, and the records of filter and world; it returns further
+    records,
+    see :meth:`.Filter.records`."""
 
 
 def trained_banks(task: Any) -> Mapping[str, type]:
-    """Return the trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
+    """Return the classes of the trained banks of a task, or of a class of tasks, by the algorithm that trains each."""
     found = find_companion(task, TrainedBanks)
     return {} if found is None else found.banks
 
 
 def action_reach(task: Any, control: str) -> tuple[str, ...]:
-    """Return the names of the parameters that fix the range or duration of an action of a control, see
-    :class:`Actions`.
-    """
+    """Return the names of the task parameters that set the range or duration of an action of a control."""
     found = find_companion(task, Actions)
     return () if found is None else found.reach.get(control, ())
 
 
 def action_meanings(task: Any) -> Mapping[str, str]:
-    """Return the meaning of an action under each control, in words."""
+    """Return a description of the actions of a task, by the name of the control."""
     found = find_companion(task, Actions)
     return {} if found is None else found.meanings
 
 
 def lost_cost(task: Any) -> float | None:
-    """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
+    """Return the mean cost of an episode above which its track counts as lost; None where a task declares none."""
     found = find_companion(task, LostTracks)
     return None if found is None else found.cost
 
 
 def array_meanings(task: Any) -> ArrayMeanings:
-    """Return the meanings of arrays of a task, in words that may be empty."""
+    """Return the descriptions of a task's measurement and feedback arrays; empty texts where it declares none."""
     return find_companion(task, ArrayMeanings) or ArrayMeanings()

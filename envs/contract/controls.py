@@ -16,7 +16,7 @@ from .observation import Array
 
 
 def bank_action_space(control: str, count: int) -> gymnasium.Space[Any]:
-    """Return the action space of a control over a bank of ``count`` hypotheses.
+    """Return the Gymnasium action space of a control (mode, weights or evidence) over ``count`` hypotheses.
 
     ``mode``: the selected hypothesis. ``weights``: absolute weights, normalised by the task (all
     zero = uniform). ``evidence``: scaled and added to the log-posterior of Bayes' rule; zero is the paper.
@@ -35,7 +35,7 @@ def bank_probabilities(
     evidence_scale: float,
     xp: ModuleType,
 ) -> Array:
-    """Return the weights of the bank under an action, ``(M, N)``.
+    """Return the weights ``(M, N)`` of the M hypotheses of a bank that follow from an action under a control.
 
     Args:
         control: "mode", "weights" or "evidence".
@@ -58,20 +58,24 @@ def bank_probabilities(
 
 
 class SteerableFilter(Filter[TaskT, Measurement, State]):
-    """Filter with settings that an action multiplies at each measurement. The action of :meth:`update` is the logarithm
-    of each factor, ``(n, N)``. Without an action it is an estimator.
+    """Filter with settings (noise levels, gains) that an action multiplies at each measurement.
+
+    The action of :meth:`update` is the logarithm of each factor, ``(n, N)``. Without an action the filter is an
+    estimator.
     """
 
     settings: Mapping[str, float]
     """Factor by which an action of one multiplies each setting: white noise of deviation one, with which a new policy
     explores, then increases the cost by a twentieth at most."""
 
-    def heeds(self, measurement: Measurement) -> Array:
-        """Return one where an action has an effect, zero where nothing is measured, ``(N,)``."""
+    def has_effect(self, measurement: Measurement) -> Array:
+        """Return one where an action affects the update with a measurement, zero where nothing was measured,
+        ``(N,)``.
+        """
         return 1.0
 
     def examine(self, state: State, measurement: Measurement) -> Any:
-        """Return the result of a measurement without an action, for the observation; by default the state after it.
+        """Return the state after an update without an action, from which the observation is computed.
 
         Args:
             state: after :meth:`predict`.
@@ -81,7 +85,7 @@ class SteerableFilter(Filter[TaskT, Measurement, State]):
 
 
 class SettingsBank(Bank[Any, Any, Any]):
-    """A filter, steered by factors of its settings.
+    """A bank of one filter whose settings the action multiplies.
 
     The action a in [-1, 1]^n multiplies setting k by ``r_k^a_k``, where the filter declares r_k. The zero action is
     the filter itself, bit for bit: an agent starts from the strongest classical filter.
@@ -90,48 +94,50 @@ class SettingsBank(Bank[Any, Any, Any]):
     prediction, ``action``, the last one, ``(n, N)``, and further values of the observation.
     """
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]]
-    """Class of the filter."""
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]]
+    """Class of the steered filter."""
     own: Any
-    """The filter."""
+    """The steered filter."""
 
     def __init__(self, task: Any, control: str) -> None:
         super().__init__(task, control)
-        self.own = self.strong(task)
+        self.own = self.filter_class(task)
         factors = self.own.settings.values()
         self.log_reach: Array = task.constant([math.log(factor) for factor in factors])[:, None]
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Box with a number for each setting."""
+        """Gymnasium box [-1, 1] with one number for each setting."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.own.settings),), numpy.float32)
 
     @abstractmethod
-    def look(self, state: Any, found: Any, measurement: Any) -> Any:
-        """Return the state with the observed values of a measurement.
+    def add_observed(self, state: Any, result: Any, measurement: Any) -> Any:
+        """Return the bank's state with the values that the agent observes at a measurement filled in.
 
         Args:
             state: contains that of the filter after :meth:`predict`.
-            found: result of the measurement in the filter, see :meth:`SteerableFilter.examine`.
+            result: result of the measurement in the filter, see :meth:`SteerableFilter.examine`.
             measurement: the current one.
         """
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Predict with the filter, and examine the measurement without an action."""
+        """Return the bank's state predicted to a measurement, with the values that the agent observes."""
         own = self.own.predict(state.own, measurement)
-        return self.look(state._replace(own=own), self.own.examine(own, measurement), measurement)
+        return self.add_observed(state._replace(own=own), self.own.examine(own, measurement), measurement)
 
     def act(self, state: Any, measurement: Any, action: Array) -> Any:
-        """Update the filter with its settings multiplied."""
+        """Return the state updated with a measurement by the filter, its settings multiplied by the action's
+        factors.
+        """
         shown = self.xp.clip(self.xp.astype(action, self.xp.float64), -1.0, 1.0)
-        logarithms = self.own.heeds(measurement) * self.log_reach * shown
+        logarithms = self.own.has_effect(measurement) * self.log_reach * shown
         own = self.own.update(state.own, FilterInput(measurement, None, logarithms))
         return state._replace(own=own, action=shown)
 
     def mean(self, state: Any) -> Array:
-        """Return the mean of the filter."""
+        """Return the mean of the filter's estimate, ``(C, N)``."""
         return self.own.mean(state.own)
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of the filter."""
+        """Return the covariance of the filter's estimate, ``(C, C, N)``."""
         return self.own.covariance(state.own)

@@ -1,8 +1,8 @@
-"""The uniform numbers that fix an episode, handed out by name and distribution.
+"""The random quantities of an episode: named draws from uniform random numbers.
 
 A world draws its quantities in a fixed order. A first pass without random numbers counts how many numbers that takes
 (:meth:`Draws.counting`). Each draw is stored by name: the levels, times and kinds of an episode are its context. A
-draw may be in force within a window of time, or change in steps: :func:`within`, :class:`StepSignal`.
+draw may apply within a window of time, or change in steps: :func:`is_within`, :class:`StepSignal`.
 """
 
 import math
@@ -14,7 +14,7 @@ from .observation import Array
 
 
 class Draws:
-    """Uniform numbers on [0, 1) in order.
+    """Named random quantities, computed one after another from uniform numbers on [0, 1).
 
     Every method takes the name of the quantity and, with ``count``, draws ``(count, N)`` of it in place of
     ``(N,)``.
@@ -36,7 +36,7 @@ class Draws:
 
     @classmethod
     def counting(cls, average: Array, xp: ModuleType) -> "Draws":
-        """Return draws that always give one half and count the requested numbers in ``used``.
+        """Return draws without random numbers, each uniform number one half, that count the numbers used in ``used``.
 
         Args:
             average: ``(1, N)``, all one half.
@@ -62,30 +62,34 @@ class Draws:
         return values
 
     def unit(self, name: str, count: int | None = None) -> Array:
-        """Draw uniformly on [0, 1)."""
+        """Draw values of a quantity, uniformly distributed on [0, 1), ``(N,)`` or ``(count, N)``."""
         return self._keep(name, self._rows(count))
 
     def uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Draw uniformly between two limits."""
+        """Draw values of a quantity, uniformly distributed between two limits, ``(N,)`` or ``(count, N)``."""
         low, high = limits
         return self._keep(name, low + (high - low) * self._rows(count))
 
     def log_uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
-        """Draw between two positive limits, with a uniform logarithm."""
+        """Draw values whose logarithm is uniformly distributed between two positive limits, ``(N,)`` or ``(count,
+        N)``.
+        """
         low, high = limits
         return self._keep(name, low * self.xp.exp(math.log(high / low) * self._rows(count)))
 
     def integer(self, name: str, limits: Sequence[int], count: int | None = None) -> Array:
-        """Draw a whole number from the first to the last, all equally probable, as a float."""
+        """Draw integers from the first to the last limit, all equally probable, as floats, ``(N,)`` or ``(count,
+        N)``.
+        """
         first, last = limits
         return self._keep(name, first + self.xp.floor((last - first + 1) * self._rows(count)))
 
     def event(self, name: str, probability: float, count: int | None = None) -> Array:
-        """Draw a boolean that is true with a given probability."""
+        """Draw booleans that are true with a given probability, ``(N,)`` or ``(count, N)``."""
         return self._keep(name, self._rows(count) < probability)
 
     def category(self, name: str, thresholds: Sequence[Array]) -> Array:
-        """Draw an index by the inverse of a cumulative distribution, ``(N,)`` of integers.
+        """Draw an integer index ``(N,)`` from cumulative probabilities, by the inverse of the distribution.
 
         Args:
             name: name of the quantity.
@@ -95,14 +99,12 @@ class Draws:
 
 
 def draw_between(draw: Callable[..., Array], name: str, limits: tuple[float, float]) -> Array:
-    """Draw between two limits; where they are equal, return that value as a float and use no random number."""
+    """Draw between two limits; if they are equal, return that value without using a random number."""
     return limits[0] if limits[0] == limits[1] else draw(name, limits)
 
 
 def category(uniform: Array, thresholds: Sequence[Array], xp: ModuleType) -> Array:
-    """Return the index of the interval between cumulative ``thresholds`` that a uniform number falls into,
-    ``(N,)``.
-    """
+    """Return the integer index ``(N,)`` of the interval between thresholds in which a uniform number lies."""
     index = xp.zeros_like(uniform, dtype=xp.int64)
     for threshold in thresholds:
         index = index + xp.astype(uniform >= threshold, xp.int64)
@@ -110,7 +112,7 @@ def category(uniform: Array, thresholds: Sequence[Array], xp: ModuleType) -> Arr
 
 
 class StepSignal(NamedTuple):
-    """A signal that is constant between its steps."""
+    """A piecewise constant signal."""
 
     values: Array
     """Values at the start and from each step on, ``(J + 1, ..., N)``."""
@@ -118,13 +120,13 @@ class StepSignal(NamedTuple):
     """Times of the steps, ascending, ``(J, N)``: numbers of measurements, or s."""
 
     def at(self, time: Array, xp: ModuleType) -> Array:
-        """Return the value at a time, ``(..., N)``."""
+        """Return the value of the piecewise constant signal at a time, ``(..., N)``."""
         value = self.values[0]
         for i in range(self.times.shape[0]):
             value = xp.where(time >= self.times[i], self.values[i + 1], value)
         return value
 
 
-def within(time: Array, window: Array) -> Array:
-    """Return whether a time lies in a window: not before its first row, but before its second one, ``(N,)``."""
+def is_within(time: Array, window: Array) -> Array:
+    """Return booleans ``(N,)``: whether a time lies in a window ``[start, end)``, its first and second row."""
     return (time >= window[0]) & (time < window[1])

@@ -12,8 +12,8 @@ PYTHON = str(Path(traceback.__file__).parent)
 """Folder of Python's own modules."""
 
 
-def own_line(error: BaseException) -> str:
-    """Return the last line of a user's own code that an error came through, such as " (mine.py, line 12)", or "".
+def user_code_line(error: BaseException) -> str:
+    """Return the last line of the user's code in a traceback, as " (mine.py, line 12)"; "" if there is none.
 
     Code of this package and of installed libraries is not the user's own.
     """
@@ -29,7 +29,7 @@ def own_line(error: BaseException) -> str:
 
 @contextmanager
 def explain_errors(what: str) -> Iterator[None]:
-    """Turn an error of a user's code into one sentence with the line that raised it.
+    """Context manager that re-raises errors of a user's code as a ValueError that names the line of that code.
 
     Args:
         what: beginning of the sentence.
@@ -42,4 +42,4 @@ def explain_errors(what: str) -> Iterator[None]:
     except NotTraceable:
         raise
     except (Exception, SystemExit) as error:
-        raise ValueError(f"{what}: {type(error).__name__}: {error}{own_line(error)}") from error
+        raise ValueError(f"{what}: {type(error).__name__}: {error}{user_code_line(error)}") from error

@@ -1,4 +1,4 @@
-"""Disturbances of sensors: the parts that a world lists, and the errors that more than one environment has."""
+"""Disturbances of sensors: their base class, the list that a world has, and errors shared by several environments."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +12,7 @@ from .task_base import TaskBase
 
 
 class DisturbanceInput(NamedTuple):
-    """A measurement on its way through the disturbances."""
+    """Input of a disturbance at one measurement: time and random numbers."""
 
     number: Array
     """Number of the measurement, from 1 on, ``(N,)``."""
@@ -26,11 +26,11 @@ class DisturbanceInput(NamedTuple):
     """Feedback of a closed loop, see :meth:`.World.advance`."""
 
 
-def undisturbed(draws: Draws, parameters: Any) -> Array | None:
-    """Draw which episodes have no hidden disturbance, booleans ``(N,)``; None where there is no such episode.
+def draw_undisturbed(draws: Draws, parameters: Any) -> Array | None:
+    """Draw booleans ``(N,)``: which episodes have no hidden disturbance; None if every episode may have them.
 
     The first call takes a random number. Disturbances that a measurement reports are drawn in these episodes by the
-    same law as in all others, so that no report shows whether an episode is one of them.
+    same law as in all others, so that no report reveals whether an episode is one of them.
 
     Args:
         draws: random numbers that fix the scenario of each episode.
@@ -43,7 +43,7 @@ def undisturbed(draws: Draws, parameters: Any) -> Array | None:
 
 
 class Disturbance(ABC):
-    """Disturbance of sensors, with a name, random draws, an effect and causes.
+    """Base class of a disturbance of sensors, with a name, random draws, an effect and causes.
 
     It is drawn with the episode, advances with every measurement, and acts through the methods that it defines: on the
     deviations of the white errors, on errors, on the reading, or on the whole measurement. Its state contains its draws
@@ -71,12 +71,12 @@ class Disturbance(ABC):
         self.xp: ModuleType = task.xp
 
     @classmethod
-    def is_in(cls, parameters: Any) -> bool:
-        """Return whether a task with these parameters has the disturbance; by default every task has it."""
+    def is_enabled(cls, parameters: Any) -> bool:
+        """Return whether a task with these parameters has the disturbance; by default True."""
         return True
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Any:
-        """Draw the quantities of an episode, and return the state at the start of the track.
+        """Draw the random quantities of an episode and return the disturbance's state at the start of the track.
 
         Args:
             draws: random numbers that fix the scenario of each episode.
@@ -86,41 +86,45 @@ class Disturbance(ABC):
         return None
 
     def complete(self, state: Any, draws: Draws) -> Any:
-        """Return the state of :meth:`begin` with the draws of some scenarios only.
+        """Return the state of :meth:`begin` with the quantities added that only some scenarios draw.
 
         They come after the draws of all scenarios, so that the other scenarios use the same numbers as without them.
         """
         return state
 
-    def quiet(self, state: Any, calm: Array) -> Any:
-        """Return the state of :meth:`complete` for episodes without hidden disturbances.
+    def switch_off(self, state: Any, undisturbed: Array) -> Any:
+        """Return the initial state with the disturbance switched off in episodes without hidden disturbances.
 
-        A disturbance that the measurement reports leaves its state as it is, see :func:`undisturbed`.
+        A disturbance that the measurement reports leaves its state as it is, see :func:`draw_undisturbed`.
 
         Args:
             state: at the start of the track.
-            calm: whether an episode has no hidden disturbance, booleans ``(N,)``.
+            undisturbed: whether an episode has no hidden disturbance, booleans ``(N,)``.
         """
         return state
 
     def advance(self, state: Any, step: DisturbanceInput) -> Any:
-        """Return the state at a measurement, from that at the previous one."""
+        """Return the disturbance's state at the next measurement."""
         return state
 
     def change_deviations(self, state: Any, deviations: Array) -> Array:
-        """Apply the disturbance to the standard deviations of the white errors over the usual ones, ``(..., N)``."""
+        """Return the standard deviations of the white errors relative to nominal, ``(..., N)``, as the disturbance
+        changes them.
+        """
         return deviations
 
     def change_errors(self, state: Any, errors: Array) -> Array:
-        """Apply the disturbance to the errors, ``(n, N)``, in the world's units of them."""
+        """Return the sensor errors, ``(n, N)``, in the world's units, as the disturbance changes them."""
         return errors
 
     def change_reading(self, state: Any, reading: Array) -> tuple[Any, Array]:
-        """Apply the disturbance to the reading, ``(n, N)`` in the sensor's coordinates; return state and reading."""
+        """Return the state and the sensor reading, ``(n, N)`` in the sensor's coordinates, as the disturbance changes
+        it.
+        """
         return state, reading
 
     def change_measurement(self, state: Any, measurement: Any, step: DisturbanceInput) -> tuple[Any, Any]:
-        """Apply the disturbance to the measurement; return state and measurement.
+        """Return the state and the whole measurement as the disturbance changes it.
 
         Args:
             state: of :meth:`advance`.
@@ -130,16 +134,16 @@ class Disturbance(ABC):
         return state, measurement
 
     def context(self, state: Any) -> dict[str, Array]:
-        """Return the random draws, see :meth:`.World.context`."""
+        """Return the random draws of the disturbance by name, for the context of an episode."""
         return {}
 
     def records(self, state: Any) -> dict[str, Array]:
-        """Return further records for an evaluation, see :meth:`.World.records`."""
+        """Return further values to record at each measurement, by name (:meth:`.World.records`)."""
         return {}
 
 
 class Disturbances:
-    """Disturbances of a world, in the order in which they act and use the random numbers of measurements.
+    """The disturbances of a world, in the order in which they act and use the random numbers of measurements.
 
     States are a mapping from names.
 
@@ -167,19 +171,19 @@ class Disturbances:
         kinds: Sequence[type[Disturbance]],
         drawn: Sequence[type[Disturbance]] = (),
     ) -> "Disturbances":
-        """Return the disturbances of some kinds that a task has.
+        """Return those of the given kinds of disturbances that a task's parameters switch on.
 
         Args:
             task: with its parameters.
             kinds: in the order in which they act.
             drawn: the kinds that are drawn first; the others follow in the order of ``kinds``.
         """
-        parts = [kind(task) for kind in kinds if kind.is_in(task.parameters)]
+        parts = [kind(task) for kind in kinds if kind.is_enabled(task.parameters)]
         order = *drawn, *kinds
         return cls(parts, sorted(parts, key=lambda part: order.index(type(part))))
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> dict[str, Any]:
-        """Draw each disturbance, and return the states at the start of the track."""
+        """Draw the quantities of every disturbance and return their states at the start of the track, by name."""
         shares, used = {}, 0
         for part in self.parts:
             shares[part.name] = normals[used : used + part.initial_normals]
@@ -187,24 +191,23 @@ class Disturbances:
         return self._draw(lambda part: part.begin(draws, shares[part.name], zero))
 
     def complete(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
-        """Return the states with the draws of some scenarios only."""
+        """Return the states with the quantities added that only some scenarios draw."""
         return self._draw(lambda part: part.complete(states[part.name], draws))
 
     def _draw(self, draw: Callable[[Disturbance], Any]) -> dict[str, Any]:
-        """Draw the state of each disturbance, and return the states in the order in which they act."""
         states = {part.name: draw(part) for part in self.drawn}
         return {part.name: states[part.name] for part in self.parts}
 
-    def quiet(self, states: dict[str, Any], calm: Array | None) -> dict[str, Any]:
-        """Return the states with no hidden disturbance in some episodes, see :func:`undisturbed`."""
-        if calm is None:
+    def switch_off(self, states: dict[str, Any], undisturbed: Array | None) -> dict[str, Any]:
+        """Return the states with hidden disturbances switched off in the episodes where ``undisturbed`` is true."""
+        if undisturbed is None:
             return states
-        return {part.name: part.quiet(states[part.name], calm) for part in self.parts}
+        return {part.name: part.switch_off(states[part.name], undisturbed) for part in self.parts}
 
-    def share(
+    def split_noise(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
     ) -> dict[str, DisturbanceInput]:
-        """Split a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
+        """Return the inputs of all disturbances by name, with the random numbers of a measurement split among them."""
         steps, n, u = {}, 0, 0
         for part in self.parts:
             own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
@@ -213,23 +216,23 @@ class Disturbances:
         return steps
 
     def advance(self, states: Mapping[str, Any], steps: Mapping[str, DisturbanceInput]) -> dict[str, Any]:
-        """Return the states at a measurement."""
+        """Return the states of all disturbances at the next measurement."""
         return {part.name: part.advance(states[part.name], steps[part.name]) for part in self.parts}
 
     def change_deviations(self, states: Mapping[str, Any], deviations: Array) -> Array:
-        """Apply each disturbance to the standard deviations of the white errors over the usual ones."""
+        """Return the relative deviations of the white errors, ``(..., N)``, as changed by every disturbance in turn."""
         for part in self.parts:
             deviations = part.change_deviations(states[part.name], deviations)
         return deviations
 
     def change_errors(self, states: Mapping[str, Any], errors: Array) -> Array:
-        """Apply each disturbance to the errors."""
+        """Return the sensor errors, ``(n, N)``, as changed by every disturbance in turn."""
         for part in self.parts:
             errors = part.change_errors(states[part.name], errors)
         return errors
 
     def change_reading(self, states: Mapping[str, Any], reading: Array) -> tuple[dict[str, Any], Array]:
-        """Apply each disturbance to the reading of the sensor; return states and reading."""
+        """Return the states, and the sensor reading, ``(n, N)``, as changed by every disturbance in turn."""
         changed = dict(states)
         for part in self.parts:
             changed[part.name], reading = part.change_reading(changed[part.name], reading)
@@ -238,7 +241,7 @@ class Disturbances:
     def change_measurement(
         self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, DisturbanceInput]
     ) -> tuple[dict[str, Any], Any]:
-        """Apply each disturbance to the measurement; return states and measurement."""
+        """Return the states, and the measurement as changed by every disturbance in turn."""
         changed = dict(states)
         for part in self.parts:
             own = changed[part.name], measurement, steps[part.name]
@@ -246,16 +249,16 @@ class Disturbances:
         return changed, measurement
 
     def context(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """Return the random draws of all disturbances."""
+        """Return the random draws of all disturbances for the context of an episode, by name."""
         return {name: v for part in self.parts for name, v in part.context(states[part.name]).items()}
 
     def records(self, states: Mapping[str, Any]) -> dict[str, Array]:
-        """Return the records of all."""
+        """Return the values of all disturbances to record at each measurement, by name."""
         return {name: v for part in self.parts for name, v in part.records(states[part.name]).items()}
 
 
 def causes_of(kinds: Sequence[type[Disturbance]]) -> tuple[Cause, ...]:
-    """Return the causes of some kinds of disturbances, in their order."""
+    """Return the causes of several classes of disturbances as one tuple."""
     return tuple(cause for kind in kinds for cause in kind.causes)
 
 
@@ -283,14 +286,14 @@ class Outliers(Disturbance):
     @staticmethod
     @abstractmethod
     def limits(parameters: Any) -> tuple[float, float]:
-        """Return the probability and the factor."""
+        """Return the probability of an outlier and the factor on its standard deviation, from the parameters."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Start with a usual measurement."""
+        """Return factors of one on the standard deviations, ``(N,)``: the first measurement is no outlier."""
         return zero + 1.0
 
     def advance(self, state: Array, step: DisturbanceInput) -> Array:
-        """Draw whether this measurement is an outlier."""
+        """Return the drawn factor on this measurement's standard deviations, ``(N,)``: one, or that of an outlier."""
         if not self.probability:
             return state
         one = self.xp.ones_like(state)
@@ -298,22 +301,22 @@ class Outliers(Disturbance):
 
 
 class Glint(Outliers):
-    """Measurements whose errors are larger than stated by ``glint_factor`` with ``glint_probability``."""
+    """Glint: radar errors multiplied by ``glint_factor`` with probability ``glint_probability``."""
 
     name = "glint"
 
     @classmethod
-    def is_in(cls, parameters: Any) -> bool:
-        """Return whether a measurement may have glint."""
+    def is_enabled(cls, parameters: Any) -> bool:
+        """Return whether the parameters give glint a probability above zero."""
         return bool(parameters.glint_probability > 0.0)
 
     @staticmethod
     def limits(parameters: Any) -> tuple[float, float]:
-        """Return the probability and the factor of glint."""
+        """Return the probability and the factor of glint, from the parameters."""
         return parameters.glint_probability, parameters.glint_factor
 
     def change_errors(self, state: Array, errors: Array) -> Array:
-        """Enlarge the errors."""
+        """Return the errors multiplied by this measurement's glint factor, which is one without glint."""
         return state * errors
 
 
@@ -331,7 +334,7 @@ class GaussMarkov(NamedTuple):
     def sampled(
         cls, deviation: Array, correlation_time: Array, interval: float, xp: ModuleType
     ) -> "GaussMarkov":
-        """Return the process with a stationary deviation, sampled exactly.
+        """Return the exactly discretised process of a stationary standard deviation and a correlation time.
 
         Args:
             deviation: sigma, ``(N,)``.
@@ -343,7 +346,7 @@ class GaussMarkov(NamedTuple):
         return cls(decay, deviation * xp.sqrt(1.0 - decay * decay))
 
     def advance(self, error: Array, normals: Array) -> Array:
-        """Return the errors of the next measurement, ``(..., N)``."""
+        """Return the correlated errors at the next measurement, ``(..., N)``."""
         return self.decay * error + self.kick * normals
 
 
@@ -358,7 +361,7 @@ class ColouredErrorsState(NamedTuple):
 
 
 class ColouredErrors(Disturbance):
-    """Correlated errors beside the white ones, at a fixed interval; they are not reported.
+    """Errors correlated in time, added to the white ones at a fixed interval; a measurement does not report them.
 
     Args:
         task: with its parameters.
@@ -378,29 +381,32 @@ class ColouredErrors(Disturbance):
 
     @abstractmethod
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw standard deviation and correlation time, s, each ``(N,)`` or ``(n, N)``."""
+        """Draw the stationary standard deviation and the correlation time, s, each ``(N,)`` or ``(n, N)``."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> tuple[Array, Array]:
-        """Store the arguments of :meth:`complete`."""
+        """Return the normal numbers and zeros with which :meth:`complete` draws the initial errors."""
         return normals, zero
 
     def complete(self, state: tuple[Array, Array], draws: Draws) -> ColouredErrorsState:
-        """Draw standard deviation and correlation time; the errors are stationary from the start."""
+        """Return the process of the errors with drawn standard deviation and correlation time, stationary from the
+        start.
+        """
         normals, zero = state
         deviation, lasting = self.draw(draws, zero)
         process = GaussMarkov.sampled(deviation, lasting, self.interval, self.xp)
         level = deviation * normals if self.normals else self.xp.stack([zero] * self.count)
         return ColouredErrorsState(deviation, process, level)
 
-    def quiet(self, state: ColouredErrorsState, calm: Array) -> ColouredErrorsState:
-        """Set the errors to zero where ``calm``."""
+    def switch_off(self, state: ColouredErrorsState, undisturbed: Array) -> ColouredErrorsState:
+        """Return the state with the errors set to zero in the episodes where ``undisturbed`` is true."""
         deviation, kick, level = (
-            self.xp.where(calm, 0.0, each) for each in (state.deviation, state.process.kick, state.level)
+            self.xp.where(undisturbed, 0.0, each)
+            for each in (state.deviation, state.process.kick, state.level)
         )
         return ColouredErrorsState(deviation, state.process._replace(kick=kick), level)
 
     def advance(self, state: ColouredErrorsState, step: DisturbanceInput) -> ColouredErrorsState:
-        """Advance the errors by a measurement."""
+        """Return the state with the coloured errors of the next measurement."""
         return (
             state._replace(level=state.process.advance(state.level, step.normals)) if self.normals else state
         )

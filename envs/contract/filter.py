@@ -29,7 +29,7 @@ class Initial(NamedTuple):
     mean: Array
     """Mean in the units of the task's components, ``(C, N)``."""
     covariance: Array
-    """Its covariance, ``(C, C, N)``."""
+    """Covariance of the mean, ``(C, C, N)``."""
 
 
 class FilterInput(NamedTuple):
@@ -54,36 +54,36 @@ class Likelihood(NamedTuple):
 
     @classmethod
     def of(cls, values: Any) -> "Likelihood":
-        """Return a likelihood from its values, or from a log-likelihood alone."""
+        """Return a :class:`Likelihood` from a tuple of its values, or from a log-likelihood alone."""
         return cls(*values) if isinstance(values, tuple) else cls(values)
 
     @classmethod
     def unknown(cls, like: Array) -> "Likelihood":
-        """Return a likelihood of NaN, in the shape of an array ``(N,)``."""
+        """Return a :class:`Likelihood` whose values are all NaN, in the shape of an array ``(N,)``."""
         return cls(None).fill_unknown(like)
 
     @classmethod
     def of_records(cls, records: Mapping[str, Array]) -> "Likelihood":
-        """Return the likelihood in the records of a filter, see :meth:`Filter.records`; None for missing parts."""
+        """Return the :class:`Likelihood` contained in the records of a filter; None for missing values."""
         return cls(*(records.get(name) for name in cls._fields))
 
     def fill_unknown(self, like: Array) -> "Likelihood":
-        """Replace missing parts with NaN, in the shape of an array ``(N,)``."""
+        """Return the likelihood with NaN ``(N,)`` in place of values that are None."""
         none = math.nan + 0.0 * like
         return Likelihood(*(none if values is None else values for values in self))
 
 
-class Stated(NamedTuple):
-    """Estimate of a filter that does not always report all of it; the rest is NaN."""
+class ReportedParts(NamedTuple):
+    """The parts of the estimate that a filter reports, if it does not report all of it; the rest is NaN."""
 
     components: tuple[bool, ...]
-    """Which components it estimates, ``(C,)``."""
+    """Whether it estimates each component, booleans ``(C,)``."""
     deviations: tuple[bool, ...]
-    """Components whose errors it estimates, ``(C,)``."""
+    """Whether it reports the variance of each component, booleans ``(C,)``."""
 
 
 class EstimateState(NamedTuple):
-    """State of a filter that remembers its estimate alone."""
+    """State of a filter that consists of its estimate and the likelihood alone."""
 
     mean: Array
     covariance: Array
@@ -91,7 +91,7 @@ class EstimateState(NamedTuple):
 
 
 class Filter(ABC, Generic[TaskT, Measurement, State]):
-    """A filter, batch last: arrays of N episodes are ``(..., N)``. Policies have the batch first.
+    """Base class of every filter. Arrays of N episodes are ``(..., N)``, whereas policies have the batch first.
 
     Args:
         task: the estimation problem, with the constants that world and filter share.
@@ -100,15 +100,15 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     knows: str = ""
     """Information that no competitor receives, in words; empty for a competitor."""
     kind: str = "estimator"
-    """Kind of competitor."""
+    """Kind of competitor, such as ``estimator``."""
     in_python: bool = False
     """Whether it runs as Python code on every backend, since it cannot be traced."""
     adapts_covariance: bool = False
-    """Whether the covariance that is reported grows with the innovations."""
-    stated: Stated | None = None
+    """Whether the reported covariance grows with the innovations."""
+    stated: ReportedParts | None = None
     """Parts of the estimate that it reports; None: mean and covariance of all components at every measurement."""
     least_interval: ClassVar[float] = 0.0
-    """Share of the sampling interval from which on its gains are good for the time between two measurements."""
+    """Smallest interval between measurements, as a share of the sampling interval, for which its gains are valid."""
 
     def __init__(self, task: TaskT) -> None:
         self.task = task
@@ -117,59 +117,59 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Action space; here without a choice."""
+        """Gymnasium space of the actions; here it has a single action."""
         return gymnasium.spaces.Discrete(1)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of this state and the measurement, in order."""
+        """Blocks of the agent's observation, computed from this filter's state and the measurement, in order."""
         return ()
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Further quantities that a policy can read from an observation."""
+        """Further quantities that a policy can compute from an observation."""
         return ()
 
     @abstractmethod
     def start(self, initial: Any) -> State:
-        """Return the state at the start of the track from the initial estimate, an :class:`Initial` of the task."""
+        """Return the filter's state at the start of the track, from the initial mean and covariance."""
 
-    def initialise(self, given: FilterInput) -> State:
-        """Return the state at the start of the track from the whole input; its measurement is the initial estimate."""
-        return self.start(given.measurement)
+    def initialise(self, inputs: FilterInput) -> State:
+        """Return the filter's state at the start of the track from a whole input, whose measurement is the initial
+        estimate.
+        """
+        return self.start(inputs.measurement)
 
     def predict(self, state: State, measurement: Measurement) -> State:
-        """Step 2: predict to the time of a measurement and compare with it; by default return the state unchanged."""
+        """Return the state predicted to the time of a measurement, with its innovation; by default unchanged."""
         return state
 
     @abstractmethod
-    def update(self, state: State, given: FilterInput) -> State:
-        """Step 4: update with the measurement that was predicted.
+    def update(self, state: State, inputs: FilterInput) -> State:
+        """Return the state updated with the measurement to which it was predicted (step 4 of the clock).
 
         Args:
             state: after :meth:`predict`.
-            given: the same measurement, and the further input of this filter.
+            inputs: the same measurement, and the further input of this filter.
         """
 
-    def step(self, state: State, given: FilterInput) -> State:
-        """Predict to a measurement and update with it, without an action in between."""
-        return self.update(self.predict(state, given.measurement), given)
+    def step(self, state: State, inputs: FilterInput) -> State:
+        """Return the state predicted to a measurement and updated with it, without an action."""
+        return self.update(self.predict(state, inputs.measurement), inputs)
 
     def mean(self, state: State) -> Array:
-        """Return the estimate of the task's components, after :meth:`update`, ``(C, N)``; by default the state's
-        ``mean``.
-        """
+        """Return the mean of the task's components, ``(C, N)``; by default the state's ``mean``."""
         mean: Array = state.mean  # type: ignore[attr-defined]
         return mean
 
     def covariance(self, state: State) -> Array:
-        """Return the covariance that is reported for it, ``(C, C, N)``; by default the state's ``covariance``."""
+        """Return the reported covariance of the mean, ``(C, C, N)``; by default the state's ``covariance``."""
         covariance: Array = state.covariance  # type: ignore[attr-defined]
         return covariance
 
     def feedback(self, state: State, measurement: Any) -> Any:
-        """Return a feedback to the world that does not follow from the estimate; by default None, where it does, see
-        :meth:`.Task.feedback`.
+        """Return the feedback to the world in a closed loop; None where :meth:`.Task.feedback` computes it from the
+        estimate.
 
         Args:
             state: after :meth:`start` or :meth:`update`.
@@ -178,8 +178,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         return None
 
     def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
-        """Return further records of each measurement, for an evaluation: arrays ``(N,)``, or ``(M, N)`` for
-        ``mode_probability``.
+        """Return further values to record at each measurement, by name: ``(N,)`` each, ``mode_probability`` ``(M, N)``.
 
         The quality of the prediction is reported by ``log_likelihood`` (log-density of the measurement as it was
         predicted, NaN where nothing was received), ``nis``, the normalised innovation squared, and ``nis_degrees``, its
@@ -190,7 +189,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
 
 class Bank(Filter[TaskT, Measurement, State]):
-    """A filter that an action steers: the filters of a task under one control.
+    """A filter, usually a set of parallel filters, that an action of the agent steers under one control.
 
     Args:
         task: the estimation problem.
@@ -204,20 +203,20 @@ class Bank(Filter[TaskT, Measurement, State]):
     @property
     @abstractmethod
     def action_space(self) -> gymnasium.Space[Any]:
-        """Action space."""
+        """Gymnasium space of the actions that steer the filters."""
 
     @property
     @abstractmethod
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of this state and the measurement, in order."""
+        """Blocks of the agent's observation, computed from this bank's state and the measurement, in order."""
 
     @abstractmethod
     def predict(self, state: State, measurement: Measurement) -> State:
-        """Step 2: predict to the time of a measurement and compare with it."""
+        """Return the state predicted to the time of a measurement, with the innovations (step 2 of the clock)."""
 
     @abstractmethod
     def act(self, state: State, measurement: Measurement, action: Array) -> State:
-        """Step 4: apply the action to the measurement.
+        """Return the predicted state updated with the measurement as the action directs (step 4 of the clock).
 
         Args:
             state: after :meth:`predict`.
@@ -225,6 +224,6 @@ class Bank(Filter[TaskT, Measurement, State]):
             action: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space.
         """
 
-    def update(self, state: State, given: FilterInput) -> State:
-        """Apply the action of the input."""
-        return self.act(state, given.measurement, given.action)
+    def update(self, state: State, inputs: FilterInput) -> State:
+        """Return the predicted state updated with the measurement and the action of the input."""
+        return self.act(state, inputs.measurement, inputs.action)

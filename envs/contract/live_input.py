@@ -1,4 +1,4 @@
-"""Live measurements, one by one: values by their names, converted into the task's ``Measurement``."""
+"""Measurements of a live sensor, one at a time: named values, converted into the task's ``Measurement``."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -20,7 +20,7 @@ Memory = dict[str, Any]
 
 
 class LiveInput:
-    """Converter of live values into measurements.
+    """Converter of named live values into measurements of a task.
 
     This class serves every task: the values are the arrays of its ``Measurement``, by their names. A task whose sensors
     have simpler values has a subclass.
@@ -43,7 +43,7 @@ class LiveInput:
     counter: ClassVar[str] = "number"
     """Array of the measurement that counts measurements."""
     fuses: bool = False
-    """Whether several measurements may have the same time."""
+    """Whether several measurements may have the same time stamp."""
     values: Mapping[str, str]
     start_values: Mapping[str, str]
 
@@ -58,7 +58,7 @@ class LiveInput:
         self.values, self.start_values = self.describe()
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return the descriptions :attr:`values` and :attr:`start_values`."""
+        """Return the names and descriptions of the values of a measurement, and of those at the start of a track."""
 
         def shapes(part: Any, left_out: Iterable[str]) -> dict[str, str]:
             return {
@@ -70,7 +70,7 @@ class LiveInput:
         return shapes(self.measurement, [self.counter]), shapes(self.initial, ["mean", "covariance"])
 
     def read(self, values: Mapping[str, Any], name: str, shape: tuple[int, ...] = ()) -> Any:
-        """Return a value ``(*shape, N)``, of one track ``shape``; NaN where it is missing.
+        """Return a value by its name as an array ``(*shape, N)``, ``shape`` for one track; NaN where it is missing.
 
         Raises:
             ValueError: for a value that is no number, or has another shape.
@@ -84,7 +84,7 @@ class LiveInput:
         array = read_numbers(name, numpy.nan if value is None else value)
         if numpy.count_nonzero(numpy.abs(array) > LARGEST):  # a tenth of the time of any()
             raise ValueError(
-                f"{name} must be at most {LARGEST:g}, or NaN where it did not come, got {quote_shortened(value)}"
+                f"{name} must be at most {LARGEST:g}, or NaN where it was not received, got {quote_shortened(value)}"
             )
         if value is None:
             array = numpy.full((*shape, 1), numpy.nan)
@@ -98,7 +98,8 @@ class LiveInput:
         return array.reshape(shape) if shape else array.item()
 
     def read_all(self, values: Mapping[str, Any], names: Iterable[str], what: str) -> numpy.ndarray:
-        """Return some numbers as ``(len(names), N)``, of one track ``(len(names),)``.
+        """Return several numbers, none of which may be missing, as ``(len(names), N)``; for one track
+        ``(len(names),)``.
 
         Raises:
             ValueError: if one is missing.
@@ -109,7 +110,7 @@ class LiveInput:
         return found
 
     def check_names(self, values: Mapping[str, Any], known: Mapping[str, str]) -> None:
-        """Raise ValueError for a value of another name."""
+        """Raise ValueError if there is a value whose name is not among the known ones."""
         if values.__class__ is not dict and not isinstance(values, Mapping):
             raise ValueError(f"values are given by name, got {quote_shortened(values)}")
         if not values.keys() <= known.keys():
@@ -119,12 +120,12 @@ class LiveInput:
                 f"unknown value {quote_shortened(unknown[0])}: {self.task.id} takes {listed or 'no more'}"
             )
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the initial estimate of the task's NamedTuple, arrays ``(..., N)`` also of one track, and memory.
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Return the initial estimate from its values by name, and the memory for the first measurement.
 
         Args:
             time: of the start, s, ``(N,)``, of one track a float.
-            given: ``mean``, ``covariance`` and other values by name; arrays of one track, or with N last.
+            initial_values: ``mean``, ``covariance`` and other values by name; arrays of one track, or with N last.
 
         Raises:
             ValueError: for a value that is missing, unknown, or of another shape.
@@ -132,29 +133,31 @@ class LiveInput:
         found = {}
         for name, array in self.initial._asdict().items():
             if array is not None:
-                values = self._read_finite(given, name, array, "at the start")
+                values = self._read_finite(initial_values, name, array, "at the start")
                 found[name] = numpy.reshape(values, (*array.shape[:-1], self.tracks)).astype(array.dtype)
-        return type(self.initial)(**found), {"time": time, "count": self.same_of_all(0.0)}
+        return type(self.initial)(**found), {"time": time, "count": self.broadcast(0.0)}
 
-    def same_of_all(self, number: float, shape: tuple[int, ...] = ()) -> Any:
-        """Repeat one number for all tracks, ``(*shape, N)``, of one track ``shape``."""
+    def broadcast(self, number: float, shape: tuple[int, ...] = ()) -> Any:
+        """Return an array ``(*shape, N)`` filled with one number; for one track ``shape``, or the number itself."""
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 
-    def _read_finite(self, given: Mapping[str, Any], name: str, like: numpy.ndarray, what: str) -> Any:
-        """Return a value as :meth:`read` does, rounded to the type of an array.
+    def _read_finite(
+        self, initial_values: Mapping[str, Any], name: str, like: numpy.ndarray, what: str
+    ) -> Any:
+        """Return a value by its name, all of it finite, truncated to integers or booleans where ``like`` is.
 
         Raises:
             ValueError: for a value that is missing or not finite.
         """
-        values, dtype = self.read(given, name, like.shape[:-1]), like.dtype
+        values, dtype = self.read(initial_values, name, like.shape[:-1]), like.dtype
         if numpy.count_nonzero(numpy.isfinite(values)) < numpy.size(values):
-            raise ValueError(f"{self.task.id} needs {name} {what}, finite, got {_listed(given)}")
+            raise ValueError(f"{self.task.id} needs {name} {what}, finite, got {_listed(initial_values)}")
         if dtype.kind == "f":
             return values
         return values > 0.5 if dtype.kind == "b" else numpy.trunc(values)
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Make the measurement from the values of one time, as floats also where the task has another type.
+        """Return the task's ``Measurement`` from the values of one time, and the memory for the next one.
 
         Args:
             memory: of the previous measurements.
@@ -184,7 +187,7 @@ class LiveInput:
         return type(self.measurement)(**made), {**memory, "time": time, "count": count}
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
-        """Return the initial mean and covariance from the first two measurements, each with its ``time``.
+        """Return initial mean and covariance by name from the first two measurements, each with its ``time``.
 
         Raises:
             ValueError: if two measurements cannot start a track of this task, or a value is missing.
@@ -192,12 +195,12 @@ class LiveInput:
         raise ValueError(f"a track of {self.task.id} does not start from two measurements: call start")
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
-        """Replace values that were not received; by default with zeros."""
+        """Return the array of values with numbers in place of those not received; by default zeros."""
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
 
 
 class LiveValues:
-    """Live values, as :class:`~.log_format.Readings` of several tracks.
+    """Live values of several tracks, in the form of :class:`~.log_format.Readings`.
 
     Args:
         input: converter that reads them.
@@ -209,19 +212,19 @@ class LiveValues:
         self.values = values
 
     def has(self, *names: str) -> bool:
-        """Return whether all of these are given."""
+        """Return whether there is a value under each of these names."""
         return all(self.values.get(name) is not None for name in names)
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the value of each track, ``(N,)``; NaN where it is missing."""
+        """Return the value of a name for each track, ``(N,)``; NaN where it is missing."""
         return numpy.atleast_1d(self.input.read(self.values, name))
 
     def place(self, number: int) -> str:
-        """Track of a value."""
+        """Return the name of the track with this index, for an error message."""
         return f"track {number}"
 
     def deviations(self, name: str) -> Any:
-        """Return the standard deviations, ``(N,)``, of one track a float; NaN where none is stated.
+        """Return the standard deviations stated under a name, ``(N,)``, a float for one track; NaN where there is none.
 
         Raises:
             ValueError: if one is not above zero.
@@ -233,13 +236,13 @@ class LiveValues:
 
 
 class LiveReader(NamedTuple):
-    """Conversion of single values to measurements of a problem."""
+    """Class that converts single values to measurements of a problem."""
 
     input: type[LiveInput] = LiveInput
 
     @classmethod
     def of(cls, task: Any) -> "LiveReader":
-        """Return the reader of a task, or of a class of tasks; by default that of the arrays by their names."""
+        """Return the reader of a task, or of a class of tasks; by default one that takes its arrays by their names."""
         return find_companion(task, cls) or cls()
 
 

@@ -1,4 +1,4 @@
-"""Formats of sensor readings, as rows of a table and as live values, and how a table is read."""
+"""Formats of sensor readings: columns of a table, live values, and the rules of their conversion to measurements."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,28 +28,28 @@ class Column(NamedTuple):
 
     @property
     def live_text(self) -> str:
-        """Description of the live value."""
+        """Unit and meaning of the column as a live value."""
         return self.live or self.text
 
 
 class Readings(Protocol):
-    """Numbers by the names of their columns: n rows of a table, or the live values of n tracks."""
+    """Protocol of numbers by column name: n rows of a table, or the live values of n tracks."""
 
     def has(self, *names: str) -> bool:
-        """Return whether all of these are given."""
+        """Return whether there is a column under each of these names."""
         ...
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the numbers of a column, ``(n,)``; NaN where one is missing."""
+        """Return the numbers of a column by its name, ``(n,)``; NaN where one is missing."""
         ...
 
     def place(self, number: int) -> str:
-        """Return the place of a number, such as "row 12"."""
+        """Return the place of a number in words, such as "row 12", for an error message."""
         ...
 
 
-def optional(readings: Readings, name: str, count: int) -> numpy.ndarray:
-    """Return the numbers of an optional column, ``(n,)``; NaN without it.
+def optional_column(readings: Readings, name: str, count: int) -> numpy.ndarray:
+    """Return the numbers of a column, ``(n,)``; all NaN if the column does not exist.
 
     Args:
         readings: given.
@@ -60,7 +60,7 @@ def optional(readings: Readings, name: str, count: int) -> numpy.ndarray:
 
 
 def check_deviations(readings: Readings, name: str, values: Any) -> None:
-    """Raise ValueError if a standard deviation is not above zero.
+    """Raise ValueError if a standard deviation of a column is not above zero.
 
     Args:
         readings: source of the values.
@@ -82,12 +82,12 @@ UNITS = {"azimuth_sigma": "degrees"}
 
 
 def is_assumed(words: str) -> bool:
-    """Return whether the source of deviations is an assumption, since no column states them."""
+    """Return whether this description of the source of deviations marks them as assumed, not read from a column."""
     return words.startswith(NO_DEVIATIONS)
 
 
 def deviation_words(deviations: Mapping[str, float]) -> str:
-    """Return the typical deviations in words, such as "sigma_x 13.8 m, sigma_y 13.8 m"."""
+    """Return typical deviations as text, such as "sigma_x 13.8 m, sigma_y 13.8 m"."""
     return ", ".join(f"{name} {value:.3g} {UNITS.get(name, 'm')}" for name, value in deviations.items())
 
 
@@ -116,7 +116,7 @@ class TrackLog(NamedTuple):
     start: float
     """Time of the start of the track, s, as in the table."""
     time: numpy.ndarray
-    """Time of each measurement as it stands in the table, ``(T,)``."""
+    """Time of each measurement as written in the table, ``(T,)``."""
     notes: tuple[str, ...] = ()
     """Changes made to the table, a line each."""
     typical: Mapping[str, float] = {}
@@ -128,8 +128,8 @@ class TrackLog(NamedTuple):
     """Source of the deviations, in words."""
 
 
-class Predicted(NamedTuple):
-    """A coordinate of a measurement that an estimate predicts."""
+class PredictedCoordinate(NamedTuple):
+    """A coordinate of a measurement, compared with its prediction by an estimate."""
 
     name: str
     unit: str
@@ -188,7 +188,7 @@ class LogFormat:
     """Function that returns the predicted and the measured coordinates, ``(m, N)`` each, NaN where nothing was
     received. Its arguments are the mean ``(C, N)`` after the previous measurement, the ``Measurement`` and the
     parameters."""
-    predicted: tuple[Predicted, ...] = ()
+    predicted: tuple[PredictedCoordinate, ...] = ()
     """Predicted coordinates, at least m, the main ones first."""
     plane: tuple[str, ...] = ()
     """Two columns of metres, east and north, and two of their true values, which latitude and longitude may
@@ -209,7 +209,7 @@ class LogFormat:
 
 
 class LogSetup(NamedTuple):
-    """Reading of the log for which a filter is advised, so that the filter can be run on the same input."""
+    """Setup with which a log was read, so that a filter runs on the same input later."""
 
     interval: float
     """Median time between measurements, s: the filter was evaluated with a missed scan wherever more time passes."""
@@ -228,20 +228,18 @@ class LogSetup(NamedTuple):
     """Measurements of the longest track; zero: not known."""
 
     def scenario(self, task: Any) -> Scenario:
-        """Return the parameters of a task on logs that are read in the same way, instead of those of a simulated
-        scenario.
-        """
+        """Return a :class:`Scenario` with the parameters of the log, which replaces a simulated scenario."""
         log_format: Any = find_companion(task, LogFormat)
         known = ("horizon", self.horizon), ("decision_interval", log_format.decision_interval)
         return Scenario("log", "", {**{name: value for name, value in known if value}, **self.parameters})
 
     @property
     def plane(self) -> PlaneOrigin | None:
-        """Origin of the plane."""
+        """Origin of the plane of metres east and north; None where positions were in metres."""
         return PlaneOrigin(**self.origin) if self.origin else None
 
     @property
     def assumed(self) -> dict[str, float]:
-        """Parameters that make a log without deviations be read as the fitted log was; empty where that stated any."""
+        """Parameter ``range_sigma`` with the deviation assumed for a log that stated none; empty if it stated any."""
         isotropic = self.deviations.get("sigma_x") if is_assumed(self.deviations_from) else None
         return {} if isotropic is None else {"range_sigma": isotropic}

@@ -62,20 +62,20 @@ class Model:
         self.action_space = filter.action_space
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Model":
-        """Share the model, which never changes."""
+        """Return the model itself, which is immutable."""
         return self
 
     def __reduce__(self) -> Any:
-        """Pickle the arguments of the model, not what is computed from them."""
+        """Return the constructor's arguments for pickling, without computed values."""
         return type(self), (self.task, self.control)
 
     @property
     def backend(self) -> str:
-        """Code that computes its steps: "numpy", "torch", or "compiled"."""
+        """Name of the backend that computes its steps: "numpy", "torch", or "compiled"."""
         return "torch" if "torch" in self.task.xp.__name__ else "numpy"
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Return the positions of named fields in the observation.
+        """Return the positions of fields in the observation, by their names.
 
         Raises:
             ValueError: for a name that is no field.
@@ -83,23 +83,23 @@ class Model:
         return self._blocks.columns(names)
 
     def reader(self, name: str) -> Reader:
-        """Return a function that reads a block or quantity of the observation by its name, uncompressed.
+        """Return a function from observations to the uncompressed values of a block or quantity, by its name.
 
         Raises:
             ValueError: for a name that is neither.
         """
         return self._blocks.reader(name)
 
-    def under(self, control: str) -> "Model":
-        """Return the same problem with another control."""
+    def with_control(self, control: str) -> "Model":
+        """Return a model of the same task with the bank of another control."""
         return type(self)(self.task, control)
 
     def on_numpy(self) -> "Model":
-        """Return the same problem on NumPy arrays, not compiled."""
+        """Return a model of the same task on NumPy arrays, not compiled."""
         return Model(self.task if self.task.xp is numpy else self.task.on(numpy), self.control)
 
     def with_filter(self, make: Callable[["Model"], Filter[Any, Any, Any]]) -> "Model":
-        """Return the same problem with another filter in place of the bank.
+        """Return a model of the same task with another filter in place of the bank.
 
         Args:
             make: makes the filter for a model. Pass the same function each time: compiled code is stored by it.
@@ -109,7 +109,7 @@ class Model:
         return other
 
     def run(self, function: Callable[..., Any], *parts: Any) -> Any:
-        """Call ``function(model, *parts)`` on this model's backend.
+        """Return ``function(model, *parts)``, computed on this model's backend.
 
         Args:
             function: of this module or another; pass the same one each time, since it may be compiled once.
@@ -121,30 +121,30 @@ class Model:
         return function(self, *parts)
 
     def picture(self) -> Any:
-        """Make the :class:`~.rendering.Picture` of an episode of this task; None for the general one."""
+        """Return the object that draws an episode of this task; None where the general picture serves."""
         maker = find_companion(self.task, PictureMaker)
         return None if maker is None or self.task.recording is not None else maker.make(self)
 
     def truth_for_filter(self, truth: Any) -> Any:
-        """Return the truth that the filter receives: None unless it ``knows`` something."""
+        """Return the truth for a reference filter that ``knows`` something; None for any other filter."""
         return truth if self.filter.knows else None
 
     # --- the filter's part of a step
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
-        """Return the state of the filter at the start of the track."""
+        """Return the filter's state at the start of the track, from the initial estimate."""
         return self.filter.initialise(FilterInput(initial, truth))
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
-        """Return the state of the filter predicted to a measurement, before the update."""
+        """Return the filter's state predicted to a measurement, before the update."""
         return self.filter.predict(state, measurement)
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
-        """Return the state of the filter after the update with the measurement; a bank uses the action."""
+        """Return the filter's state after the update with a measurement; a bank uses the action."""
         return self.filter.update(state, FilterInput(measurement, truth, action))
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """Return the feedback of a filter to the world, see :meth:`.Task.feedback`; None in an open loop."""
+        """Return the feedback of a filter's estimate to the world; None in an open loop."""
         if not self.task.closes_loop:
             return None
         own = self.filter.feedback(state, measurement)
@@ -155,7 +155,7 @@ class Model:
     # --- called by the engine
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Return the episode at the start of the track.
+        """Return N episodes at the start of the track, from their random numbers.
 
         Args:
             uniforms: ``(noise.uniforms, N)``, of the task.
@@ -165,34 +165,41 @@ class Model:
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Apply steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
+        """Return the episode at the next measurement, with the filter predicted to it (steps 1 and 2 of the clock).
+
+        Args:
+            episode: after :meth:`begin` or :meth:`act`.
+            noise: random numbers of the measurement, ``(noise.normals + noise.row_uniforms, N)``.
+        """
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.task.world.advance(episode.truth, noise, feedback)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 
     def observe(self, episode: Episode) -> Array:
-        """Step 3: return the observation of the agent, ``(len(fields), N)``."""
+        """Return the agent's observation, ``(len(fields), N)`` (step 3 of the clock)."""
         if not self.fields:  # nothing steers the filter
             N = next(named_arrays(episode.measurement))[1].shape[-1]
             return self.task.xp.zeros((0, N), dtype=self.task.xp.float64, device=self.task.device)
         return self._blocks.observe(episode.filter, episode.measurement)
 
     def act(self, episode: Episode, action: Array) -> Episode:
-        """Step 4: update the filter with the measurement; a bank uses the action."""
+        """Return the episode after the filter's update with the measurement; a bank uses the action (step 4 of the
+        clock).
+        """
         truth = self.truth_for_filter(episode.truth)
         return episode._replace(filter=self.update_filter(episode.filter, episode.measurement, action, truth))
 
     def mean(self, episode: Episode) -> Array:
-        """Return the estimate, ``(len(components), N)``, in the units of ``components``."""
+        """Return the mean of the filter's estimate, ``(len(components), N)``, in the units of ``components``."""
         return self.filter.mean(episode.filter)
 
     def context(self, episode: Episode) -> dict[str, Array]:
-        """Return the random draws of the episode, and those in force now: arrays of floats ``(..., N)``."""
+        """Return the random draws of the episode and their current values by name, floats ``(..., N)``."""
         context = self.task.world.context(episode.truth)
         return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
 
     def moment(self, episode: Episode) -> Moment:
-        """Return the moment from which causes are computed."""
+        """Return the :class:`Moment` of the episode, from which causes are computed."""
         world, measurement = self.task.world, episode.measurement
         return Moment(
             self.task.xp,
@@ -204,15 +211,17 @@ class Model:
         )
 
     def causes(self, episode: Episode) -> Array:
-        """Return the number of the true causes of the task, ``(N,)``, see :func:`.causes.cause_number`."""
+        """Return the causes that are true at the measurement, encoded as one number, ``(N,)``
+        (:func:`.causes.cause_number`).
+        """
         return cause_number(Causes.of(self.task).causes, self.moment(episode))
 
     def cost(self, episode: Episode) -> Array:
-        """Step 5: return the cost of the estimate, uncapped, ``(N,)``."""
+        """Return the uncapped cost of the estimate, ``(N,)`` (step 5 of the clock)."""
         return self.task.world.cost(episode.truth, self.filter.mean(episode.filter))
 
     def counted_cost(self, episode: Episode) -> Array:
-        """Return the part of the cost that the reward counts, ``(N,)``; see :meth:`World.counted_cost`."""
+        """Return the part of the estimate's cost that enters the reward, ``(N,)``."""
         return self.task.world.counted_cost(episode.truth, self.filter.mean(episode.filter))
 
     def error(self, episode: Episode) -> Array:
@@ -220,20 +229,21 @@ class Model:
         return self.task.subtract(self.filter.mean(episode.filter), self.task.world.state(episode.truth))
 
     def covariance(self, episode: Episode) -> Array:
-        """Return the covariance that the estimator reports for its error, ``(C, C, N)``."""
+        """Return the covariance that the filter reports for its estimate, ``(C, C, N)``."""
         return self.filter.covariance(episode.filter)
 
     def track(self, episode: Episode) -> dict[str, Array]:
-        """Return the data of a picture: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
-        ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
+        """Return the arrays for a picture by name: ``truth`` if known, ``estimate``, ``covariance``,
+        ``measurement_NAME``.
         """
         measured = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
         return {**self._truth_and_estimate(episode), **measured}
 
     def picture_track(self, episode: Episode) -> dict[str, Array]:
-        """Return the arrays that a picture of a track shows: as :meth:`track`, but of the measurement only
-        ``seen``, the readings of the components ``(C, N)``, if the world has any; NaN where a component was not
-        measured.
+        """Return ``truth`` if known, ``estimate``, ``covariance``, and ``seen``, the readings of the components ``(C,
+        N)``.
+
+        ``seen`` is absent where the world has no such readings, and NaN where a component was not measured.
         """
         seen = self.task.world.component_readings(episode.measurement)
         return {**self._truth_and_estimate(episode), **({} if seen is None else {"seen": seen})}
@@ -248,7 +258,7 @@ class Model:
         return {"truth": truth, **estimate}
 
     def records(self, episode: Episode) -> dict[str, Array]:
-        """Return the further records of each measurement."""
+        """Return further values to record at a measurement, by name, of filter and world."""
         records = {
             **self.filter.records(episode.filter, episode.measurement),
             **self.task.world.records(episode.truth),

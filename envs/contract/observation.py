@@ -1,4 +1,4 @@
-"""Observations: a list of blocks gives fields, observation and decoding.
+"""Observations: a list of blocks, from which fields, values and their decoding follow.
 
 A :class:`Block` is one quantity of the observation: a function of the state of the filters, and the
 :class:`Compression` of its values. The base class of the banks derives the observation from the list, and a
@@ -32,7 +32,7 @@ class Field(NamedTuple):
 
 
 class Compression(NamedTuple):
-    """Compression of a value, and its inverse."""
+    """An invertible compression of values."""
 
     text: str
     """Text in front of the description of a block."""
@@ -45,12 +45,12 @@ class Compression(NamedTuple):
 
 
 def symlog(value: Array, xp: ModuleType) -> Array:
-    """Compress large values invertibly: ``sign(x) log(1 + |x|)``, close to x near zero."""
+    """Return the symmetric logarithm ``sign(x) log(1 + |x|)``, close to x near zero."""
     return xp.sign(value) * xp.log1p(xp.abs(value))
 
 
 def symexp(value: Array, xp: ModuleType) -> Array:
-    """Return the inverse of :func:`symlog`."""
+    """Return the inverse of :func:`symlog`: ``sign(y) (exp(|y|) - 1)``."""
     return xp.sign(value) * xp.expm1(xp.abs(value))
 
 
@@ -58,13 +58,13 @@ PLAIN = Compression("", None, None)
 """No compression and no limits."""
 
 
-def within(low: float, high: float) -> Compression:
-    """Return the identity, for values that cannot lie outside these limits."""
+def limited(low: float, high: float) -> Compression:
+    """Return a :class:`Compression` that changes nothing, for values within these limits."""
     return Compression("", None, None, (low, high))
 
 
-SHARE = within(0.0, 1.0)
-ACTION = within(-1.0, 1.0)
+SHARE = limited(0.0, 1.0)
+ACTION = limited(-1.0, 1.0)
 LARGEST_LOG = 710.0
 """Largest logarithm of a finite number; only that of zero is below the negative of :data:`SMALLEST_LOG`."""
 SMALLEST_LOG = 746.0
@@ -76,14 +76,14 @@ LIMIT = 8.0
 
 
 def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
-    """Return ``y / (1 + |y| / 8)`` of the signed logarithm y: close to x near zero, below 8 for the largest number."""
+    """Return ``y / (1 + |y| / 8)`` with y the symmetric logarithm of a value; its magnitude stays below 8."""
     logarithm = symlog(value, xp)
     return logarithm / (1.0 + (1.0 / LIMIT) * xp.abs(logarithm))
 
 
-def bounded_exponential(shown: numpy.ndarray) -> numpy.ndarray:
-    """Return the inverse of :func:`bounded_logarithm`."""
-    return symexp(shown / (1.0 - numpy.abs(shown) / LIMIT), numpy)
+def bounded_exponential(compressed: numpy.ndarray) -> numpy.ndarray:
+    """Return the values x whose ``bounded_logarithm(x)`` is ``compressed``: the inverse of that function."""
+    return symexp(compressed / (1.0 - numpy.abs(compressed) / LIMIT), numpy)
 
 
 BOUNDED_LOG = Compression(
@@ -92,19 +92,19 @@ BOUNDED_LOG = Compression(
     bounded_exponential,
     (-LIMIT, LIMIT),
 )
-"""For values that a wrong hypothesis can make arbitrarily large."""
-KEPT_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1, (0.0, LARGEST_LOG))
+"""Compression of values that a wrong hypothesis can make arbitrarily large."""
+STORED_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1, (0.0, LARGEST_LOG))
 """The block's function returns log(1 + x) already, because the filters store that; reading gives x."""
-LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1, KEPT_AS_LOG1P.limits)
-AVERAGE_OF_LOG1P = within(*KEPT_AS_LOG1P.limits)
-KEPT_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LOG))
+LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1, STORED_AS_LOG1P.limits)
+AVERAGE_OF_LOG1P = limited(*STORED_AS_LOG1P.limits)
+STORED_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LOG))
 """The block's function returns the logarithm already; reading gives the value."""
 
 
 def linear_scale(
     factor: float, offset: float = 0.0, limits: tuple[float, float] = (-math.inf, math.inf)
 ) -> Compression:
-    """Return the compression ``factor (x - offset)``, where the unit of the field describes the rest.
+    """Return the :class:`Compression` ``factor (x - offset)``, for values x within limits.
 
     Args:
         factor: above zero.
@@ -118,7 +118,7 @@ def linear_scale(
 
 
 class Block(NamedTuple):
-    """One quantity of the observation."""
+    """One quantity of the observation, in one row or several."""
 
     name: str
     value: Callable[[Any, Any], Array]
@@ -141,15 +141,15 @@ class Quantity(NamedTuple):
     unit: str
     text: str
     value: Callable[[Callable[[str], numpy.ndarray]], numpy.ndarray]
-    """From a function that reads blocks and other quantities by name to ``(N, parts)``."""
+    """Function that computes ``(N, parts)``; its argument reads blocks and other quantities by name."""
 
 
 Reader = Callable[[numpy.ndarray], numpy.ndarray]
-"""From observations ``(N, fields)`` to the values of one block or quantity, ``(N, parts)``."""
+"""Function from observations ``(N, fields)`` to the values of one block or quantity, ``(N, parts)``."""
 
 
 class Blocks:
-    """An observation made of blocks.
+    """An observation made of blocks, and the functions that decode it.
 
     Args:
         blocks: in the order of the observation.
@@ -189,7 +189,7 @@ class Blocks:
         self._values = [block.value for block in self.blocks]
 
     def observe(self, state: Any, measurement: Any) -> Array:
-        """Return the observation, ``(fields, N)``."""
+        """Return the observation, ``(fields, N)``, of a filter's state and a measurement."""
         xp = self.xp
         values = []
         for function in self._values:
@@ -209,7 +209,7 @@ class Blocks:
         return xp.concat(values)
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Return the positions of named fields.
+        """Return the positions of fields in the observation, by their names.
 
         Raises:
             ValueError: for a name that is no field.
@@ -236,7 +236,7 @@ class Blocks:
         return {block.name: block.compression.inverse for block in self.blocks}
 
     def reader(self, name: str) -> Reader:
-        """Return a function that reads a block, uncompressed, or a quantity from observations.
+        """Return a function from observations to the uncompressed values of a block or quantity, by its name.
 
         Raises:
             ValueError: for a name that is neither.
@@ -253,7 +253,7 @@ class Blocks:
 
 
 class DecisionMeans:
-    """Fields of the observation that are means over the measurements of a decision.
+    """Observation fields that are averaged over the measurements for which one action holds.
 
     Args:
         fields: of the observation.
@@ -270,15 +270,15 @@ class DecisionMeans:
         ]
 
     def add(self, total: Array, observation: Array) -> Array:
-        """Add these fields of an observation, ``(fields, N)``, to their sum since the last decision."""
+        """Return the sum of the averaged fields since the last decision with those of an observation added."""
         return total + observation[self.columns]
 
     def write(self, observation: numpy.ndarray, total: numpy.ndarray) -> None:
-        """Write the means into an observation in place; arguments as of :meth:`show`."""
+        """Replace the averaged fields of an observation in place by ``total`` over the number of measurements."""
         observation[self.columns] = total / self.interval
 
     def show(self, observation: Array, total: Array, xp: ModuleType) -> Array:
-        """Return an observation, ``(fields, N)``, with the means of these fields in their places.
+        """Return a copy of an observation, ``(fields, N)``, whose averaged fields contain their means.
 
         Args:
             observation: of the last measurement.
@@ -310,7 +310,7 @@ def _read(
 
 
 Value = Callable[[Any, Any], Array]
-"""From the bank's state and the measurement to the rows of a block."""
+"""Function from the bank's state and the measurement to the rows of a block."""
 Interval = Literal["last", "mean"]
 """Value of a block where one action applies to several measurements, see :class:`.Field`."""
 
@@ -323,33 +323,33 @@ def innovation_block(
     compression: Compression = SIGNED_LOG,
     over_interval: Interval = "last",
 ) -> Block:
-    """Return the block of the innovation over a deviation; by default the ``innovation`` of the state."""
+    """Return the observation block of the innovation divided by its predicted standard deviation."""
     return Block(name, value, text, parts, compression, over_interval=over_interval)
 
 
 def average_block(name: str, value: Value, text: str, parts: Sequence[str] = ()) -> Block:
-    """Return the block of the average over the last measurements of a signed value, such as an innovation."""
+    """Return the observation block of a running average of a signed value, such as an innovation."""
     return Block(name, value, text, parts, SIGNED_LOG)
 
 
 def nis_block(parts: Sequence[str] = ()) -> Block:
-    """Return the block of the normalised innovation squared, ``nis`` of the state."""
+    """Return the observation block of the normalised innovation squared (NIS), ``nis`` of the state."""
     return Block("nis", lambda f, _: f.nis, "normalised innovation squared", parts, LOG1P)
 
 
 def log_squared_block(parts: Sequence[str] = ()) -> Block:
-    """Return the block of log(1 + x), x the normalised innovation squared; the state has it as ``log_squared``."""
+    """Return the observation block of ``log(1 + NIS)``, which the state stores as ``log_squared``."""
     return Block(
         "log_squared_innovation",
         lambda f, _: f.log_squared,
         "the normalised innovation squared",
         parts,
-        KEPT_AS_LOG1P,
+        STORED_AS_LOG1P,
     )
 
 
 def average_log_squared_block(average: str, parts: Sequence[str] = ()) -> Block:
-    """Return the block of the average of :func:`log_squared_block`, ``average_log_squared`` of the state.
+    """Return the observation block of the running average of ``log(1 + NIS)``, ``average_log_squared`` of the state.
 
     Args:
         average: over which measurements, in words.
@@ -370,8 +370,7 @@ def expected_nis_block(
     text: str = "the hypotheses' mean normalised innovation squared",
     over_interval: Interval = "last",
 ) -> Block:
-    """Return the block of the normalised innovation squared that a bank of hypotheses expects; zero where nothing was
-    received.
+    """Return the observation block of the NIS averaged over a bank's hypotheses; zero where nothing was received.
 
     Args:
         xp: array namespace.
@@ -396,28 +395,26 @@ def relative_likelihood_block(
     name: str = "log_likelihood",
     value: Callable[[Any], Array] = lambda f: f.log_likelihood,
 ) -> Block:
-    """Return the block of the log-likelihoods of the hypotheses, less the largest; by default ``log_likelihood`` of
-    the state.
-    """
+    """Return the observation block of each hypothesis' log-likelihood minus the largest one."""
     return Block(name, lambda f, _: value(f) - xp.max(value(f), axis=0), text, parts, compression)
 
 
 def log_density_block(
     value: Value, text: str, name: str = "log_likelihood", over_interval: Interval = "last"
 ) -> Block:
-    """Return the block of the log-density of a measurement in its usual units."""
+    """Return the observation block of the log-density of a measurement in its usual units."""
     return Block(name, value, text, compression=BOUNDED_LOG, over_interval=over_interval)
 
 
 def log_predicted_block(
     parts: Sequence[str], text: str = "the logarithm of the predicted probability"
 ) -> Block:
-    """Return the block of the logarithms of the predicted probabilities, ``log_predicted`` of the state."""
+    """Return the observation block of the log-predicted mode probabilities, ``log_predicted`` of the state."""
     return Block("log_predicted", lambda f, _: f.log_predicted, text, parts, SIGNED_LOG)
 
 
 def predicted_block(parts: Sequence[str], measurement: str = "measurement", of: str = "") -> Block:
-    """Return the block of the logarithms of the probabilities ``predicted`` by a bank of hypotheses.
+    """Return the observation block of the logarithms of a bank's predicted probabilities, ``predicted`` of the state.
 
     Args:
         parts: suffixes of the rows.
@@ -440,14 +437,12 @@ def probability_block(
     name: str = "probability",
     value: Callable[[Any], Array] = lambda f: f.probabilities,
 ) -> Block:
-    """Return the block of the probabilities of hypotheses, by default ``probabilities`` of the state; rounding may not
-    leave 0 to 1.
-    """
+    """Return the observation block of the hypotheses' probabilities, clipped to [0, 1]."""
     return Block(name, lambda f, _: xp.clip(value(f), 0.0, 1.0), text, parts, SHARE)
 
 
 def entropy_block(xp: ModuleType) -> Block:
-    """Return the block of the entropy of the hypotheses, ``entropy`` of the state."""
+    """Return the observation block of the entropy of the hypotheses' probabilities, ``entropy`` of the state."""
     return Block(
         "entropy",
         lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
@@ -461,34 +456,30 @@ def prior_block(
     text: str = "the sigma of the predicted position over that of the measurement",
     value: Value = lambda f, _: f.prior,
 ) -> Block:
-    """Return the block of the deviation of the prediction over that of the measurement; the state has the logarithm
-    ``prior``.
-    """
-    return Block("prior", value, text, parts, KEPT_AS_LOG)
+    """Return the observation block of the predicted over the measured deviation, of which the state has the log."""
+    return Block("prior", value, text, parts, STORED_AS_LOG)
 
 
 def last_action_block(
     parts: Sequence[str] = (), name: str = "last_action", compression: Compression = ACTION
 ) -> Block:
-    """Return the block of the action that was applied before, ``action`` of the state."""
+    """Return the observation block of the previous action, ``action`` of the state."""
     return Block(name, lambda f, _: f.action, "action applied before", parts, compression)
 
 
 def last_weight_block(
     parts: Sequence[str],
     value: Callable[[Any], Array] = lambda f: f.probabilities,
-    text: str = "weight in force before this scan",
+    text: str = "weight before this scan",
 ) -> Block:
-    """Return the block of the weights of the hypotheses that were in force before; by default ``probabilities`` of
-    the state.
-    """
+    """Return the observation block of the hypotheses' weights before this measurement; by default ``probabilities``."""
     return Block("last_weight", lambda f, _: value(f), text, parts, SHARE)
 
 
 def availability_block(
     text: str = "1 where a value was received", parts: Sequence[str] = (), over_interval: Interval = "last"
 ) -> Block:
-    """Return the block that shows whether a measurement was received, its ``available``."""
+    """Return the observation block that is one where a measurement was received and zero elsewhere."""
     return Block(
         "available",
         lambda _, measurement: measurement.available,
@@ -500,11 +491,11 @@ def availability_block(
 
 
 def clock_block(xp: ModuleType, horizon: int, unit: str = "1") -> Block:
-    """Return the block of the share of the horizon that has passed, from the ``number`` of a measurement."""
+    """Return the observation block of the share of the episode that has passed: ``number`` over the horizon."""
     return Block(
         "time",
         lambda _, measurement: xp.astype(measurement.number, xp.float64) / horizon,
         "measurements so far over the horizon",
-        compression=within(0.0, (horizon + 1) / horizon),
+        compression=limited(0.0, (horizon + 1) / horizon),
         unit=unit,
     )

@@ -23,7 +23,7 @@ import numpy
 
 @dataclasses.dataclass(frozen=True)
 class ParameterLimits:
-    """Limits of a value beside its type; of each number where the value is a sequence."""
+    """Limits of a parameter's value beside its type; of each number if the value is a sequence."""
 
     above: float | None = None
     at_least: float | None = None
@@ -31,13 +31,13 @@ class ParameterLimits:
     at_most: float | None = None
     choices: tuple[str, ...] = ()
     ascending: bool = False
-    """Of a pair: the first must not be larger than the second."""
+    """Whether the first number of a pair must not be larger than the second."""
     stochastic: bool = False
-    """Of a row of numbers: they are probabilities that sum to one."""
+    """Whether a row of numbers must be probabilities that sum to one."""
 
 
 def parameter(default: Any, **limits: Any) -> Any:
-    """Declare a field of a parameters' dataclass with its default and its :class:`ParameterLimits`."""
+    """Return a dataclass field with a default value and :class:`ParameterLimits` for a parameter of a task."""
     return dataclasses.field(default=default, metadata={"limits": ParameterLimits(**limits)})
 
 
@@ -51,7 +51,7 @@ class TaskParameters:
     """Measurements for which one action holds."""
 
     def __post_init__(self) -> None:
-        """Check every field.
+        """Check every field against its type and limits, and convert lists to tuples.
 
         Raises:
             ValueError: with the name of the field, its value and the expected values.
@@ -69,12 +69,12 @@ class TaskParameters:
         self.check()
 
     def check(self) -> None:
-        """Check conditions on several fields together."""
+        """Raise ValueError for fields that contradict each other; subclasses override it."""
 
 
 @cache
 def field_limits(cls: type) -> dict[str, tuple[Any, ParameterLimits]]:
-    """Return the type and limits of every field of a parameters' dataclass."""
+    """Return the type and the :class:`ParameterLimits` of every field of a parameters' dataclass, by name."""
     hints = typing.get_type_hints(cls)
     return {
         f.name: (hints[f.name], f.metadata.get("limits", ParameterLimits())) for f in dataclasses.fields(cls)
@@ -82,14 +82,14 @@ def field_limits(cls: type) -> dict[str, tuple[Any, ParameterLimits]]:
 
 
 def freeze(value: Any) -> Any:
-    """Turn lists and arrays into tuples, all the way down, so that parameters from JSON equal those from Python."""
+    """Return a value with nested lists and arrays converted to tuples, so that parameters from JSON compare equal."""
     if isinstance(value, numpy.ndarray | numpy.generic):
         value = value.tolist()
     return tuple(freeze(item) for item in value) if isinstance(value, list | tuple) else value
 
 
 def check(name: str, value: Any, hint: Any, limits: ParameterLimits) -> None:
-    """Check a value against its declared type and limits.
+    """Raise ValueError if a parameter's value violates its declared type or limits.
 
     Raises:
         ValueError: with the name, the value and the expected values.
@@ -133,7 +133,7 @@ LARGEST = 1e60
 
 
 def quote_shortened(value: Any, most: int = 80) -> str:
-    """Return a value as Python writes it, on one line and shortened where it is long."""
+    """Return the ``repr`` of a value on one line, shortened to at most ``most`` characters."""
     if isinstance(value, int) and abs(value) >= 10**most:
         return f"a whole number of {value.bit_length() * math.log10(2.0):,.0f} digits"
     if isinstance(value, str | bytes | list | tuple):
@@ -146,7 +146,7 @@ def quote_shortened(value: Any, most: int = 80) -> str:
 
 
 def read_numbers(name: str, value: Any) -> numpy.ndarray:
-    """Return an array of floats from the input of a user.
+    """Return a user's number or nested list of numbers as an array of floats.
 
     Raises:
         ValueError: for a value that is no number, or rows of several lengths.
@@ -178,7 +178,7 @@ def _integer(name: str, value: Any, limits: ParameterLimits) -> None:
 
 
 def check_integer(name: str, value: Any, at_least: int) -> int:
-    """Return a whole number, of Python or NumPy, that a user gave as an argument.
+    """Return a user's argument as an int, after a check that it is a whole number and not too small.
 
     Raises:
         ValueError: with the name, the value and the expected values.
@@ -216,13 +216,13 @@ def _sequence(name: str, value: Any, of: tuple[Any, ...], limits: ParameterLimit
 
 
 def check_length(name: str, value: Sequence[Any], count: int, what: str = "numbers") -> None:
-    """Check the length of a sequence that depends on other parameters."""
+    """Raise ValueError if a sequence parameter has not ``count`` elements, as another parameter requires."""
     if len(value) != count:
         raise ValueError(f"{name} must be {count} {what}, got {quote_shortened(value)}")
 
 
 def square_matrix(name: str, rows: Sequence[Sequence[float]], size: int) -> None:
-    """Check the shape of a matrix of transition probabilities that depends on other parameters."""
+    """Raise ValueError if a transition matrix is not ``(size, size)``, as another parameter requires."""
     if len(rows) != size:
         raise ValueError(
             f"{name} must have {size} rows (row = from, column = to), got {quote_shortened(rows)}"

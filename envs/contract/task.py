@@ -23,7 +23,7 @@ The clock of every task:
 
 ``begin`` makes the episode at the start of the track, as if step 4 had just happened: :meth:`World.begin`
 gives the initial estimate to :meth:`Filter.start`. A reset is ``begin``, 1, 2, 3; an
-environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation shows a
+environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation is that of a
 real measurement that is not acted on.
 
 A :class:`Task` is the declaration of an author; :class:`TaskBase` derives the rest from it: the parameters, the
@@ -54,7 +54,7 @@ from .task_base import TaskBase
 from .world import World
 
 Banks = Mapping[str, type[Bank[Any, Any, Any]]]
-"""Bank of each control."""
+"""Class of the bank of each control, by its name."""
 
 
 class Component(NamedTuple):
@@ -90,7 +90,7 @@ class Scenario:
 
 
 class PaperPolicy(NamedTuple):
-    """The paper's algorithm as a constant action."""
+    """The algorithm of the source paper as a constant action."""
 
     control: str
     action: tuple[float, ...]
@@ -150,11 +150,12 @@ class Task(TaskBase):
             cls.controls = tuple(cls.banks)
 
     def set_up(self) -> None:
-        """Compute the constants that world and banks share; optional."""
+        """Compute the constants that world and banks share; an optional method of an environment's author."""
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
-        """Return the feedback of an estimate to the world, in a closed loop. A filter may give back something else, see
-        :meth:`.Filter.feedback`.
+        """Return the feedback to the world in a closed loop, computed from an estimate, such as a control command.
+
+        A filter may return another one, see :meth:`.Filter.feedback`.
 
         Args:
             mean: of the estimate, ``(C, N)``.
@@ -168,7 +169,7 @@ class Task(TaskBase):
 
 
 def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
-    """Return the arrays of nested NamedTuples, with the names that lead to them."""
+    """Yield the arrays of nested NamedTuples with their names, joined by underscores."""
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
             yield from named_arrays(value, f"{prefix}{name}_")
@@ -177,7 +178,7 @@ def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
 
 
 def field_texts(cls: type) -> dict[str, str]:
-    """Return the documentation below each field of a class, in one line; empty where there is none."""
+    """Return the docstring below each field of a class as one line, by name; empty where there is none."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):
@@ -193,9 +194,7 @@ def field_texts(cls: type) -> dict[str, str]:
 
 
 def field_words(cls: type) -> dict[str, str]:
-    """Return the words for a single track in which the field exists: without shapes such as ``(2, N)``, and without a
-    clause on where it is None.
-    """
+    """Return the docstrings of a class's fields by name, without array shapes and without clauses on None."""
     found = {}
     for name, text in field_texts(cls).items():
         words = re.sub(r"(, |^)``\([^`]*\)``\.?", "", text)

@@ -1,4 +1,4 @@
-"""Derived parts of a task: its constants, arrays, episodes and random numbers."""
+"""Base class of a task: constants, arrays, episodes and random numbers, derived from its declaration."""
 
 import functools
 import importlib
@@ -30,8 +30,7 @@ class NoiseLayout(NamedTuple):
 
 
 class TaskBase(ABC):
-    """Parts that are computed from the declaration of a task: its parameters on arrays, its world, and how its episodes
-    run.
+    """Base class that derives a task's world, constants and the course of its episodes from its declaration.
 
     The author of a task writes only the declaration, :class:`~.task.Task`.
 
@@ -93,22 +92,22 @@ class TaskBase(ABC):
 
     @abstractmethod
     def set_up(self) -> None:
-        """Compute the constants that world and banks share."""
+        """Compute the constants that the world and the banks of a task share; an author defines it."""
 
     @abstractmethod
     def _writes_feedback(self) -> bool:
-        """Return whether the declaration defines a feedback to the world."""
+        """Return whether the task overrides :meth:`.Task.feedback`."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Share the task, which never changes."""
+        """Return the task itself, which is immutable."""
         return self
 
     def __reduce__(self) -> Any:
-        """Pickle the arguments of the task; its array namespace, a module, cannot be pickled."""
+        """Return the constructor's arguments for pickling; the array namespace, a module, by its name."""
         return _remake, (type(self), self.parameters, self.xp.__name__, self.device, self.recording)
 
     def on(self, xp: ModuleType, device: Any = None) -> Self:
-        """Return the same problem on other arrays."""
+        """Return the same task on arrays of another namespace and device."""
         return type(self)(self.parameters, xp, device, self.recording)
 
     @functools.cached_property
@@ -122,11 +121,11 @@ class TaskBase(ABC):
 
     @functools.cached_property
     def periods(self) -> dict[int, float]:
-        """Periods of the components that are angles, by their numbers."""
+        """Period of each component that is an angle, by its index."""
         return {i: one.period for i, one in enumerate(self.components) if one.period is not None}
 
     def subtract(self, estimate: Array, truth: Array) -> Array:
-        """Return estimate minus truth, ``(C, ...)`` each; of an angle the shortest difference."""
+        """Return estimate minus truth, ``(C, ...)`` each; for an angle the shortest difference."""
         return shorten(estimate - truth, self.periods)
 
     def _noise_layout(self) -> NoiseLayout:
@@ -149,11 +148,11 @@ class TaskBase(ABC):
         return seconds
 
     def _sampling_interval(self) -> float | None:
-        """Return the time between measurements by the parameters, s; None where it differs."""
+        """Return the time between measurements from the parameters, s; None where it varies."""
         return getattr(self.parameters, "sampling_interval", None)
 
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Return the number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
+        """Return the integer index of the flight that each episode flies, ``(N,)``, drawn from :attr:`flights`.
 
         Args:
             uniforms: of the scenario, ``(noise.uniforms, N)``; the first row draws the flight.
@@ -161,7 +160,7 @@ class TaskBase(ABC):
         return numpy.floor(len(self.flights) * uniforms[0]).astype(int)
 
     def lengths(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Return the measurements acted on in each episode, ``(N,)``.
+        """Return the number of measurements acted on in each episode, ``(N,)``.
 
         Args:
             uniforms: of the scenario, ``(noise.uniforms, N)``.
@@ -171,8 +170,10 @@ class TaskBase(ABC):
         return numpy.asarray(self.flights)[self.flight_of(uniforms)]
 
     def constant(self, values: Any) -> Array:
-        """Turn numbers into a float64 array of the task's namespace and device; nested lists may hold arrays ``(N,)``
-        beside numbers, where episodes differ, and then get a last axis of N.
+        """Return numbers as a float64 array of the task's namespace and device.
+
+        Nested lists may contain arrays ``(N,)`` beside numbers, where episodes differ; the result then has a last
+        axis of N.
         """
         if isinstance(values, list | tuple):
             arrays = lane_arrays(values)

@@ -1,4 +1,4 @@
-"""Truth and sensors: the half of a task that is simulated, or replayed."""
+"""Truth and sensors: the part of a task that is simulated, or replayed from a recording."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,10 +16,10 @@ Measurement = TypeVar("Measurement")
 
 
 class World(ABC, Generic[TaskT, Truth, Measurement]):
-    """Truth and sensors.
+    """Base class of the truth and the sensors of a task.
 
     Args:
-        task: whose world it is, with the constants that both halves share.
+        task: the estimation problem, with the constants that world and filter share.
 
     Attributes:
         initial_normals: standard normal numbers of the track's start.
@@ -55,7 +55,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     @abstractmethod
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Any]:
-        """Return the truth at the start of the track, and the initial estimate given to every filter.
+        """Return the true state at the start of the track, and the initial estimate given to every filter.
 
         Args:
             draws: random numbers that fix the scenario of each episode.
@@ -67,7 +67,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     @abstractmethod
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
-        """Step 1: advance the truth and return it with the readings of the sensors.
+        """Return the true state at the next measurement, and that measurement's readings (step 1 of the clock).
 
         Args:
             truth: at the previous measurement.
@@ -81,7 +81,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return state
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
-        """Replace every value that was not received with NaN, for an estimator.
+        """Return the measurement with NaN in place of every value that was not received, for an estimator.
 
         The filters of a bank weight a value by its availability, so its number does not matter to them. An estimator
         that ignores the availability must not use that number as a measurement. By default the values of
@@ -98,7 +98,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return replaced
 
     def add_recorded_fields(self, measurement: Measurement) -> Measurement:
-        """Replace None with zeros in the fields that only recordings may contain; by default there are no such fields.
+        """Return the measurement with zeros instead of None in fields that only recordings contain.
 
         Args:
             measurement: of :meth:`advance`.
@@ -113,14 +113,13 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return None
 
     def component_deviations(self, measurement: Measurement) -> Array | None:
-        """Return the standard deviations that are stated for the errors of :meth:`component_readings`, in the same
-        shape; None where those are None.
-        """
+        """Return the stated standard deviations of :meth:`component_readings`, ``(C, N)``, or None."""
         return None
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Return the standard deviations of the errors of what sensors read, stated or nominal, in the shape of the
-        readings; here the square roots of ``stated_field``.
+        """Return the standard deviations of the readings' errors, in the shape of the readings.
+
+        By default the square roots of ``stated_field``; a subclass may return nominal ones.
 
         Args:
             measurement: of :meth:`advance`.
@@ -132,8 +131,9 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.xp.sqrt(getattr(measurement, self.stated_field))
 
     def error_cost(self, error: Array) -> Array:
-        """Return the cost of an error of the estimate alone, ``(N,)``; :meth:`cost` then need not be
-        defined, and recordings of the task can be evaluated.
+        """Return the cost of an estimation error, ``(N,)``, without the truth.
+
+        Where it is defined, :meth:`cost` need not be, and recordings of the task can be evaluated.
 
         Args:
             error: estimate minus truth, ``(C, N)``, in the units of the task's components.
@@ -141,7 +141,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         raise NotImplementedError(f"{type(self).__name__} needs error_cost, or a cost of its own")
 
     def cost(self, truth: Truth, mean: Array) -> Array:
-        """Step 5: return the cost of an estimate, uncapped, ``(N,)``.
+        """Return the uncapped cost of an estimate, ``(N,)`` (step 5 of the clock).
 
         A squared error in units of the sensor's nominal variance (:meth:`error_cost`), or, where the estimate drives a
         control loop, the quadratic cost of the loop in a fixed unit.
@@ -153,8 +153,9 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.error_cost(self.task.subtract(mean, self.state(truth)))
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
-        """Return the part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it,
-        except a part that the estimate is known not to cause.
+        """Return the part of the cost of an estimate that enters the reward, not negative, ``(N,)``.
+
+        That is all of it, except a part that the estimate is known not to cause.
 
         Args:
             truth: at the measurement that the estimate is for.
@@ -163,11 +164,12 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.cost(truth, mean)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return further records of the truth at each measurement, for an evaluation: arrays ``(N,)``."""
+        """Return further values of the truth to record at each measurement, by name: arrays ``(N,)``."""
         return {}
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the random draws of the episode, and those in force now: finite arrays ``(..., N)`` of constant
-        shape. The time of an event that does not occur is -1.
+        """Return the random draws of the episode and their current values by name: finite arrays ``(..., N)``.
+
+        Their shapes are constant. The time of an event that does not occur is -1.
         """
         return {}

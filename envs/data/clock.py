@@ -1,4 +1,4 @@
-"""Times as numbers: seconds of a log or since 1970, and their unit."""
+"""Time stamps: seconds of a log, or units since 1970."""
 
 SINCE_1970 = 1e8
 """Smallest time that counts from 1970, s: that of a log of three years from zero on is below it, a date after 1973
@@ -8,8 +8,7 @@ TIME_UNITS = 1e9, 1e6, 1e3
 
 
 def time_unit(time: float) -> float:
-    """Return the number of units of a time in a second: 1e9, 1e6 or 1e3 of a number that is too large for seconds since
-    1970.
+    """Return the units per second of a time stamp, by its magnitude: 1, or 1e3, 1e6, 1e9 for units since 1970.
 
     1e11 seconds after 1970 are in the year 5138, 1e11 milliseconds in 1973; and so on in steps of a thousand.
     """

@@ -1,4 +1,4 @@
-"""Reading of files from outside: each is opened, measured and parsed here, under one set of limits.
+"""Reading of files from outside: opened, measured and parsed under limits of memory and processor time.
 
 The path must be a file, no device, pipe or folder, and no larger than its reader accepts. JSON is counted before it is
 parsed. Formats that need other libraries (NetCDF-4, Parquet, ULog, bags, SQLite, YAML) are parsed in a process of their
@@ -49,7 +49,7 @@ class ReadingLimits(NamedTuple):
 
 
 def limits() -> ReadingLimits:
-    """Return the limits in force.
+    """Return the limits of memory and processor time from environment variables, else the defaults.
 
     Raises:
         ValueError: if an environment variable is not a valid limit.
@@ -67,7 +67,7 @@ def limits() -> ReadingLimits:
 
 
 def refuse_memory(what: str) -> ValueError:
-    """Return the error for a file that needs more memory than the limit; ``what`` names the part that needs it."""
+    """Return a ValueError for a file whose part ``what`` needs more memory than the limit."""
     most = limits().memory / 1e6
     return ValueError(
         f"{what}, and reading a file may take {most:,.0f} MB: split it, or set {MEMORY}={2 * most:.0f} (MB) if you "
@@ -77,7 +77,7 @@ def refuse_memory(what: str) -> ValueError:
 
 @contextlib.contextmanager
 def open_foreign(path: Path, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
-    """Open a file for reading, if it is a regular file and not too large.
+    """Context manager that opens a file for reading in binary, if it is a regular file and not too large.
 
     Args:
         path: path of the file.
@@ -109,7 +109,7 @@ def _size(count: int) -> str:
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether there is a folder of this name; False for a name that no folder can have."""
+    """Return whether a path is an existing folder; False for a name that is not valid."""
     try:
         return path.is_dir()
     except (OSError, ValueError):  # an impossible name of a file
@@ -117,7 +117,7 @@ def is_folder(path: Path) -> bool:
 
 
 def read_content(path: Path, most: int | None = None) -> bytes:
-    """Return the bytes of a file.
+    """Return the bytes of a file, if it is a regular file and not too large.
 
     Args:
         path: path of the file.
@@ -136,7 +136,7 @@ def read_content(path: Path, most: int | None = None) -> bytes:
 
 
 def parse_json(content: bytes) -> Any:
-    """Return the content of JSON, if it fits into the limit of memory.
+    """Return the value of a JSON text, after a check that it fits into the memory limit.
 
     Raises:
         ValueError: if it is no JSON, or larger.
@@ -154,7 +154,7 @@ def parse_json(content: bytes) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
+    """Return the decoded value of a JSON file, within the memory limit.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -164,7 +164,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """Return the content of a YAML file: words, numbers, lists and mappings.
+    """Return the value of a YAML file: words, numbers, lists and mappings.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -183,7 +183,7 @@ _WARNED: list[bool] = []
 
 
 def _warn_without_limit() -> None:
-    """Warn once where the system cannot limit the memory of a process."""
+    """Warn, once, if the system cannot limit the memory of a process."""
     if sys.platform != "linux" and not _WARNED:
         _WARNED.append(True)
         warnings.warn(
@@ -200,7 +200,7 @@ def _has(library: str) -> bool:
 
 
 def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **options: Any) -> Any:
-    """Parse a file in a process of its own, under the limits.
+    """Return the plain values of a file, parsed in a subprocess with limits of memory and processor time.
 
     Args:
         parser: name of one of :data:`.foreign_parsers.PARSERS`.
@@ -263,7 +263,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
 
 
 def _explain_end(code: int, seconds: float) -> ValueError:
-    """Return the error for a parser that ended without a result."""
+    """Return a ValueError for a parser process that ended without a result."""
     if code == 3:
         return refuse_memory("its parser needs more memory")
     if -code in (9, 24):  # SIGKILL, SIGXCPU
@@ -275,7 +275,7 @@ def _explain_end(code: int, seconds: float) -> ValueError:
 
 
 def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
-    """Return the head of a result and its arrays; None for an incomplete result."""
+    """Return the JSON head and the arrays that a parser process sent; None for an incomplete result."""
     size = answer.read(8)
     if len(size) < 8 or int.from_bytes(size, "little") > memory:
         return None, []
@@ -299,7 +299,7 @@ def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
 
 
 def _array_forms(value: Any) -> Iterator[tuple[str, list[int]]]:
-    """Return the types and shapes of the arrays that a head names, in their order."""
+    """Yield the type and shape of each array that a head names, in their order."""
     if isinstance(value, dict):
         if "array" in value:
             yield value["dtype"], value["shape"]

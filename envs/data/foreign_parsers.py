@@ -1,4 +1,4 @@
-"""Parsers of other libraries, run as a program of their own under limits of memory and processor time.
+"""Parsers based on other libraries, run as a separate program under limits of memory and processor time.
 
 :mod:`.foreign_files` starts this file with the interpreter's ``-I`` and a request in JSON: the parser, the
 path, and the limits. The file to read is open as standard input. The result goes to standard output: the length of a
@@ -28,7 +28,7 @@ MOST_NODES = 100_000
 
 
 def check_column_names(names: Sequence[str]) -> list[str]:
-    """Return names of columns in lower case.
+    """Return the names of a table's columns in lower case.
 
     Raises:
         ValueError: if there are too many, one is too long, or two are equal.
@@ -51,7 +51,7 @@ def check_column_names(names: Sequence[str]) -> list[str]:
 
 
 def check_rows(count: int, most: int) -> None:
-    """Raise ValueError for a table with too many rows."""
+    """Raise ValueError if a table has more rows than the limit."""
     if count > most:
         raise ValueError(f"it has more than {most:,} rows: split it, or reduce the rate of its rows")
 
@@ -72,7 +72,7 @@ def check_cells(name: str, cells: Any) -> None:
 def parse_netcdf4(
     file: BinaryIO, path: str, wanted: Mapping[str, Any] | None, bytes_limit: int, numbers_limit: int
 ) -> Any:
-    """Return attributes and variables of the root group.
+    """Return the attributes and variables of the root group of a NetCDF-4 file, as lists of pairs.
 
     Args:
         file: the open file.
@@ -103,7 +103,7 @@ def parse_netcdf4(
         total = sum(size(variable) * max(_item_size(variable), 1) for variable in chosen.values())
         if numbers > numbers_limit:
             raise ValueError(
-                f"it holds {numbers:,} numbers, more than the {numbers_limit:,} that it may: split it"
+                f"it holds {numbers:,} numbers, more than the limit of {numbers_limit:,}: split it"
             )
         if total > bytes_limit:
             raise LimitError(f"its values take {total / 1e6:,.0f} MB")
@@ -137,7 +137,7 @@ def _item_size(variable: Any) -> int:
 
 
 def _check_links(group: Any, h5py: Any) -> None:
-    """Raise ValueError if a variable's values would come from another file."""
+    """Raise ValueError if a variable of an HDF5 group has its values in another file."""
     for name in group:
         link = group.get(name, getlink=True)
         if isinstance(link, h5py.ExternalLink):
@@ -148,7 +148,7 @@ def _check_links(group: Any, h5py: Any) -> None:
 
 
 def parse_netcdf4_names(file: BinaryIO, path: str) -> Any:
-    """Return the names of the attributes of the root group."""
+    """Return the names of the attributes of a NetCDF-4 file's root group."""
     import h5py
 
     with h5py.File(file, "r") as data:
@@ -161,7 +161,7 @@ def parse_netcdf4_names(file: BinaryIO, path: str) -> Any:
 def parse_parquet(
     file: BinaryIO, path: str, wanted: Mapping[str, Any], rows_limit: int, bytes_limit: int
 ) -> Any:
-    """Return names of all columns, and the known ones: arrays, dates, or words by their numbers.
+    """Return the names of all columns of a Parquet file, and the wanted columns as arrays, dates or numbered words.
 
     Args:
         file: the open file.
@@ -204,7 +204,7 @@ def parse_parquet(
 
 
 def _arrow_column(name: str, column: Any, pyarrow: Any) -> Any:
-    """Return a column in the types of a message; missing numbers are NaN, missing words have the number -1."""
+    """Return an Arrow column as plain arrays; missing numbers are NaN, missing words have the number -1."""
     import numpy
 
     types, kind = pyarrow.types, column.type
@@ -254,8 +254,9 @@ ONBOARD_FIELDS = ("timestamp", "timestamp_sample", "x", "y", "ref_lat", "ref_lon
 
 
 def parse_ulog(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
-    """Return the topic with positions of a log of PX4, names of all its fields, and the known ones; ``onboard`` the
-    topic and the fields of the vehicle's own filter, empty without one.
+    """Return the receiver's positions in a PX4 log (ULog): the topic, the names of its fields, and the known ones.
+
+    With ``onboard`` the positions of the vehicle's own filter, empty if there are none.
     """
     import pyulog
 
@@ -284,9 +285,10 @@ ORIGINS = {"ORGN": ("TimeUS", "Type", "Lat", "Lng")}
 
 
 def parse_dataflash(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
-    """Return the fixes of the first receiver in a log of ArduPilot, a column each, and the stated errors;
-    ``onboard`` the estimates of the first core of the vehicle's own filter and their origins, empty without
-    them.
+    """Return the first receiver's position fixes in an ArduPilot log, a column each, and their stated errors.
+
+    With ``onboard`` the estimates of the first core of the vehicle's own filter and their origins, empty if there are
+    none.
     """
     import numpy
     from pymavlink import DFReader
@@ -324,7 +326,7 @@ class _Bag(NamedTuple):
     """Digests of the library's definitions of types; None where a bag contains none."""
 
     def busiest(self, kind: str) -> str:
-        """Return the topic with most messages of a type; empty where there are none."""
+        """Return the topic with the most messages of a type; empty if there are none."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             if connection.msgtype == kind:
@@ -332,7 +334,7 @@ class _Bag(NamedTuple):
         return next(iter(counts.most_common(1)), ("", 0))[0]
 
     def rows(self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int) -> Any:
-        """Return the numbers of the messages of a topic, a column each, since messages need a hundred times the memory.
+        """Return the numbers of a topic's messages as columns, since messages need a hundred times the memory.
 
         Raises:
             ValueError: if there are none or too many, or they are of another definition.
@@ -353,7 +355,7 @@ class _Bag(NamedTuple):
 
 
 def _open_bag(path: str) -> _Bag:
-    """Open a bag with the library's definitions of types, since definitions in a bag would become code."""
+    """Return an open ROS bag with the library's type definitions; those in a bag would be compiled to code."""
     from rosbags.typesys import Stores, get_typestore
 
     reader: Any
@@ -374,8 +376,9 @@ def _open_bag(path: str) -> _Bag:
 
 
 def parse_bag(file: BinaryIO, path: str, rows_limit: int) -> Any:
-    """Return the topic with most messages of a position, its kind and its numbers ``(values, n)``, and the same of a
-    topic of odometry beside positions of a receiver.
+    """Return the topic with the most positions in a ROS bag, its kind and its numbers ``(values, n)``.
+
+    The same follows for a topic of odometry beside positions of a receiver.
     """
     bag = _open_bag(path)
     topic, source = bag.busiest(NAVSAT), bag.busiest(ODOMETRY)
@@ -397,7 +400,7 @@ def _seconds(header: Any) -> float:
 
 
 def _fix_values(fix: Any) -> tuple[float, ...]:
-    """Time, status, latitude, longitude, altitude, variances east and north, and their type."""
+    """Return the time, status, latitude, longitude, altitude, variances east and north, and their type of a fix."""
     variances = fix.position_covariance.reshape(3, 3).diagonal()
     place = fix.latitude, fix.longitude, fix.altitude
     known = fix.position_covariance_type
@@ -405,7 +408,7 @@ def _fix_values(fix: Any) -> tuple[float, ...]:
 
 
 def _pose_values(message: Any) -> tuple[float, ...]:
-    """Time, x, y, and their variances, zero where the file has none."""
+    """Return the time, x, y, and their variances of a pose message; a variance is zero if the file has none."""
     pose, variances = message.pose, (0.0, 0.0)
     if hasattr(pose, "covariance"):
         diagonal = pose.covariance.reshape(6, 6).diagonal()
@@ -417,7 +420,7 @@ def _pose_values(message: Any) -> tuple[float, ...]:
 
 
 def parse_yaml(file: BinaryIO, path: str) -> Any:
-    """Return the content of a YAML file, in words, numbers, lists and mappings, its aliases resolved."""
+    """Return the value of a YAML file as words, numbers, lists and mappings, with aliases resolved."""
     import yaml
 
     try:
@@ -465,25 +468,23 @@ LIBRARIES: Mapping[str, tuple[str, ...]] = {
 
 
 class LimitError(Exception):
-    """A file needs more than the limit of memory; the message names it."""
+    """Error for a file that needs more than the memory limit."""
 
 
 # --- the program
 
 
 class _WithoutPandas:
-    """Import hook that hides pandas, which Arrow would import in 0.2 s and does not need here."""
+    """Import hook that hides pandas, whose import by Arrow takes 0.2 s and is not needed."""
 
     def find_spec(self, name: str, *_: Any) -> None:
-        """Leave every other module to the next finders."""
+        """Raise ImportError for pandas; return None for every other module."""
         if name == "pandas":
             raise ImportError(name)
 
 
 def _limit(memory: int, seconds: int) -> None:
-    """Limit this process to its present memory and ``memory`` bytes more, to ``seconds`` of processor time, and to
-    no written files.
-    """
+    """Limit this process's further memory, bytes, and processor time, s, and forbid it to write files."""
     try:
         import resource
     except ImportError:  # Windows; the parent has reported it
@@ -498,7 +499,7 @@ def _limit(memory: int, seconds: int) -> None:
 
 
 def _plain(value: Any, arrays: list[Any]) -> Any:
-    """Return a value in the types of JSON; append its arrays to a list, in their native order of bytes."""
+    """Return a value in the types of JSON, and append its arrays, in native byte order, to ``arrays``."""
     if isinstance(value, dict):
         return {name: _plain(item, arrays) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -533,7 +534,7 @@ def _answer(handle: int, head: Any, arrays: Sequence[Any] = ()) -> None:
 
 
 def main() -> None:
-    """Parse the file of the request in the first argument."""
+    """Parse the file that the request in the first argument names, and write the result to standard output."""
     request = json.loads(sys.argv[1])
     # Libraries print warnings, so the result has a channel of its own.
     answers = os.dup(1)

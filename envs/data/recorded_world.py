@@ -1,6 +1,4 @@
-"""Worlds that replay a recording or take live measurements, in place of a task's own; and examples of the measurements
-of a task.
-"""
+"""Worlds that replay a recording or take live measurements in place of a simulation; example measurements of a task."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -19,7 +17,7 @@ from ..contract.world import World
 
 
 class Replayed(NamedTuple):
-    """Place of an episode in the tables of a recording."""
+    """Position of an episode in the tables of a recording: the truth of a replayed world."""
 
     number: Array
     """Number of the recording, ``(N,)``, as a float, like all fields below."""
@@ -32,7 +30,7 @@ class Replayed(NamedTuple):
 
 
 class RecordedArrays(NamedTuple):
-    """A recording as it is replayed: arrays of floats with measurements, or recordings, as their last axis."""
+    """Arrays of a recording for replay: floats with measurements, or recordings, on the last axis."""
 
     measurements: Mapping[str, numpy.ndarray]
     initial: Mapping[str, numpy.ndarray]
@@ -44,8 +42,7 @@ class RecordedArrays(NamedTuple):
 
 
 def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """Return an example of the start of the track and of a measurement, from a task of NumPy; eight episodes side by
-    side.
+    """Return an example of the initial estimate and of a measurement of a task, arrays ``(..., 8)``.
 
     Args:
         task: on NumPy arrays.
@@ -66,7 +63,9 @@ def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
 
 def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """Return an example of the start of the track and of a measurement; arguments of :func:`measure_examples`.
+    """Return an example of the initial estimate and of a measurement of a task in an open loop.
+
+    Arguments as of :func:`measure_examples`.
 
     Raises:
         ValueError: if the measurements depend on the estimates.
@@ -81,7 +80,7 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
 
 def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
-    """Replace the arrays of nested NamedTuples by others, converted to their types.
+    """Return nested NamedTuples like ``like`` with other arrays, found by name and converted to the same types.
 
     Args:
         like: a measurement, or an initial estimate.
@@ -100,7 +99,7 @@ def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
 
 
 class _ForeignWorld(World[Task, Any, Any]):
-    """Readings of real sensors, in place of a task's own world.
+    """World with readings of real sensors in place of a task's simulated world.
 
     Attributes:
         simulated: the task's own world, which computes the cost of an error.
@@ -111,24 +110,24 @@ class _ForeignWorld(World[Task, Any, Any]):
         self.simulated: World[Any, Any, Any] = task.World(task)
 
     def mask_missing(self, measurement: Any) -> Any:
-        """Return a measurement with NaN in place of values that were not received, by the task's own world."""
+        """Return the measurement with NaN in place of missing values, as the task's simulated world does."""
         return self.simulated.mask_missing(measurement)
 
     def component_readings(self, measurement: Any) -> Array | None:
-        """Return the readings of the components, as in the task's own world."""
+        """Return the readings of the components, ``(C, N)``, as the task's simulated world does."""
         return self.simulated.component_readings(measurement)
 
     def component_deviations(self, measurement: Any) -> Array | None:
-        """Return the stated deviations of these readings, as in the task's own world."""
+        """Return the stated deviations of :meth:`component_readings`, as the task's simulated world does."""
         return self.simulated.component_deviations(measurement)
 
     def error_cost(self, error: Array) -> Array:
-        """Return the cost in the task's own world."""
+        """Return the cost of an estimation error by the task's simulated world, ``(N,)``."""
         return self.simulated.error_cost(error)
 
 
 class RecordedWorld(_ForeignWorld):
-    """Recorded readings, in place of a task's own world.
+    """World that replays the readings of a recording.
 
     Args:
         task: the task.
@@ -156,20 +155,21 @@ class RecordedWorld(_ForeignWorld):
         )
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:
-        """Draw a recording, and return its start."""
+        """Return a randomly drawn recording's position and initial estimate for each episode."""
         number = draws.integer("recording", (0, len(self.tables.first) - 1))
         first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
         initial = self._fill(self._initial, self.tables.initial, number)
         return Replayed(number, 0.0 * number, first, last), initial
 
     def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
-        """Advance to the next measurement; at the end the last one is repeated."""
+        """Return the position at the next measurement, and that measurement; the last one is repeated at the end."""
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
 
     def all_observations(self) -> tuple[Array | None, Array | None]:
-        """Return the readings of the components in all measurements of all episodes, and their stated deviations,
-        ``(C, measurements)``; None where the measurement is of no component.
+        """Return the readings of the components in all measurements and their stated deviations, ``(C, measurements)``.
+
+        Both are None where the measured quantity is no component.
         """
         columns = self.xp.arange(self.tables.seconds.shape[-1])
         measurement = self._fill(self._measurement, self.tables.measurements, columns)
@@ -178,16 +178,16 @@ class RecordedWorld(_ForeignWorld):
         )
 
     def _column(self, truth: Replayed) -> Array:
-        """Return the column of the present measurement."""
+        """Return the index of the current measurement in the tables, ``(N,)``."""
         xp = self.xp
         return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
 
     def _at(self, table: Array, column: Array) -> Array:
-        """Return the entries of a table, ``(..., N)``."""
+        """Return the entries of a table at measurements with these column numbers ``(N,)``, as ``(..., N)``."""
         return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
 
     def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
-        """Return a NamedTuple of arrays of the tables, in the types of another."""
+        """Return a NamedTuple like ``like`` with the entries of the tables at columns ``(N,)``."""
         return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
 
     def state(self, truth: Replayed) -> Array:
@@ -201,17 +201,17 @@ class RecordedWorld(_ForeignWorld):
         return self._at(self.tables.truth, self._column(truth))
 
     def records(self, truth: Replayed) -> dict[str, Array]:
-        """Return the time since the start of the track, s."""
+        """Return the values to record at a measurement, by name: the time since the start of the track, s."""
         return {"seconds": self._at(self.tables.seconds, self._column(truth))}
 
     def context(self, truth: Replayed) -> dict[str, Array]:
-        """Return the number of the recording."""
+        """Return the context by name: the index of the recording that each episode replays."""
         return {"recording": truth.number}
 
 
 @dataclass(frozen=True)
 class Feed:
-    """Source of live measurements, in place of a recording; the truth is unknown.
+    """Live measurements in place of a recording; the truth is unknown.
 
     Args:
         regular: whether every measurement comes, one sampling interval after the previous one.
@@ -231,24 +231,24 @@ class Feed:
     has_whole_truth: ClassVar[bool] = False
 
     def has_interval(self, seconds: float) -> bool:
-        """Return whether measurements come that many seconds apart; True where the filters do not use times."""
+        """Return whether measurements come that many seconds apart; True if the filters do not use times."""
         return True
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
-        """Return no lengths: live measurements have no episodes."""
+        """Return an empty tuple: live measurements have no episodes with a length."""
         return ()
 
     def world(self, task: Task) -> "LiveWorld":
-        """Return the world of live measurements."""
+        """Return the world of live measurements that replaces a task's simulated world."""
         return LiveWorld(task, self.second_sensor)
 
 
 class Unknown(NamedTuple):
-    """Unknown truth."""
+    """The unknown truth of live measurements, an empty state."""
 
 
 class LiveWorld(_ForeignWorld):
-    """Live measurements in place of a task's own world: the noise argument contains the numbers of a measurement.
+    """World of live measurements: its noise argument contains the numbers of a measurement.
 
     Args:
         task: the task.
@@ -267,15 +267,15 @@ class LiveWorld(_ForeignWorld):
         self.normals: int = _count_numbers(self.measurement)
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Unknown, Any]:
-        """Make an initial estimate from its numbers."""
+        """Return an unknown truth, and the initial estimate made of the numbers in ``normals``."""
         return Unknown(), self._fill(self.initial, normals)
 
     def advance(self, truth: Unknown, noise: Array, feedback: None) -> tuple[Unknown, Any]:
-        """Make a measurement from its numbers."""
+        """Return an unknown truth, and the measurement made of the numbers in ``noise``."""
         return truth, self._fill(self.measurement, noise)
 
     def _fill(self, like: Any, numbers: Array) -> Any:
-        """Return a NamedTuple of arrays like another, from the numbers of all its arrays in order, ``(numbers, N)``."""
+        """Return a NamedTuple like ``like`` whose arrays are successive rows of ``numbers``, ``(numbers, N)``."""
         parts, first = {}, 0
         for name, array in named_arrays(like):
             last = first + math.prod(array.shape[:-1])
@@ -284,12 +284,10 @@ class LiveWorld(_ForeignWorld):
         return fill_arrays(like, parts.__getitem__, self.xp)
 
     def state(self, truth: Unknown) -> Array:
-        """Raise ValueError: the truth is unknown."""
-        raise ValueError(
-            "the truth of what comes from outside is not known, so there is no error and no cost"
-        )
+        """Raise ValueError, since the truth of live measurements is unknown."""
+        raise ValueError("the truth of live measurements is unknown, so there is no error and no cost")
 
 
 def _count_numbers(like: Any) -> int:
-    """Return the numbers of a NamedTuple of arrays in one lane."""
+    """Return the number of rows that the arrays of a NamedTuple have in all."""
     return sum(math.prod(array.shape[:-1]) for _, array in named_arrays(like))

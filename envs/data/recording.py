@@ -1,4 +1,4 @@
-"""Recorded measurements in place of a simulated world: readings of real sensors, replayed to any policy.
+"""Recorded measurements in place of a simulated world: readings of real sensors, replayed under any policy.
 
 A :class:`Recording` contains episodes of one environment: every array of its ``Measurement``, the initial estimate of
 the start of the track, the times, and the truth where it is known. As a scenario it replaces the task's own world by a
@@ -40,7 +40,7 @@ class Recording(ScenarioData):
         measurements: every array of the environment's ``Measurement`` by its name, ``(E, T, ...)``.
         initial: every array of the initial estimate given to every filter, ``(E, ...)``.
         seconds: times since the start of the track, s, ``(E, T)``; NaN beyond the end of an episode.
-        lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation shows it,
+        lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation is of it,
             otherwise the last measurement again.
         truth: true values of the task's components in their units, ``(E, T, C)``; NaN for an unknown one, None
             where all are unknown.
@@ -110,7 +110,7 @@ class Recording(ScenarioData):
             self._check_episode(episode, int(rows[episode]), name)
 
     def _check_episode(self, episode: int, rows: int, name: str) -> None:
-        """Raise ValueError for an episode that cannot be replayed."""
+        """Raise ValueError if an episode cannot be replayed."""
         if not 1 <= self.lengths[episode] <= rows:
             raise ValueError(
                 f"recording {name!r}: length must be from 1 to its {rows} measurements, got {self.lengths[episode]}"
@@ -137,7 +137,7 @@ class Recording(ScenarioData):
                 raise ValueError(f"recording {name!r}: initial_{what} is not finite")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
-        """Share the recording, which never changes."""
+        """Return the recording itself, which is immutable."""
         return self
 
     def __repr__(self) -> str:
@@ -153,7 +153,7 @@ class Recording(ScenarioData):
 
     @functools.cached_property
     def truth_known(self) -> numpy.ndarray:
-        """Return whether each component of the truth is known at some measurement of every episode, ``(C,)``.
+        """Return whether the truth of each component is known somewhere in every episode, booleans ``(C,)``.
 
         The truth must not be None.
         """
@@ -171,7 +171,7 @@ class Recording(ScenarioData):
         return bool(numpy.isfinite(self.truth[there]).all())
 
     def has_interval(self, seconds: float) -> bool:
-        """Return whether measurements come that many seconds apart, the first that far from the start of the track."""
+        """Return whether measurements come that many seconds apart, counted from the start of the track."""
         times = seconds * numpy.arange(1, self.seconds.shape[1] + 1)
         late = numpy.abs(self.seconds - times)
         # NaN beyond the end of a shorter episode. Times in a file are rounded.
@@ -180,16 +180,16 @@ class Recording(ScenarioData):
     # --- as a scenario
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields by name."""
+        """Return the arrays and other constructor arguments of the recording, by name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
-        """Return the measurements acted on in each episode, whole decisions, none beyond the horizon."""
+        """Return the number of measurements acted on in each episode: whole decisions, none beyond the horizon."""
         lengths = numpy.minimum(self.lengths, horizon)
         return tuple((lengths - lengths % decision_interval).tolist())
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario that replays this recording, one of its episodes in every episode.
+        """Return a scenario in which every episode replays one recorded episode.
 
         Args:
             cls: the environment.
@@ -235,7 +235,7 @@ class Recording(ScenarioData):
         )
 
     def check_fits(self, task: Task) -> None:
-        """Raise ValueError if a task on NumPy measures arrays that the recording has not, or has a closed loop."""
+        """Raise ValueError if the recording lacks arrays of a task's measurement, or the task has a closed loop."""
         initial, measurement = measure_once(task, self.measurements)
         for kind, prefix, example, found, leading in (
             ("measures", "", measurement, self.measurements, 2),
@@ -251,8 +251,8 @@ class Recording(ScenarioData):
             for name in found:
                 if name not in expected:
                     raise ValueError(
-                        f"recording {self.name!r} has {prefix}{name}, which is nothing that {task.id} {kind}: "
-                        f"{', '.join(prefix + name for name in expected)}"
+                        f"recording {self.name!r} has {prefix}{name}, which is not among the arrays "
+                        f"that {task.id} {kind}: {', '.join(prefix + name for name in expected)}"
                     )
                 shape = found[name].shape[leading:]
                 if shape != expected[name]:
@@ -274,7 +274,7 @@ class Recording(ScenarioData):
             self._check_cost_known(task)
 
     def _check_cost_known(self, task: Task) -> None:
-        """Raise ValueError if the known part of the truth of an episode does not determine the cost of an error."""
+        """Raise ValueError if the known part of an episode's truth does not determine the cost of an error."""
         world, rows = task.World(task), self.rows
         for episode, name in enumerate(self.names):
             nothing = 0.0 * self.truth[episode, : rows[episode]].T  # type: ignore[index]
@@ -295,22 +295,22 @@ class Recording(ScenarioData):
 
     @property
     def dataset(self) -> Any:
-        """Return the content of the file, an :class:`xarray.Dataset`."""
+        """Return the recording as an :class:`xarray.Dataset`, the content of its file."""
         return _dataset_of(self)
 
     def write(self, path: Any) -> None:
-        """Write a NetCDF file, for ``read_recording`` and as the path of a scenario."""
+        """Write the recording to a NetCDF file, for ``read_recording`` or as the path of a scenario."""
         self.dataset.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
 
     # --- as a world
 
     def world(self, task: Task) -> RecordedWorld:
-        """Return the world that replays this recording."""
+        """Return the world of a task that replays this recording."""
         return RecordedWorld(task, self.tables, self.name)
 
     @functools.cached_property
     def tables(self) -> RecordedArrays:
-        """Arrays of all episodes one after another, as floats."""
+        """Arrays of all recorded episodes, concatenated along the last axis, as floats."""
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         ends = numpy.cumsum(self.rows)
 
@@ -331,7 +331,7 @@ class Recording(ScenarioData):
 
 
 def _dataset_of(recording: Recording) -> Any:
-    """Return the dataset of a recording, as in a file."""
+    """Return a recording as an :class:`xarray.Dataset`, the content of its file."""
     import xarray
 
     there = numpy.arange(recording.seconds.shape[1]) < recording.rows[:, None]
@@ -372,7 +372,7 @@ def _dataset_of(recording: Recording) -> Any:
 
 
 def recording_from(fields: Mapping[str, Any]) -> Recording:
-    """Return the recording from a dictionary of its fields, as read from JSON.
+    """Return a :class:`Recording` from a dictionary of its fields, as read from JSON.
 
     Raises:
         ValueError: if a field is missing or unknown.
@@ -405,7 +405,7 @@ def recording_from(fields: Mapping[str, Any]) -> Recording:
 
 
 def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
-    """Put recordings of one environment side by side; those with other parameters than the first are omitted.
+    """Return one recording with the episodes of several that have the parameters of the first; omit the others.
 
     Args:
         recordings: at least one.
@@ -443,7 +443,7 @@ def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[
 
 
 def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
-    """Put the episodes of recordings of one environment side by side.
+    """Return one recording with the episodes of several, padded to the same length.
 
     Args:
         recordings: at least one; the truth is known if it is known in all.
@@ -480,12 +480,12 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
 
 
 def _first(values: numpy.ndarray) -> int:
-    """Return the index of the first row that is not finite."""
+    """Return the index of the first row of an array that is not finite."""
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 
-def differing(parameters: Any) -> dict[str, Any]:
-    """Return the parameters of a task that differ from the defaults, without the horizon."""
+def changed_parameters(parameters: Any) -> dict[str, Any]:
+    """Return the parameters of a task that differ from their defaults by name, without the horizon."""
     found = {}
     for each in dataclasses.fields(parameters):
         value = getattr(parameters, each.name)

@@ -1,4 +1,4 @@
-"""Data that replace a scenario: objects that make one, and readers of such data in files."""
+"""Data that act as a scenario: their base classes, and the readers of such data in files."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -9,10 +9,10 @@ from ..contract.task import Scenario, Task
 
 
 class ScenarioData:
-    """Data from which an environment makes a scenario."""
+    """Base class of data from which an environment makes a scenario."""
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario from the data.
+        """Return a scenario of an environment made from the data.
 
         Args:
             cls: the environment.
@@ -24,15 +24,15 @@ class ScenarioData:
         raise NotImplementedError
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields of the data by name; the dictionary is also a valid scenario."""
+        """Return the constructor's arguments by name; this dictionary is also a valid scenario."""
         raise NotImplementedError
 
 
 class FlightData(ScenarioData):
-    """Flights, of which every episode flies one."""
+    """Base class of flights, of which every episode of a scenario flies one."""
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario from the data, as :meth:`ScenarioData.scenario`."""
+        """Return a scenario of an environment in which every episode flies one of the flights."""
         of_flights = find_companion(cls, FlightScenarios)
         if of_flights is None:
             raise ValueError(f"{cls.id} does not take flights as scenario")
@@ -41,7 +41,7 @@ class FlightData(ScenarioData):
 
 
 class Reader(NamedTuple):
-    """A kind of data in files, folders or dictionaries."""
+    """Functions that recognise and read one kind of data in files, folders or dictionaries."""
 
     takes: Callable[[Any], bool]
     """Function that returns whether a value, not the name of a scenario, names or contains data of this kind."""
@@ -54,5 +54,5 @@ class Reader(NamedTuple):
 
 
 def readers() -> Iterator[Reader]:
-    """Yield the readers of the installation, in the order in which they are tried."""
+    """Yield the installed readers of scenario data, in the order in which they are tried."""
     yield from load_present(READERS)

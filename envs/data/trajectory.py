@@ -59,16 +59,16 @@ class Trajectory(FlightData):
             )
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields by name."""
+        """Return the arrays and other constructor arguments of the trajectory, by name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @property
     def duration(self) -> float:
-        """Seconds from the first to the last time."""
+        """Time from the first to the last position of the flight, s."""
         return float(self.time[-1] - self.time[0])
 
     def intervals(self, interval: float) -> int:
-        """Return the number of whole sampling intervals (s) that the flight lasts.
+        """Return the number of whole sampling intervals (s) within the flight.
 
         Raises:
             ValueError: if they are too many for an episode.
@@ -83,7 +83,9 @@ class Trajectory(FlightData):
         return int(count)
 
     def resample(self, interval: float, count: int) -> numpy.ndarray:
-        """Return the state at ``count`` times from the start, ``interval`` apart, straight on beyond the end.
+        """Return position and velocity, ``(4, count)``, at ``count`` times ``interval`` (s) apart from the start on.
+
+        The flight continues straight beyond its end.
 
         Between the given times a cubic runs through positions and velocities (Hermite), or, without
         velocities, a cubic spline through the positions.
@@ -115,7 +117,7 @@ class Trajectory(FlightData):
 
 
 def trajectory_of(fields: Mapping[str, Any]) -> Trajectory:
-    """Return the trajectory from a dictionary of its fields.
+    """Return a :class:`Trajectory` from a dictionary of its fields.
 
     Raises:
         ValueError: if a field is missing or unknown, or the values are no trajectory.

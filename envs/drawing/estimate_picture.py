@@ -49,7 +49,7 @@ class EstimatePicture(Picture):
         self.limits: list[tuple[float, float]] = [_extent(path[:, i]) for i in self.drawn]
 
     def values(self, track: Mapping[str, numpy.ndarray], k: int) -> dict[str, float]:
-        """Return the values of a measurement for the history.
+        """Return the values of one measurement that the history of the picture stores, by series name.
 
         Args:
             track: of the episode, as :meth:`.Model.picture_track` returns it of one measurement, ``(K, ...)``.
@@ -68,7 +68,7 @@ class EstimatePicture(Picture):
         return values
 
     def strips(self) -> Sequence[Strip]:
-        """Return the errors of the first components."""
+        """Return the time series of the errors of the first components."""
         return [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
             for component in self.task.components[:MOST_STRIPS]
@@ -79,7 +79,7 @@ class EstimatePicture(Picture):
         return False
 
     def open(self, figure: Figure) -> None:
-        """Make the panel and its legend."""
+        """Create the panel of the path with truth, readings and estimate, and its legend."""
         panel: Axes = figure.add_axes(PANEL)
         self.panel = panel
         panel.tick_params(labelsize=8)
@@ -116,7 +116,7 @@ class EstimatePicture(Picture):
         )
 
     def arrange(self) -> None:
-        """Set limits around the whole path."""
+        """Set the axis limits to the whole path."""
         if not self.plane:
             self.panel.set_xlim(0.5, self.task.horizon + 0.5)
             self.panel.set_ylim(*self.limits[0])
@@ -132,7 +132,7 @@ class EstimatePicture(Picture):
         self.panel.set_ylim(south, north)
 
     def draw(self, history: History, state: Any) -> None:
-        """Update all artists to the current measurement."""
+        """Update path, covariance ellipse and readings to the current measurement."""
         empty = numpy.empty(0)
         for name, line in (("true", self.true), ("seen", self.seen), ("believed", self.believed)):
             x, y = self._places([history.get(f"{name}.{row}", empty) for row in range(len(self.drawn))])
@@ -154,7 +154,7 @@ class EstimatePicture(Picture):
 
 
 def _extent(values: numpy.ndarray) -> tuple[float, float]:
-    """Return the lowest and highest value with a margin."""
+    """Return the lowest and highest of some values, with a margin, as axis limits."""
     finite = values[numpy.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
     margin = MARGIN * (high - low) or 1.0

@@ -58,7 +58,7 @@ History = Mapping[str, numpy.ndarray]
 
 
 class Strip(NamedTuple):
-    """Panel of curves over the number of the measurement."""
+    """Panel of curves over the number of the measurement (time series)."""
 
     title: str
     """Title, with the unit."""
@@ -75,14 +75,16 @@ class Strip(NamedTuple):
 
 
 def error_strip(title: str, component: str, limit: float) -> Strip:
-    """Return the panel of a component's error with its reported band, between plus and minus ``limit`` at first."""
+    """Return the time-series panel of a component's error with its reported band, initially within plus and minus
+    ``limit``.
+    """
     return Strip(
         title, {"error": f"error.{component}"}, (-limit, limit), band=f"sigma.{component}", guides=(0.0,)
     )
 
 
-def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-    """Stretch limits about zero by the least factor 1, 2, 5, 10, ... with which they contain low and high."""
+def widen_limits(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
+    """Return limits stretched about zero by the smallest factor 1, 2, 5, 10, ... that contain low and high."""
     lowest, highest = limits
     # A value on the far side of a limit at zero cannot be reached by stretching, and is cut off.
     needed = max(
@@ -99,11 +101,11 @@ def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, 
 
 
 class Picture:
-    """Picture of an episode.
+    """Picture of an episode; this base class draws any task.
 
-    This base class draws any task. A subclass declares its additions to the history (:meth:`records`), which
-    strips are drawn (:meth:`strips`), and may draw panels of its own into the figure's left part
-    (:meth:`open`, :meth:`begin`, :meth:`draw`).
+    A subclass declares its additions to the history (:meth:`records`) and the time series to draw (:meth:`strips`),
+    and may
+    draw further panels into the figure's left part (:meth:`open`, :meth:`begin`, :meth:`draw`).
 
     Args:
         model: of the episodes; its states contain lane 0 of a batch that is padded to several.
@@ -127,7 +129,7 @@ class Picture:
         return {}
 
     def strips(self) -> Sequence[Strip]:
-        """Return the error of every component with its reported band, and the action."""
+        """Return the time series to draw: the error of every component with its reported band, and the action."""
         shown = self.model.task.components[:MOST_COMPONENTS]
         errors = [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
@@ -146,24 +148,24 @@ class Picture:
         return [*errors, Strip(f"action, {self.model.control}", named, limits, steps=discrete)]
 
     def shows_observation(self) -> bool:
-        """Return whether a last strip shows every component of the observation as a colour."""
+        """Return whether the last panel shows every component of the observation as a colour."""
         return True
 
     def open(self, figure: Figure) -> None:
-        """Make panels and artists; called once, before the strips are made."""
+        """Create the panels that a subclass draws beside the time series; called once for a figure."""
 
     def begin(self, state: Any) -> None:
         """Prepare for a new episode, from its state after the first measurement."""
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return the measurements, from and to, that every strip marks with a grey ground."""
+        """Return intervals of measurements, first and last, that every time series shades grey."""
         return ()
 
     def arrange(self) -> None:
-        """Set limits for the episode of :meth:`begin`; called before its first drawing."""
+        """Set axis limits for the episode of :meth:`begin`; called before its first drawing."""
 
     def draw(self, history: History, state: Any) -> None:
-        """Update the panels.
+        """Update the panels of :meth:`open` to the current measurement.
 
         Args:
             history: of the measurements acted on.
@@ -172,12 +174,12 @@ class Picture:
 
 
 def picture_of(model: Model) -> Picture:
-    """Return the picture of a model's task, or the general one."""
+    """Return the picture that a model's task declares, or the general one."""
     return model.picture() or Picture(model)
 
 
 class _StripPanel:
-    """Axes and artists of one strip."""
+    """Axes and artists of one time series."""
 
     def __init__(self, axes: Axes, strip: Strip) -> None:
         self.axes, self.strip = axes, strip
@@ -226,7 +228,7 @@ class _StripPanel:
             self.band.set_data(times[: len(half)], -half, half)
         # The band alone does not stretch the limits: at the start it is far wider than all that follows.
         if low <= high:
-            self.axes.set_ylim(*grown(self.strip.limits, low, high))
+            self.axes.set_ylim(*widen_limits(self.strip.limits, low, high))
 
 
 class _ObservationPanel:
@@ -299,7 +301,7 @@ class EpisodePicture:
             self._go_on_unseen(problem)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return all attributes but the figure: a copy draws its own."""
+        """Return all attributes except the figure, for pickling."""
         picture = copy.copy(self.picture)
         for name in self._artists & vars(picture).keys():
             delattr(picture, name)
@@ -309,13 +311,13 @@ class EpisodePicture:
     # --- history
 
     def begin(self, state: Any) -> None:
-        """Start a new episode; ``state`` is the one after its first measurement."""
+        """Delete the history and start a new episode, from its state after the first measurement."""
         self.history, self.observations, self.count = {}, [], 0
         self.picture.begin(state)
         self._fresh = True
 
     def keep(self, state: Any, action: numpy.ndarray, observation: numpy.ndarray) -> None:
-        """Add a measurement that has been acted on.
+        """Append a measurement, its action and observation to the history.
 
         Args:
             state: after the action; lane 0 is stored.
@@ -337,7 +339,7 @@ class EpisodePicture:
         self.append(values)
 
     def append(self, values: Mapping[str, float]) -> None:
-        """Add the values of a measurement to the history.
+        """Append the values of a measurement to the history.
 
         Args:
             values: by the names of the series.
@@ -349,7 +351,7 @@ class EpisodePicture:
     # --- drawing
 
     def frame(self, state: Any) -> numpy.ndarray:
-        """Draw and return the picture, ``(height, width, 3)`` bytes."""
+        """Return an image of the episode, ``(height, width, 3)`` bytes."""
         figure = self._draw(state)
         canvas = figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
@@ -369,7 +371,7 @@ class EpisodePicture:
         return numpy.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
     def show(self, state: Any) -> None:
-        """Draw into the window, not faster than ``frames_per_second``; without one, do nothing."""
+        """Draw into the window, at most ``frames_per_second`` times a second; without a window, do nothing."""
         if self._unseen:
             return
         from matplotlib import pyplot
@@ -417,7 +419,7 @@ class EpisodePicture:
 
     @property
     def title(self) -> str:
-        """Environment, scenario, control and the number of the measurement acted on last."""
+        """Title: environment, scenario, control and the number of the last measurement acted on."""
         name = self.model.task.id.rpartition("/")[2]
         control = [f"control {self.model.control}"] if self.picture.steered else []
         parts = [name, f"scenario {self.scenario}", *control]
@@ -461,7 +463,7 @@ class EpisodePicture:
         return figure
 
     def _arrange(self) -> None:
-        """Set the limits for a new episode."""
+        """Set the axis limits of all panels for a new episode."""
         self._fresh = False
         for shade in self._shades:
             shade.remove()
@@ -475,7 +477,7 @@ class EpisodePicture:
 
 
 class EpisodePictures:
-    """Pictures of the first few episodes of many side by side.
+    """Pictures of the first few of many parallel episodes.
 
     Args:
         model: of the episodes, on any backend.
@@ -496,13 +498,13 @@ class EpisodePictures:
             picture.caption = f"sub-environment {i}"
 
     def begin(self, state: Any, lanes: Sequence[int]) -> None:
-        """Start new episodes in some lanes; ``state`` contains them after their first measurement."""
+        """Start new episodes in some lanes, from the state after their first measurement."""
         for i, picture in enumerate(self.pictures):
             if i in lanes:
                 picture.begin(_alone(state, i))
 
     def keep(self, state: Any, actions: numpy.ndarray, observations: numpy.ndarray) -> None:
-        """Add a measurement that has been acted on.
+        """Append a measurement, its actions and observations to the histories.
 
         Args:
             state: of all episodes after the action.
@@ -513,18 +515,18 @@ class EpisodePictures:
             picture.keep(_alone(state, i), actions[i], observations[i].copy())
 
     def frames(self, state: Any) -> tuple[numpy.ndarray, ...]:
-        """Draw a frame ``(height, width, 3)`` for each episode, the same blank one beyond the first few."""
+        """Return an image for each episode, ``(height, width, 3)``, the same blank one beyond the first few."""
         drawn = [picture.frame(_alone(state, i)) for i, picture in enumerate(self.pictures)]
         return (*drawn, *[numpy.full_like(drawn[0], 255)] * (self.count - len(drawn)))
 
     def close(self) -> None:
-        """Delete the figures."""
+        """Close the figures of all pictures."""
         for picture in self.pictures:
             picture.close()
 
 
 def _alone(state: Any, lane: int) -> Any:
-    """Return the episode in one lane for a picture: on the host, padded with itself."""
+    """Return the episode of one lane on the host, padded with copies of itself, for a picture."""
     return map_arrays(lambda values: host_array(values)[..., [lane] * round_up_lanes(1)], state)
 
 
@@ -536,11 +538,11 @@ def _moving(axes: Axes) -> list[Artist]:
 
 
 class _WindowError(Exception):
-    """A window cannot be opened; the message has the reason and the remedy."""
+    """Error for a window that cannot be opened; its message contains the reason and the remedy."""
 
 
 def _missing_display() -> str:
-    """Return why matplotlib cannot open a window, and the remedy; empty where no reason is known."""
+    """Return the reason why matplotlib cannot open a window, and the remedy; empty if none is known."""
     from matplotlib.backends.registry import BackendFilter, backend_registry
 
     try:

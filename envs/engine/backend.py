@@ -1,4 +1,4 @@
-"""Backends, which compute the steps of a task: code compiled for the processor, NumPy, or torch on a device."""
+"""Choice of the backend that computes the steps of a task: compiled code, NumPy, or torch on a device."""
 
 from types import ModuleType
 from typing import Any
@@ -11,7 +11,7 @@ from ..contract.model import Model
 from ..contract.parameters import ParameterLimits, check
 from ..contract.task import Task
 from .catalogue import nearest
-from .compiled import AVAILABLE, compiled_model, warn_of
+from .compiled import AVAILABLE, compiled_model, warn_not_compiled
 from .scenario_choice import find_scenario
 
 BACKENDS = ("auto", "compiled", "numpy", "torch")
@@ -27,7 +27,7 @@ def make_model(
     threads: int = 1,
     **keywords: Any,
 ) -> Model:
-    """Make a task with the bank of a control in the loop; ``model.backend`` names the code that computes its steps.
+    """Return a :class:`Model` of a task under a control, on the chosen backend (``model.backend`` names it).
 
     Args:
         cls: the task.
@@ -57,18 +57,18 @@ def make_model(
         except NotTraceable as error:
             if backend == "compiled":
                 raise ValueError(f"{cls.id} cannot be compiled: {error}") from error
-            warn_of(cls.id, error)
+            warn_not_compiled(cls.id, error)
     return Model(cls(parameters, xp, device, chosen.recording), control)
 
 
 def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
-    """Return the array namespace of a backend, and its device.
+    """Return the array namespace (NumPy or torch) and the device of a backend.
 
     Torch is imported only for its own backend.
 
     Args:
         backend: one of ``BACKENDS``; all but "torch" compute on NumPy arrays.
-        device: None for the backend's default (the CPU), or what ``torch.device`` takes, such as "cuda:1".
+        device: None for the backend's default (the CPU), or an argument of ``torch.device``, such as "cuda:1".
 
     Returns:
         Namespace and device; the device is None for NumPy.

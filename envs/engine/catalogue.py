@@ -1,4 +1,4 @@
-"""Catalogue of the environments, and the modules that users name.
+"""Catalogue of the environments, and import of modules whose names a user gives.
 
 Every folder in ``envs/`` that defines an ``ID`` is an environment; its ``task.py`` defines the class, ``TASK``, which
 is imported on first use. No other file lists it. A user's own environments are added by
@@ -20,20 +20,20 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from ..contract.failures import own_line
+from ..contract.failures import user_code_line
 from ..contract.parameters import quote_shortened
 
 if TYPE_CHECKING:
     from ..contract.task import Task
 
 ENVS = __name__.rsplit(".", 2)[0]
-"""The package whose folders are the environments, and the rooms that they stand on."""
+"""The package whose folders are the environments and the layers that they build on."""
 USER_TASKS: dict[str, "type[Task]"] = {}
 """Registered environments of users: Gymnasium id -> task class."""
 
 
 class Catalogue(Mapping[str, "type[Task]"]):
-    """Every environment: Gymnasium id -> task class, which is imported when it is read."""
+    """Mapping of every environment's Gymnasium id to its task class, which is imported on access."""
 
     def __getitem__(self, id: str) -> "type[Task]":
         folder = folders().get(id)
@@ -53,26 +53,28 @@ class Catalogue(Mapping[str, "type[Task]"]):
 
 
 def catalogue() -> Mapping[str, "type[Task]"]:
-    """Return every environment: Gymnasium id -> task class, which is imported when it is read."""
+    """Return the mapping of every environment's Gymnasium id to its task class, which is imported on access."""
     return Catalogue()
 
 
 @functools.cache
 def folders() -> dict[str, str]:
-    """Return the folders of the environments, those of ``envs/`` that define an ``ID``: Gymnasium id -> name."""
+    """Return the folder name of every environment of this package, by Gymnasium id, without importing tasks."""
     names = [m.name for m in pkgutil.iter_modules(importlib.import_module(ENVS).__path__) if m.ispkg]
     packages = {name: importlib.import_module(f"{ENVS}.{name}") for name in names}
     return {package.ID: name for name, package in packages.items() if hasattr(package, "ID")}
 
 
 class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (the name describes it)
-    """A keyword that an environment does not accept. It is a TypeError, as of any function, for clients that test
-    whether an environment accepts one, and a ValueError as for every other wrong name.
+    """Error for a keyword that an environment does not accept.
+
+    It is a TypeError, as of any function, for clients that test whether an environment accepts one, and a ValueError as
+    for every other wrong name.
     """
 
 
 def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
-    """Return an error for an unknown name, with the nearest known one."""
+    """Return a ValueError for an unknown name that suggests the most similar valid ones."""
     return ValueError(f"unknown {kind} {quote_shortened(name)}: {_meant(name, valid)}")
 
 
@@ -87,12 +89,12 @@ def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None
 _SEARCH_FOLDERS: list[str] = []
 """Folders that are searched for modules that a user names, after ``sys.path``."""
 FOUND_IN: list[str] = []
-"""Those folders in which a module was found; other processes receive them, see :mod:`..evaluation.parallel`."""
+"""Search folders in which a module was found; other processes receive them, see :mod:`..evaluation.parallel`."""
 
 
 @contextmanager
 def modules_from(folder: str) -> Iterator[None]:
-    """Find modules that a user names in a folder, too, and no others: a file there is no library."""
+    """Context manager: let :func:`import_user_module` search a folder too, and no other import."""
     _SEARCH_FOLDERS.append(folder)
     try:
         yield
@@ -103,7 +105,7 @@ def modules_from(folder: str) -> Iterator[None]:
 
 @contextmanager
 def on_path(folders: Iterable[str]) -> Iterator[None]:
-    """Put folders at the end of ``sys.path`` for a while, where none of them hides a library."""
+    """Context manager: append folders to ``sys.path``, after the libraries, and remove them at the end."""
     further = [folder for folder in folders if folder not in sys.path]
     sys.path.extend(further)
     try:
@@ -113,7 +115,7 @@ def on_path(folders: Iterable[str]) -> Iterator[None]:
 
 
 def import_user_module(module: str, refusal: str) -> ModuleType:
-    """Import a module that a user has named; the only function that imports by a name.
+    """Import and return a module whose name a user gave; the only function that imports by name.
 
     It is called only for arguments of the command line or of a function that the user calls. Names read from a file go
     through :func:`task_class`, which imports nothing.
@@ -132,7 +134,7 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
             found = importlib.import_module(module)
     except Exception as error:  # a module is a program: it can raise anything
         # A ValueError is complete.
-        line = "" if isinstance(error, ValueError) else own_line(error)
+        line = "" if isinstance(error, ValueError) else user_code_line(error)
         raise ValueError(f"{refusal}: {type(error).__name__}: {error}{line}") from error
     places = (*getattr(found, "__path__", ()), getattr(found, "__file__", None) or "")
     FOUND_IN.extend(
@@ -144,7 +146,7 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
 
 
 def find_user_module(module: str, refusal: str) -> Path:
-    """Return the file of a module that a user has named, and import nothing.
+    """Return the path of a module's file whose name a user gave, without importing it.
 
     Args:
         module: its name, without dots.
@@ -161,7 +163,7 @@ def find_user_module(module: str, refusal: str) -> Path:
 
 
 def import_task(id: str) -> "type[Task]":
-    """Return the task of an id that a user has given, as :func:`task_class`; ``module:id`` imports the module first.
+    """Return the task class of an environment id; for ``module:id``, import that module first.
 
     The module registers the environment, as for ``gymnasium.make``.
 
@@ -181,7 +183,7 @@ def import_task(id: str) -> "type[Task]":
 
 
 def task_class(id: str) -> "type[Task]":
-    """Return the task of an environment id, and import nothing; ``filtergym/`` may be left out.
+    """Return the task class of a registered environment id, without imports; ``filtergym/`` may be omitted.
 
     Raises:
         ValueError: if there is none; of ``module:id``, if the module has not been imported.
@@ -222,32 +224,32 @@ def _import_name(name: str) -> ImportableName:
 
 
 def importable_name(cls: "type[Task]") -> str:
-    """Return the id by which another process finds an environment: of a user's with the module that registers it."""
+    """Return an environment's id for another process; a user's environment gets its module, ``module:id``."""
     return ImportableName(f"{cls.__module__}:{cls.id}") if cls.id in USER_TASKS else cls.id
 
 
 def short_name(id: str) -> str:
-    """Return the name of a Gymnasium id for files, and where the id is too long."""
+    """Return a Gymnasium id without ``filtergym/``, usable as a file name."""
     return id.removeprefix("filtergym/").replace("/", "-")
 
 
 def bare_name(id: str) -> str:
-    """Return the Gymnasium id without its namespace and version, as tables and pages call an environment."""
+    """Return a Gymnasium id without its namespace and the version ``-v0``, for tables and pages."""
     return id.rpartition("/")[2].removesuffix("-v0")
 
 
 def parameter_names(cls: "type[Task]") -> list[str]:
-    """Return the names of the keywords that an environment takes besides control, scenario and reward."""
+    """Return the names of an environment's parameters, which are keywords of ``gym.make``, as a list."""
     return [f.name for f in dataclasses.fields(cls.Parameters)]
 
 
 def check_names(cls: "type[Task]", keywords: Iterable[str], others: Iterable[str] = ()) -> None:
-    """Raise :class:`UnknownKeyword` if a keyword is no parameter of an environment.
+    """Raise :class:`UnknownKeyword` if a keyword is not the name of an environment's parameter.
 
     Args:
         cls: the environment.
         keywords: that were given as parameters.
-        others: what could have been meant beside parameters.
+        others: further valid names, for the suggestion.
     """
     known = parameter_names(cls)
     for name in keywords:
@@ -257,7 +259,7 @@ def check_names(cls: "type[Task]", keywords: Iterable[str], others: Iterable[str
 
 
 def register() -> None:
-    """Register every environment with Gymnasium; calling it again changes nothing."""
+    """Register every environment with Gymnasium; a second call changes nothing."""
     for id in catalogue():
         if id not in gymnasium.registry:
             gymnasium.register(

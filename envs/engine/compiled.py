@@ -1,4 +1,4 @@
-"""Models whose steps are compiled: the same functions, traced once and run as code of the processor.
+"""Models whose steps are compiled: their functions are traced once and run as native code.
 
 :class:`CompiledModel` is used like any other; its methods run native code of its :class:`~.programs.Programs`.
 Where episodes are only stepped, :class:`~.stepper.Stepper` is faster: it has the episodes in its own memory, bound
@@ -25,7 +25,7 @@ from .programs import PROGRAM_CACHE_SIZE, Programs, Report, begin_world, start_f
 
 
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a method of a model."""
+    """Return a method of :class:`CompiledModel` that runs the traced method as native code (decorator)."""
 
     @functools.wraps(method)
     def run(self: "CompiledModel", episode: Episode) -> Any:
@@ -35,7 +35,7 @@ def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class CompiledModel(Model):
-    """A model whose methods run as code of the processor.
+    """A model whose methods run as native code.
 
     Args:
         task: on NumPy arrays.
@@ -71,19 +71,19 @@ class CompiledModel(Model):
 
     @property
     def backend(self) -> str:
-        """Name of the backend."""
+        """Name of the backend: "compiled"."""
         return "compiled"
 
-    def under(self, control: str) -> Model:
-        """Return the same problem with another control."""
+    def with_control(self, control: str) -> Model:
+        """Return a compiled model of the same task with the bank of another control."""
         return CompiledModel(self.task, control, self.threads)
 
     def on_numpy(self) -> Model:
-        """Return the same problem on NumPy arrays, not compiled."""
+        """Return a model of the same task on NumPy arrays, not compiled."""
         return self._plain
 
     def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "CompiledModel":
-        """Return the same problem with another filter in place of the bank.
+        """Return a compiled model of the same task with another filter in place of the bank.
 
         Args:
             make: makes the filter for a model, on NumPy's arrays and on traced ones.
@@ -98,44 +98,44 @@ class CompiledModel(Model):
         return other
 
     def run(self, function: Callable[..., Any], *parts: Any) -> Any:
-        """Call ``function(model, *parts)`` as code of the processor, or with NumPy where it cannot be traced."""
+        """Return ``function(model, *parts)``, computed by native code, or by NumPy if it cannot be traced."""
         if function not in self.programs.refused:
             try:
                 return self.programs.function(function)(*parts, threads=self.threads)
             except NotTraceable as error:
                 self.programs.refused.add(function)
-                warn_of(f"{_name_of(function)} of {self.task.id}", error)
+                warn_not_compiled(f"{_name_of(function)} of {self.task.id}", error)
         return function(self._plain, *parts)
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
-        """Return the state of the filter at the start of the track."""
+        """Return the filter's state at the start of the track."""
         if self.filter.in_python:
             return super().start_filter(initial, truth)
         return self.run(start_filter, initial, truth)[0]
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
-        """Return the state of the filter predicted to a measurement."""
+        """Return the filter's state predicted to a measurement."""
         return self.programs.filter_prediction(state, measurement, threads=self.threads)[0]
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
-        """Return the state of the filter after the update with the measurement."""
+        """Return the filter's state after the update with a measurement."""
         if self.filter.in_python:
             return super().update_filter(state, measurement, action, truth)
         return self.programs.filter_update(truth, state, measurement, action, threads=self.threads)[0]
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """Return the feedback of a filter to the world."""
+        """Return the feedback of a filter's estimate to the world; None in an open loop."""
         if self.filter.in_python:
             return super().feedback(state, measurement)
         return self.run(Model.feedback, state, measurement)
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Return the episode at the start of the track."""
+        """Return N episodes at the start of the track, from their random numbers."""
         truth, initial = self.run(begin_world, uniforms, normals)
         return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Apply steps 1 and 2."""
+        """Return the episode at the next measurement, with the filter predicted to it (steps 1 and 2 of the clock)."""
         feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
@@ -144,7 +144,7 @@ class CompiledModel(Model):
 def compiled_model(
     cls: type[Task], parameters: Any, control: str, recording: Any = None, threads: int = 1
 ) -> CompiledModel:
-    """Return the compiled model of a task with these parameters; the last ones are stored, since they never change.
+    """Return the compiled model of a task with these parameters, from a cache of the most recent ones.
 
     Raises:
         NotTraceable: if a step is no straight line of arithmetic.
@@ -181,12 +181,11 @@ def _hashes(value: Any) -> bool:
 
 
 def _name_of(function: Callable[..., Any]) -> str:
-    """Return the name of a function, or of the class of an object that is called."""
     return getattr(function, "__qualname__", type(function).__name__)
 
 
-def warn_of(what: str, error: BaseException) -> None:
-    """Warn that a function runs with NumPy, and name the line that prevents compilation."""
+def warn_not_compiled(what: str, error: BaseException) -> None:
+    """Warn that a function runs with NumPy, and quote the line of code that prevents its compilation."""
     found: BaseException = error.__cause__ or error
     own = Path(namespace.__file__).parent
     frames = [f for f in traceback.extract_tb(found.__traceback__) if Path(f.filename).parent != own]
@@ -197,18 +196,18 @@ def warn_of(what: str, error: BaseException) -> None:
 
 
 def share_world(model: Any, other: Any) -> bool:
-    """Return whether two compiled models are of one task, and neither filter has a feedback to its world."""
+    """Return whether two compiled models have the same task and neither filter has feedback to its world."""
     return model.task is other.task and model.programs.is_open_loop and other.programs.is_open_loop
 
 
 def can_step(model: Any, report: Report) -> bool:
-    """Return whether a model's steps are compiled, and a report on them can be."""
+    """Return whether a model is compiled and a report function on its steps can be compiled as well."""
     if not isinstance(model, CompiledModel) or model.filter.in_python or report in model.programs.refused:
         return False
     try:
         model.programs.report_program(report)
     except NotTraceable as error:
         model.programs.refused.add(report)
-        warn_of(f"{_name_of(report)} of {model.task.id}", error)
+        warn_not_compiled(f"{_name_of(report)} of {model.task.id}", error)
         return False
     return True

@@ -1,4 +1,4 @@
-"""Random numbers of episodes side by side, made from the episodes' identities.
+"""Random numbers of parallel episodes, computed from the identities of the episodes.
 
 When an episode starts, its lane's generator gives its *identity*, two whole numbers of 64 bits. Every random number of
 the episode is a function of its identity, the measurement ``t`` and the number's place in the measurement
@@ -31,7 +31,7 @@ BLOCKS_OF_SEEDS = 64
 
 
 def draw_identity(generator: numpy.random.Generator) -> numpy.ndarray:
-    """Draw the identity of an episode, ``(2,)`` uint64."""
+    """Return the identity of a new episode: two random 64-bit integers, ``(2,)`` uint64."""
     # The generator's raw words: its methods take ten times longer for the same numbers.
     found: numpy.ndarray = generator.bit_generator.random_raw(2)
     return found
@@ -47,7 +47,7 @@ def _identities_of_seeds(seeds: tuple[int, ...]) -> numpy.ndarray:
 
 
 def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
-    """Return the identities of the first episodes of environments that are reset with these seeds, ``(2, N)`` uint64.
+    """Return the identities, ``(2, N)`` uint64, of the first episodes after a reset with each of N seeds.
 
     Seeding a generator is slow, and competitors are compared on the same seeds, so the identities of the last blocks
     of seeds are stored.
@@ -56,8 +56,9 @@ def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
 
 
 def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the uniforms ``(layout.uniforms, N)`` and normals ``(layout.initial_normals, N)`` of the start of
-    episodes.
+    """Return the uniform and the standard normal numbers with which episodes of these identities start.
+
+    Their shapes are ``(layout.uniforms, N)`` and ``(layout.initial_normals, N)``.
 
     Args:
         identities: ``(2, N)`` uint64.
@@ -69,7 +70,7 @@ def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy
 
 
 def uniforms_of_seeds(seeds: Sequence[int], layout: NoiseLayout) -> numpy.ndarray:
-    """Return the uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of these seeds.
+    """Return the uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of N seeds.
 
     Args:
         seeds: as in :func:`identities_of_seeds`.
@@ -79,7 +80,7 @@ def uniforms_of_seeds(seeds: Sequence[int], layout: NoiseLayout) -> numpy.ndarra
 
 
 class EpisodeNoise:
-    """Noise of ``count`` lanes.
+    """Random numbers of the episodes in ``count`` lanes (parallel episodes).
 
     Args:
         task: source of layout and namespace.
@@ -105,7 +106,7 @@ class EpisodeNoise:
         self._forget()
 
     def _forget(self) -> None:
-        """Delete the values derived from identities and measurements."""
+        """Delete the cached values derived from identities and measurements."""
         self._next: Call | None = None
         self._due = False
         """Whether the numbers of the current measurement are still to be made."""
@@ -117,19 +118,20 @@ class EpisodeNoise:
     # --- which episodes
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
-        """Give a lane the generator that draws the identities of its coming episodes."""
+        """Set the generator that draws the identities of a lane's next episodes."""
         while len(self.generators) <= lane:
             self.generators.append(generator)
         self.generators[lane] = generator
 
     def draw_identities(self, lanes: Sequence[int]) -> numpy.ndarray:
-        """Draw the identities of new episodes of some lanes, ``(2, lanes)``."""
+        """Draw the identities of new episodes in some lanes, ``(2, lanes)``, with the lanes' generators."""
         generators = self.generators
         return numpy.concatenate([draw_identity(generators[lane]) for lane in lanes]).reshape(-1, 2).T
 
     def put(self, identities: numpy.ndarray) -> None:
-        """Put episodes of these identities, ``(2, lanes)``, into the first lanes before their start; the others are
-        padding.
+        """Place episodes of these identities, ``(2, lanes)``, into the first lanes, before their start.
+
+        The other lanes are padding.
         """
         self.identities[:, : identities.shape[1]] = identities
         self.identities[:, identities.shape[1] :] = 0
@@ -137,7 +139,7 @@ class EpisodeNoise:
         self._ahead, self._row, self._due = None, None, False
 
     def start_call(self, memory: numpy.ndarray) -> Call:
-        """Return the native call that makes the numbers of the start after :meth:`put`.
+        """Return the native call that computes the random numbers of the episodes' start after :meth:`put`.
 
         Args:
             memory: for normals and uniforms, ``(initial_normals + uniforms, width)``.
@@ -145,7 +147,7 @@ class EpisodeNoise:
         return bind_numbers(self.identities, self.measurement, memory, self._layout.initial_normals)
 
     def start(self) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the numbers of the start after :meth:`put`, and advance to the first measurement.
+        """Return the random numbers of the episodes' start after :meth:`put`, and advance to the first measurement.
 
         Returns:
             Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)``, in new memory.
@@ -160,7 +162,7 @@ class EpisodeNoise:
         return memory[normals:], memory[:normals]
 
     def take(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:
-        """Continue in some lanes with the first episodes of others."""
+        """Replace the episodes in some lanes by the first episodes of another object."""
         self.identities[:, lanes] = other.identities[:, : len(lanes)]
         self.measurement[lanes] = other.measurement[: len(lanes)]
         if self._ahead is not None:
@@ -169,21 +171,21 @@ class EpisodeNoise:
     # --- their numbers
 
     def advance(self) -> None:
-        """Advance to the next measurement."""
+        """Advance all lanes to the next measurement, so that :attr:`row` gives its random numbers."""
         if self._due:
             _ = self.row
         self._due, self._row = True, None
 
     @property
     def row(self) -> Array:
-        """Numbers of this measurement, ``(row width, width)``, in memory that does not change."""
+        """Random numbers of the current measurement, ``(row width, width)``, in memory that does not change."""
         if self._row is None:
             task, row = self.task, self._copied_from_code() if AVAILABLE else self._next_of_block()
             self._row = row if task.xp is numpy else task.xp.asarray(row, device=task.device)
         return self._row
 
     def call_of_each(self) -> Call:
-        """Return the native call that advances to the next measurement and makes its numbers at :attr:`address`.
+        """Return the native call that advances to the next measurement and writes its numbers at :attr:`address`.
 
         It is for native code over several measurements, which runs it at least once.
         """
@@ -194,7 +196,7 @@ class EpisodeNoise:
 
     @property
     def address(self) -> int:
-        """Address of the memory that :meth:`call_of_each` writes, rows apart as those of :func:`empty_lanes`."""
+        """Address of the memory into which :meth:`call_of_each` writes, in the layout of :func:`empty_lanes`."""
         return address_of(self._next_call().arrays[2])
 
     def _copied_from_code(self) -> numpy.ndarray:
@@ -220,14 +222,14 @@ class EpisodeNoise:
         return self._ahead[self._slot - 1]
 
     def _numbers_ahead(self, lanes: numpy.ndarray, measurements: int) -> numpy.ndarray:
-        """Return the rows of the coming measurements of some lanes, ``(measurements, rows, lanes)``."""
+        """Return the random numbers of the next measurements of some lanes, ``(measurements, rows, lanes)``."""
         t = self.measurement[lanes] + numpy.arange(1, measurements + 1)[:, None]
         return numbers(self.identities[:, lanes], t, self._layout.normals, self._layout.row_uniforms)
 
     # --- copies and growth
 
     def grow(self, count: int, index: numpy.ndarray) -> None:
-        """Make room for more lanes.
+        """Enlarge the memory of random numbers to ``count`` lanes.
 
         Args:
             count: new number of lanes, a multiple of eight.
@@ -238,11 +240,11 @@ class EpisodeNoise:
         self.identities[...], self.measurement[...] = identities, measurement
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the complete state of the coming numbers; :meth:`restore` returns to it any number of times."""
+        """Return a copy of the state that determines all further numbers, for :meth:`restore`."""
         return copy.deepcopy({name: getattr(self, name) for name in _STATE_ATTRIBUTES})
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Continue from a snapshot of the same task and as many lanes."""
+        """Restore the state of a snapshot of the same task with the same number of lanes."""
         self.__dict__.update(copy.deepcopy(snapshot))
         self._forget()
 

@@ -1,4 +1,4 @@
-"""The engine: episodes of a model side by side, each fixed by its identity.
+"""The engine: parallel episodes of a model, each determined by its identity.
 
 A *lane* is one episode after another, whose identities one generator draws (:mod:`.episode_noise`). Both Gymnasium
 classes and the evaluation use this class. It owns the noise and does not depend on spaces or autoreset.
@@ -26,19 +26,17 @@ from ..contract.task import Task
 from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
 from .programs import Report
-from .reward import OWN_REWARDS, RewardBaseline
-from .stepper import Stepper, mean_of
+from .reward import REWARD_FUNCTIONS, RewardBaseline
+from .stepper import Stepper, mean_reward
 
 
 def whole_episode(model: Model, episode: Episode) -> Episode:
-    """Return the state itself, as a report."""
+    """Return the episode unchanged: the report function that reports the whole state."""
     return episode
 
 
 def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
-    """Return ``old`` with its last-axis entries ``lanes`` taken from ``new``, for nested tuples and dictionaries of
-    arrays.
-    """
+    """Return nested arrays ``old`` with the last-axis entries ``lanes`` replaced by those of ``new``."""
 
     def replaced(old: Array, new: Array) -> Array:
         # A copy, because states are never changed in place: the old one may still be in use.
@@ -57,63 +55,65 @@ class EpisodeStepper(Protocol):
     """
 
     def begin(self, identities: numpy.ndarray, noise: EpisodeNoise, others: Any) -> tuple[Array, Array]:
-        """Start episodes in all lanes up to their first measurement, see :meth:`.Stepper.begin`."""
+        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used."""
         ...
 
     def begin_some(
         self, lanes: numpy.ndarray, identities: numpy.ndarray, noise: EpisodeNoise, others: Any
     ) -> tuple[Array, Array]:
-        """Start episodes in some lanes up to their first measurement, see :meth:`.Stepper.begin_some`."""
+        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers
+        used.
+        """
         ...
 
-    def load(self, episode: Episode, shown: Array = None) -> None:
-        """Continue from other episodes; their observation, ``(fields, width)``, is computed unless it is given."""
+    def load(self, episode: Episode, observation: Array = None) -> None:
+        """Replace the current episodes; their observation, ``(fields, width)``, is computed if it is None."""
         ...
 
     def episode(self) -> Episode:
-        """Return the episodes, in arrays that do not change."""
+        """Return the current episodes of all lanes, in arrays that are never changed."""
         ...
 
     def take(self, action: Array) -> None:
-        """Apply an action from the next decision on, batch first, of all lanes or of the first."""
+        """Set the action for the next decisions, batch first, for all lanes or for the first ones."""
         ...
 
     def decide(self, noise: EpisodeNoise, others: Any) -> None:
-        """Update with all measurements of a decision and the action, and report on each."""
+        """Step all lanes through the measurements for which one action holds, and compute the report on each."""
         ...
 
     def reports(self) -> list[Any]:
-        """Return these reports, each of arrays ``(..., width)`` that do not change."""
+        """Return the reports of the last :meth:`decide`, one a measurement, of arrays ``(..., width)``."""
         ...
 
     @property
     def rewards(self) -> Any:
-        """Return these reports where each is one number, ``(interval, width)``."""
+        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``."""
         ...
 
     def observation_by_field(self) -> Array:
-        """Return the observation, ``(fields, width)``, valid until the next decision."""
+        """Return the observation of all lanes, ``(fields, width)``, valid until the next decision."""
         ...
 
     def observation(self, count: int) -> Array:
-        """Return the observation of the first lanes, batch first, in memory that the caller may keep."""
+        """Return the observation of the first ``count`` lanes, batch first, in memory that is not overwritten."""
         ...
 
     def take_alone(self, action: Array) -> None:
-        """Apply an action of the first lane from the next decision on."""
+        """Set the action of the first lane for the next decisions."""
         ...
 
-    def first_reward(self, beside: Any) -> float:
-        """Return the mean of the rewards of the first lane, less those of the stepper beside it, if there is one."""
+    def first_reward(self, baseline: Any) -> float:
+        """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
         ...
 
     def observation_of_first(self) -> Array:
-        """Return the observation of the first lane, in memory that the caller may keep."""
+        """Return the observation of the first lane, ``(fields,)``, in memory that is not overwritten."""
         ...
 
 
 class ModelStepper:
-    """Episodes stepped by the functions of their model, in arrays that never change; methods as of :class:`.Stepper`.
+    """Stepper that calls the functions of the model on arrays that are never changed; methods as of :class:`.Stepper`.
 
     ``others`` are steppers of the same kind, width and task: each call on this one also applies to them, on the same
     noise.
@@ -137,7 +137,7 @@ class ModelStepper:
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()
     ) -> tuple[Array, Array]:
-        """Start episodes in all lanes up to their first measurement, see :meth:`.Stepper.begin`."""
+        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used."""
         noise.put(identities)
         start = self._start(noise)
         for each in (self, *others):
@@ -145,14 +145,14 @@ class ModelStepper:
         return start
 
     def _start(self, noise: EpisodeNoise) -> tuple[Array, Array]:
-        """Return the uniforms and normals of the start."""
+        """Return the uniform and normal numbers of the start as arrays of the task."""
         task = self.model.task
         uniforms, normals = (task.xp.asarray(numbers, device=task.device) for numbers in noise.start())
         return uniforms, normals
 
-    def load(self, episode: Episode, shown: Array = None) -> None:
-        """Continue from other episodes; their observation is computed unless it is given."""
-        self._episode, self.shown = episode, shown
+    def load(self, episode: Episode, observation: Array = None) -> None:
+        """Replace the current episodes; their observation, ``(fields, width)``, is computed if it is None."""
+        self._episode, self.shown = episode, observation
 
     def begin_some(
         self,
@@ -161,7 +161,9 @@ class ModelStepper:
         noise: EpisodeNoise,
         others: "Sequence[ModelStepper]" = (),
     ) -> tuple[Array, Array]:
-        """Start episodes in some lanes up to their first measurement, see :meth:`.Stepper.begin_some`."""
+        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers
+        used.
+        """
         noise.put(identities)
         start = self._start(noise)
         for each in (self, *others):
@@ -174,11 +176,11 @@ class ModelStepper:
         return start
 
     def episode(self) -> Episode:
-        """Return the present episodes of all lanes."""
+        """Return the current episodes of all lanes."""
         return self._episode
 
     def take(self, action: Array) -> None:
-        """Apply an action from the next step on, batch first, of all lanes or of the first."""
+        """Set the action for the next steps, batch first, for all lanes or for the first ones."""
         xp, turned = self.model.task.xp, action.T if action.ndim == 2 else action
         if not isinstance(self.model.action_space, gymnasium.spaces.Discrete):
             turned = xp.astype(turned, xp.float64, copy=False)
@@ -191,11 +193,11 @@ class ModelStepper:
         self._action = turned
 
     def take_alone(self, action: Array) -> None:
-        """Apply an action of the first lane from the next step on."""
+        """Set the action of the first lane for the next steps."""
         self.take(action[None])
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
-        """Update with all measurements of a decision and the action, see :meth:`.Stepper.decide`."""
+        """Step all lanes through the measurements for which one action holds, and compute the report on each."""
         means = DecisionMeans(self.model.fields, self.model.task.decision_interval)
         total: Any = 0.0
         for each in (self, *others):
@@ -213,43 +215,43 @@ class ModelStepper:
             self.shown = means.show(self.observation_by_field(), total, self.model.task.xp)
 
     def reports(self) -> list[Any]:
-        """Return the reports on the measurements of the last :meth:`decide`, in arrays ``(..., width)``."""
+        """Return the reports of the last :meth:`decide`, one a measurement, of arrays ``(..., width)``."""
         return self._reports
 
     @property
     def rewards(self) -> list[Array]:
-        """Return these reports where each is one number, ``(interval, width)``."""
+        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``."""
         return self._reports
 
-    def first_reward(self, beside: "ModelStepper | None") -> float:
-        """Return the mean of the rewards of the first lane, less those of the stepper beside it, if there is one."""
-        others = [0.0] * len(self._reports) if beside is None else beside._reports
-        return float(mean_of([a - b for a, b in zip(self._reports, others, strict=True)])[0])
+    def first_reward(self, baseline: "ModelStepper | None") -> float:
+        """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
+        others = [0.0] * len(self._reports) if baseline is None else baseline._reports
+        return float(mean_reward([a - b for a, b in zip(self._reports, others, strict=True)])[0])
 
     def observation_of_first(self) -> Array:
-        """Return the observation of the first lane, in memory that the caller may keep."""
+        """Return the observation of the first lane, ``(fields,)``, in memory that is not overwritten."""
         return self.observation(1)[0]
 
     def observation_by_field(self) -> Array:
-        """Return the observation, ``(fields, width)``."""
+        """Return the observation of all lanes, ``(fields, width)``, valid until the next decision."""
         if self.shown is None:
             self.shown = self.model.observe(self._episode)
         return self.shown
 
     def observation(self, count: int) -> Array:
-        """Return the observation of the first lanes, batch first, in memory that the caller may keep."""
+        """Return the observation of the first ``count`` lanes, batch first, in memory that is not overwritten."""
         shown = self.observation_by_field()[:, :count].T
         # Contiguous, in memory of its own.
         return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
 
 
 class Lanes:
-    """``count`` episodes of a model side by side.
+    """``count`` parallel episodes (lanes) of a model.
 
     Args:
         model: task with a filter; the task's namespace determines the device of the arrays.
         count: number of lanes.
-        beside: baseline of a relative reward, run on the same noise.
+        baseline: baseline of a relative reward, run on the same noise.
         on_start: called with new episodes at the start of the track, before their first measurement.
         longest: decisions after which an episode ends at the latest; default: the task's horizon.
         report: function of the later reports; the episodes then start in its code. Default: unknown.
@@ -263,7 +265,7 @@ class Lanes:
         self,
         model: Model,
         count: int,
-        beside: RewardBaseline | None = None,
+        baseline: RewardBaseline | None = None,
         on_start: Callable[[Episode], None] | None = None,
         longest: int | None = None,
         report: Report | None = None,
@@ -273,8 +275,8 @@ class Lanes:
         task = self.task
         self.count: int = count
         self.width: int = round_up_lanes(count)
-        self.beside = beside
-        self._models = [model] if beside is None else [model, beside.model]
+        self.baseline = baseline
+        self._models = [model] if baseline is None else [model, baseline.model]
         self._on_start, self._report = on_start, report
         self._steppers: dict[Report, list[Stepper]] = {}
         """Steppers of compiled models, by report."""
@@ -293,16 +295,16 @@ class Lanes:
     # --- episodes
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
-        """Give a lane the generator that its coming episodes are drawn from."""
+        """Set the generator from which a lane's next episodes are drawn."""
         self.noise.seed(lane, generator)
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
-        """Start new episodes in some lanes (default: all) up to their first measurement."""
+        """Draw and start new episodes in some lanes (default: all), up to their first measurement."""
         chosen = range(self.count) if lanes is None or len(lanes) == self.count else lanes
         self.begin(self.noise.draw_identities(chosen), chosen)
 
     def begin(self, identities: numpy.ndarray, lanes: Sequence[int] | None = None) -> None:
-        """Start the episodes of these identities up to their first measurement.
+        """Start the episodes with these identities, up to their first measurement.
 
         Args:
             identities: ``(2, lanes)``, see :mod:`.episode_noise`.
@@ -314,12 +316,12 @@ class Lanes:
         if not self._moving and self._report is not None:
             self._reporting(self._report)
         self._moving = self._moving or self._by_functions()
-        own, *beside = self._moving
+        own, *baseline = self._moving
         if is_whole:
-            start = own.begin(identities, self.noise, beside)
+            start = own.begin(identities, self.noise, baseline)
         else:
             noise = self._noise_of_some(len(index))
-            start = own.begin_some(index, identities, noise, beside)
+            start = own.begin_some(index, identities, noise, baseline)
             self.noise.take(noise, index)
         self.decisions[index] = 0
         if task.flights:
@@ -329,7 +331,7 @@ class Lanes:
             self._on_start(self.model.begin(*start))
 
     def _noise_of_some(self, count: int) -> EpisodeNoise:
-        """Return the noise for a number of lanes that restart, in one of a few sizes."""
+        """Return an :class:`EpisodeNoise` for ``count`` restarting lanes or a few more, from a cache."""
         width = LANES
         while width < count:
             width *= 2
@@ -338,39 +340,39 @@ class Lanes:
         return self._some[width]
 
     def step_reward(self, action: Array, kind: str) -> Array:
-        """Apply one decision and return its reward, the mean over its measurements, ``(count,)``.
+        """Apply one action in all lanes and return the mean reward over its measurements, ``(count,)``.
 
         Args:
             action: batch first, as the action space has it.
             kind: one of :data:`~.reward.REWARDS`.
         """
-        own, *beside = self._take_and_decide(action, OWN_REWARDS[kind])
+        own, *baseline = self._take_and_decide(action, REWARD_FUNCTIONS[kind])
         rewards = (
             own.rewards
-            if not beside
-            else [a - b for a, b in zip(own.rewards, beside[0].rewards, strict=True)]
+            if not baseline
+            else [a - b for a, b in zip(own.rewards, baseline[0].rewards, strict=True)]
         )
-        return mean_of(rewards)[: self.count]
+        return mean_reward(rewards)[: self.count]
 
     def step_alone(self, action: Array, kind: str) -> tuple[Array, float, bool]:
-        """Apply one decision of the only lane; returns observation, reward, and whether the episode is over.
+        """Apply one action where there is one lane; return its observation, reward, and whether the episode is over.
 
         Args:
             action: as the action space has it.
             kind: one of :data:`~.reward.REWARDS`; the reward equals that of :meth:`step_reward`.
         """
-        steppers, report = self._moving, OWN_REWARDS[kind]
+        steppers, report = self._moving, REWARD_FUNCTIONS[kind]
         if steppers is not self._steppers.get(report):
             steppers = self._reporting(report)
-        own, beside = steppers[0], steppers[1:]
+        own, baseline = steppers[0], steppers[1:]
         own.take_alone(action)
-        own.decide(self.noise, beside)
+        own.decide(self.noise, baseline)
         self.decisions[0] = taken = self.decisions.item(0) + 1
-        reward = own.first_reward(beside[0] if beside else None)
+        reward = own.first_reward(baseline[0] if baseline else None)
         return own.observation_of_first(), reward, taken >= self._lengths.item(0)
 
     def _take_and_decide(self, action: Array, report: Report) -> Sequence[Any]:
-        """Apply one decision to all its measurements; returns the steppers that have the reports."""
+        """Apply one action in all lanes and return the steppers that have the reports on its measurements."""
         steppers = self._reporting(report)
         steppers[0].take(action)
         steppers[0].decide(self.noise, steppers[1:])
@@ -378,7 +380,7 @@ class Lanes:
         return steppers
 
     def decide(self, action: Array, report: Report = whole_episode) -> list[tuple[Any, Any]]:
-        """Apply one decision to all its measurements, and report on each.
+        """Apply one action in all lanes and return the report on each of its measurements.
 
         Args:
             action: batch first, as the action space has it.
@@ -386,16 +388,16 @@ class Lanes:
 
         Returns:
             The reports on every measurement of the decision, arrays ``(..., width)``: of the model, and of
-            ``beside`` (None without).
+            ``baseline`` (None without).
         """
-        own, *beside = self._take_and_decide(action, report)
+        own, *baseline = self._take_and_decide(action, report)
         reports = own.reports()
-        return list(zip(reports, beside[0].reports() if beside else [None] * len(reports), strict=True))
+        return list(zip(reports, baseline[0].reports() if baseline else [None] * len(reports), strict=True))
 
     def run(
         self, report: Report, compiled_policy: Specialised | None = None, measurements: int | None = None
     ) -> tuple[Any, Any]:
-        """Continue the episodes in native code, and report on every measurement.
+        """Run the episodes over many measurements in native code; return the reports on each and the actions.
 
         Args:
             report: as of :meth:`decide`; :func:`.compiled.can_step` must be true for it.
@@ -415,24 +417,24 @@ class Lanes:
         return answer
 
     def next_row(self) -> Array:
-        """Return the noise of the next measurement, ``(row width, width)`` for episodes that are stepped elsewhere."""
+        """Return the random numbers of the next measurement, ``(row width, width)``, for episodes stepped elsewhere."""
         self.noise.advance()
         return self.noise.row
 
     # --- steppers
 
     def _by_functions(self) -> list[Any]:
-        """Return the steppers by the models' functions, without episodes."""
+        """Return new :class:`ModelStepper` objects of task and baseline, without episodes."""
         steppers = [ModelStepper(model, self.width) for model in self._models]
-        if self.beside is not None:
-            steppers[1].take(self._beside_action(self.width))
+        if self.baseline is not None:
+            steppers[1].take(self._baseline_action(self.width))
         return steppers
 
-    def _beside_action(self, count: int) -> Array:
-        """Return the action of the baseline, batch first."""
-        assert self.beside is not None
-        actions = [self.beside.action] * count
-        discrete = isinstance(self.beside.action, int)
+    def _baseline_action(self, count: int) -> Array:
+        """Return the baseline's action, repeated for ``count`` lanes, batch first."""
+        assert self.baseline is not None
+        actions = [self.baseline.action] * count
+        discrete = isinstance(self.baseline.action, int)
         return (
             self.task.xp.asarray(actions, device=self.task.device)
             if discrete
@@ -440,15 +442,15 @@ class Lanes:
         )
 
     def _reporting(self, report: Report) -> Sequence[Any]:
-        """Return the steppers that make a report, and move the episodes into them."""
+        """Return the steppers that compute this report, after the current episodes were moved into them."""
         if self._moving is self._steppers.get(report):
             return self._moving
         if report not in self._steppers and all(can_step(model, report) for model in self._models):
             steppers = self._steppers[report] = [Stepper(self.model, report, self.width)]
-            if self.beside is not None:
+            if self.baseline is not None:
                 world_of = steppers[0] if share_world(*self._models) else None
-                steppers.append(Stepper(self.beside.model, report, self.width, world_of))
-                steppers[1].take(self._beside_action(self.width))
+                steppers.append(Stepper(self.baseline.model, report, self.width, world_of))
+                steppers[1].take(self._baseline_action(self.width))
         before, after = self._moving, self._steppers.get(report)
         if after is None:
             settled = self._settle()
@@ -461,7 +463,7 @@ class Lanes:
         return after
 
     def _settle(self) -> list[ModelStepper]:
-        """Return steppers that run the episodes by the functions of the models, in arrays of their own."""
+        """Move the episodes into :class:`ModelStepper` objects and return these."""
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
@@ -470,18 +472,18 @@ class Lanes:
         return [stepper for stepper in self._moving if isinstance(stepper, ModelStepper)]
 
     @property
-    def flies_alone(self) -> bool:
+    def has_running_episode(self) -> bool:
         """Whether the first lane has an episode that is not over."""
         return bool(self._moving) and self.decisions.item(0) < self._lengths.item(0)
 
     @property
     def has_episodes(self) -> bool:
-        """Whether there are episodes."""
+        """Whether episodes have been started in the lanes."""
         return bool(self._moving)
 
     @property
     def state(self) -> Any:
-        """The episodes after the last measurement, lanes padded to a multiple of eight."""
+        """The current episodes, lanes padded to a multiple of eight."""
         return self._moving[0].episode()
 
     @state.setter
@@ -490,12 +492,12 @@ class Lanes:
         self._moving[0].load(state)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return all attributes but those bound to memory: a copy makes its own."""
+        """Return the attributes for pickling, without those bound to memory addresses."""
         self._settle()
         return {**self.__dict__, "_steppers": {}, "_some": {}}
 
     def grow(self, count: int) -> None:
-        """Make room for more lanes; the new ones run arbitrary episodes until they are restarted.
+        """Enlarge to ``count`` lanes; the new ones run arbitrary episodes until they are restarted.
 
         Args:
             count: a multiple of eight.
@@ -515,7 +517,7 @@ class Lanes:
     # --- copies, growth, gradients
 
     def _episodes(self) -> tuple[Any, ...]:
-        """Return the episodes of every task with their observations; the arrays never change."""
+        """Return the current episodes and observations of task and baseline, in arrays that are never changed."""
         return tuple((stepper.episode(), stepper.shown) for stepper in self._settle())
 
     def _load(self, episodes: tuple[Any, ...]) -> None:
@@ -523,17 +525,17 @@ class Lanes:
             stepper.load(episode, shown)
 
     def detach(self) -> None:
-        """Detach the episodes from the graph of the gradient (torch only)."""
+        """Detach the episodes from the autograd graph (torch only)."""
         self._load(map_arrays(lambda tensor: tensor.detach(), self._episodes()))
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the complete state of the coming steps; :meth:`restore` returns to it any number of times."""
+        """Return a copy of the complete state, random numbers included, for :meth:`restore`."""
         self._settle()
         kept = {"decisions": self.decisions.copy(), "_lengths": self._lengths.copy()}
         return {"count": self.count, "episodes": self._episodes(), "noise": self.noise.snapshot(), **kept}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Continue from a snapshot of lanes of the same task.
+        """Restore the state of a snapshot of lanes of the same task.
 
         Raises:
             ValueError: if their number differs.
@@ -546,16 +548,14 @@ class Lanes:
         self._load(snapshot["episodes"])
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Shorten the episodes that have just begun in some lanes by numbers of decisions, to at least one."""
+        """Shorten the episodes that just began in some lanes by numbers of decisions, to at least one."""
         self.decisions[list(lanes)] = numpy.minimum(decisions, self._lengths[list(lanes)] - 1)
 
     @property
     def done(self) -> numpy.ndarray:
-        """Lanes whose episode is over, ``(count,)`` booleans."""
+        """Whether the episode of each lane is over, booleans ``(count,)``."""
         return self.decisions >= self._lengths
 
     def observe(self) -> Array:
-        """Return the observation of every lane, batch first: ``(count, len(model.fields))``, in memory
-        that the caller may keep.
-        """
+        """Return the observations of all lanes, ``(count, len(model.fields))``, in memory that is not overwritten."""
         return self._moving[0].observation(self.count)

@@ -1,4 +1,4 @@
-"""Compiled programs of a model: the parts of a step, and its reports.
+"""Compiled programs of a model: the four parts of a step, and the reports.
 
 A step has four parts. They are separate, because scenarios differ in the world, controls in the action and callers in
 the report. The long parts, world and filter, are compiled once for all of them.
@@ -28,7 +28,7 @@ Report = Callable[[Model, Episode], Any]
 
 
 def _update(model: Model, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
-    """Return the filter after the measurement, and its feedback to the world."""
+    """Return the filter's state after the update with a measurement, and its feedback to the world."""
     after = model.filter.update(state, FilterInput(measurement, truth, action))
     return after, model.feedback(after, measurement)
 
@@ -39,13 +39,13 @@ def _advance(model: Model, truth: Any, feedback: Any, noise: Array) -> tuple[Any
 
 
 def _predict(model: Model, state: Any, measurement: Any) -> tuple[Any, Array]:
-    """Return the filter at the measurement, and its observation."""
+    """Return the filter's state predicted to a measurement, and the agent's observation."""
     predicted = model.filter.predict(state, measurement)
     return predicted, model.observe(Episode(None, measurement, predicted))
 
 
 def _predict_unseen(model: Model, state: Any, measurement: Any) -> Any:
-    """Return the filter at the measurement, without an observation."""
+    """Return the filter's state predicted to a measurement, without computing the observation."""
     return model.filter.predict(state, measurement)
 
 
@@ -55,13 +55,13 @@ def begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any
 
 
 def start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
-    """Return the filter at the start of the track, and its feedback to the world."""
+    """Return the filter's state at the start of the track, and its feedback to the world."""
     state = model.filter.initialise(FilterInput(initial, truth))
     return state, model.feedback(state, initial)
 
 
 class Parts(NamedTuple):
-    """Programs of a step, and the episode that they are made for."""
+    """Programs of the parts of a step, and the episode for whose shapes they are made."""
 
     update: Specialised
     advance: Specialised
@@ -71,8 +71,9 @@ class Parts(NamedTuple):
 
 
 class _ComputedOnce:
-    """Property that is computed once, without a lock. That of functools has one before Python 3.12, which a fork could
-    leave locked in a child for ever.
+    """Property that is computed once, without a lock.
+
+    ``functools.cached_property`` has a lock before Python 3.12, which a fork could leave locked in a child for ever.
     """
 
     def __init__(self, compute: Callable[[Any], Any]) -> None:
@@ -85,7 +86,7 @@ class _ComputedOnce:
 
 
 class Programs:
-    """Traced programs of a task, shared by all models with its parameters.
+    """Compiled programs of a task, shared by all models with its parameters.
 
     Args:
         traced: the task on traced arrays.
@@ -104,7 +105,7 @@ class Programs:
         self._kept: dict[Any, Any] = {}
 
     def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "Programs":
-        """Return the programs of the task with another filter, and store them.
+        """Return the programs of the same task with another filter, from a cache.
 
         Raises:
             NotTraceable: if the filter is no straight line of arithmetic.
@@ -120,7 +121,7 @@ class Programs:
         return self._with_filter[make]
 
     def keep(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return the object stored by a key, or make and store it; the last ones stay."""
+        """Return the cached object of a key; if there is none, make it, cache it and drop the oldest."""
         if key not in self._kept:
             made = make()
             while len(self._kept) >= PROGRAM_CACHE_SIZE:
@@ -129,7 +130,7 @@ class Programs:
         return self._kept[key]
 
     def function(self, function: Callable[..., Any], **options: Any) -> CompiledFunction:
-        """Return the compiled form of ``function(task, ...)``."""
+        """Return the compiled form of ``function(model, ...)``, from a cache."""
         if function not in self._functions:
             options = {"unchanged": 0, **options}
             self._functions[function] = CompiledFunction(
@@ -139,24 +140,24 @@ class Programs:
 
     @_ComputedOnce
     def filter_update(self) -> CompiledFunction:
-        """Return the program of the filter update; a part of it that does not change is not written again."""
+        """Compiled function of the filter's update; arrays of its state that never change are not written again."""
         return self.function(_update, unchanged=None)
 
     @_ComputedOnce
     def world_advance(self) -> CompiledFunction:
-        """Return the program of the world; a part of the truth that does not change is not written again."""
+        """Compiled function of a world's step; arrays of the truth that never change are not written again."""
         if self._of_world is not self:
             return self._of_world.world_advance
         return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
 
     @_ComputedOnce
     def filter_prediction(self) -> CompiledFunction:
-        """Return the program of the filter prediction."""
+        """Compiled function of the filter's prediction to a measurement, with the observation."""
         return self.function(_predict, turned=True)
 
     @_ComputedOnce
     def world_start(self) -> Specialised:
-        """Return the program of the world at the start of the track."""
+        """Compiled function of the world's start: truth and initial estimate."""
         if self._of_world is not self:
             return self._of_world.world_start
         noise = self.traced.task.noise
@@ -165,7 +166,7 @@ class Programs:
 
     @_ComputedOnce
     def start(self) -> tuple[Specialised, Specialised]:
-        """Return the program of world and filter at the start of the track."""
+        """Compiled functions of the start of world and of filter."""
         truth, initial = self.world_start.example()
         return self.world_start, self.function(start_filter).specialise(
             initial, self.traced.truth_for_filter(truth)
@@ -173,13 +174,13 @@ class Programs:
 
     @_ComputedOnce
     def first(self) -> Parts:
-        """Return the programs from the start of the track over the first measurement."""
+        """Compiled functions of the first step: from the start of the track to the first measurement."""
         world, started = self.start
         return self._parts(world.example()[0], *started.example())
 
     @_ComputedOnce
     def later(self) -> Parts:
-        """Return the programs from an action to the next.
+        """Compiled functions of every later step: from an action to the next measurement.
 
         Raises:
             NotTraceable: if one is no straight line of arithmetic.
@@ -196,7 +197,7 @@ class Programs:
 
     @_ComputedOnce
     def unseen_predictions(self) -> tuple[Specialised, Specialised]:
-        """Return the filter predictions at the first and at later measurements, without an observation."""
+        """Compiled filter predictions without an observation, at the first and at later measurements."""
         states = self.start[1].example()[0], self.first.update.example()[0]
         predict, measurement = self.function(_predict_unseen), self.later.episode.measurement
         return predict.specialise(states[0], measurement), predict.specialise(states[1], measurement)
@@ -210,7 +211,7 @@ class Programs:
 
     @property
     def row(self) -> numpy.ndarray:
-        """Noise of a measurement."""
+        """Zeros in the shape of a measurement's random numbers, ``(normals + row_uniforms, 8)``."""
         return numpy.zeros((self.traced.task.noise.normals + self.traced.task.noise.row_uniforms, 8))
 
     def _parts(self, truth: Any, state: Any, feedback: Any) -> Parts:
@@ -226,7 +227,7 @@ class Programs:
         return Parts(update, advance, predict, Episode(following, measurement, predicted))
 
     def report_program(self, report: Report) -> Specialised:
-        """Return the program of a report.
+        """Return the compiled program of a report function.
 
         Raises:
             NotTraceable: if it is no straight line of arithmetic.

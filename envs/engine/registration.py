@@ -1,4 +1,4 @@
-"""A user's own environment in the catalogue, beside those of this package."""
+"""Registration of a user's own environment in the catalogue."""
 
 import dataclasses
 import re
@@ -42,7 +42,7 @@ def add_task(cls: type[Task]) -> None:
 
 
 def _check_contract(cls: Any) -> None:
-    """Raise ValueError for a class that cannot be an environment, with the missing parts."""
+    """Raise ValueError if a class lacks parts that an environment must declare."""
     if not (isinstance(cls, type) and issubclass(cls, Task)):
         raise ValueError(f"an environment is a subclass of filtergym.envs.contract.task.Task, got {cls!r}")
     name = cls.__name__
@@ -93,7 +93,7 @@ def _check_contract(cls: Any) -> None:
 
 
 def _check_action(model: Model) -> None:
-    """Raise ValueError for an action space, or an action of the paper's algorithm, that the engine cannot take."""
+    """Raise ValueError if the engine does not support the action space or the paper's action."""
     space: Any = model.action_space
     flat = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.is_bounded()
     if not flat and not (isinstance(space, gymnasium.spaces.Discrete) and space.start == 0):
@@ -113,7 +113,7 @@ def _check_action(model: Model) -> None:
 
 
 def _check_causes(model: Model) -> None:
-    """Raise ValueError for causes with ambiguous names in a table."""
+    """Raise ValueError if names of causes repeat or are reserved by the evaluation."""
     names = [cause.name for cause in Causes.of(model.task).causes]
     twice = [name for name in names if names.count(name) > 1 or name in RESERVED]
     if twice or len(names) > MOST_CAUSES:
@@ -125,7 +125,7 @@ def _check_causes(model: Model) -> None:
 
 
 def _check_episodes(model: Model) -> None:
-    """Run some episodes for two measurements on NumPy, and compare the results with the declaration of the task.
+    """Run a few episodes for two measurements on NumPy and compare shapes and values with the declaration.
 
     Raises:
         ValueError: for the first result that does not fit, or the first error.
@@ -223,8 +223,9 @@ def _check_episodes(model: Model) -> None:
 
 
 def _leaves(name: str, part: Any) -> Iterator[tuple[str, Any]]:
-    """Return the arrays of nested tuples and dictionaries, and other objects in their place, with names such as
-    "load of the truth".
+    """Yield the arrays of nested tuples and dictionaries with names such as "load of the truth".
+
+    An object that is no array is yielded in its place.
     """
     if isinstance(part, dict):
         for field, value in part.items():

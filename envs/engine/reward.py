@@ -2,12 +2,12 @@
 
 * ``cost``: minus the counted cost of the estimate, in units of its mean for the paper's algorithm, and compressed: of a
   cost ``x`` in that unit the reward is ``-30 log(1 + x / 30)``. That is about ``-x`` while the estimator works, and
-  falls by 30 log(2) with every doubling once the track is lost. So it is always better to find the track again, and
-  one lost track does not drown all that can be learned elsewhere.
-* ``log-likelihood``: the logarithm of the reported Gaussian's density at the truth. It rewards an honest covariance,
-  too.
-* ``cost-and-likelihood``: the sum of ``cost`` and of ``log-likelihood`` over the number of components, for what must
-  be both accurate and consistent.
+  falls by 30 log(2) with every doubling once the track is lost. So recovering a track always pays, and
+  one lost track does not dominate the gradient of all others.
+* ``log-likelihood``: the logarithm of the reported Gaussian's density at the truth. It also rewards a consistent
+  covariance.
+* ``cost-and-likelihood``: the sum of ``cost`` and of ``log-likelihood`` over the number of components, for
+  estimates that must be both accurate and consistent.
 * ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
   positive where the agent does better than the paper.
 * ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is the counted cost of the agent and ``x0`` that of the
@@ -36,14 +36,14 @@ COMPRESSED_BEYOND = 30.0
 
 
 def compress(model: Model, counted: Array) -> Array:
-    """Return the counted cost in units of the paper's average one, compressed, ``(N,)``."""
+    """Return a counted cost in units of the paper's mean cost, compressed to ``30 log(1 + x / 30)``, ``(N,)``."""
     return COMPRESSED_BEYOND * model.task.xp.log1p(
         counted * (1.0 / (COMPRESSED_BEYOND * model.task.reward.unit))
     )
 
 
 def compressed_cost(model: Model, state: Any) -> Array:
-    """Return the counted cost of the estimate in units of the paper's average one, compressed, ``(N,)``."""
+    """Return the compressed counted cost of the estimate, in units of the paper's mean cost, ``(N,)``."""
     return compress(model, model.counted_cost(state))
 
 
@@ -53,18 +53,18 @@ def cost_reward(model: Model, state: Any) -> Array:
 
 
 def log_cost_reward(model: Model, state: Any) -> Array:
-    """Return minus ``log(1 + x)`` of the counted cost x in units of an ordinary one, ``(N,)``."""
+    """Return ``-log(1 + x)``, x the counted cost in units of an ordinary episode's cost, ``(N,)``."""
     unit = model.task.reward.log_unit or model.task.reward.unit
     return -model.task.xp.log1p(model.counted_cost(state) * (1.0 / unit))
 
 
 def log_likelihood_reward(model: Model, state: Any) -> Array:
-    """Return the log-density of the truth under the reported Gaussian, ``(N,)``."""
+    """Return the log-density of the truth under the Gaussian with the reported mean and covariance, ``(N,)``."""
     return log_density(model.error(state), model.covariance(state))[0]
 
 
 def cost_and_likelihood_reward(model: Model, state: Any) -> Array:
-    """Return minus the compressed cost plus the log-density per component, ``(N,)``."""
+    """Return minus the compressed cost plus the log-density of the truth per component, ``(N,)``."""
     return cost_reward(model, state) + log_likelihood_reward(model, state) * (
         1.0 / len(model.task.components)
     )
@@ -75,7 +75,7 @@ LIKELIHOOD_WEIGHTS = {"cost": 0.0, "cost-and-likelihood": 1.0}
 
 
 def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance: Array) -> Array:
-    """Return the expected reward, up to a constant, if the truth has the distribution of a teacher, ``(N,)``.
+    """Return the expected reward, up to a constant, if the truth has a teacher's mean and covariance, ``(N,)``.
 
     With d = x - m, the student's estimate less the teacher's, and their covariances P and S, the log-density is
     expected to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A cost is a square of errors, and adds that of the teacher's own
@@ -100,11 +100,11 @@ def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance:
 
 
 def no_reward(model: Model, state: Any) -> Array:
-    """Return zero, ``(N,)``, for an unknown truth."""
+    """Return zeros ``(N,)``, the reward where the truth is unknown."""
     return 0.0 * model.mean(state)[0]
 
 
-OWN_REWARDS: dict[str, Callable[[Model, Any], Array]] = {
+REWARD_FUNCTIONS: dict[str, Callable[[Model, Any], Array]] = {
     "cost": cost_reward,
     "log-likelihood": log_likelihood_reward,
     "cost-and-likelihood": cost_and_likelihood_reward,
@@ -114,21 +114,21 @@ OWN_REWARDS: dict[str, Callable[[Model, Any], Array]] = {
 }
 """Functions of a model and its episodes. Where there is a :func:`reference`, its reward is subtracted later. "none" is
 for recordings without truth."""
-REWARDS = tuple(kind for kind in OWN_REWARDS if kind != "none")
+REWARDS = tuple(kind for kind in REWARD_FUNCTIONS if kind != "none")
 """Kinds of reward that a user can choose."""
 
 
 class RewardBaseline(NamedTuple):
-    """Baseline beside every episode on the same noise, for relative rewards."""
+    """Model and action whose reward on the same noise is subtracted in a relative reward."""
 
     model: Model
-    """The same task, under a control."""
+    """Model of the same task under the baseline's control."""
     action: tuple[float, ...] | int
-    """Its action in every decision, an element of the control's space."""
+    """Action of the baseline in every decision, an element of the control's space."""
 
 
 def reference(kind: str, model: Model) -> RewardBaseline | None:
-    """Return the baseline of a relative reward; None for a reward without one.
+    """Return the :class:`RewardBaseline` of a kind of reward; None for a reward that is not relative.
 
     Args:
         kind: of reward.
@@ -136,7 +136,7 @@ def reference(kind: str, model: Model) -> RewardBaseline | None:
     """
     if kind == "relative":
         paper = model.task.paper_policy
-        return RewardBaseline(model.under(paper.control), paper.action)
+        return RewardBaseline(model.with_control(paper.control), paper.action)
     if kind == "log-relative":
         return RewardBaseline(model, (0.0,) * model.action_space.shape[0] if model.action_space.shape else 0)
     return None

@@ -1,4 +1,4 @@
-"""Rollout of compiled episodes, stored and then differentiated in reverse.
+"""Rollout of compiled episodes whose states are stored, and reverse-mode differentiation through them.
 
 Forward, every measurement writes the episodes after it into memory of their own. Backward, the code of a step's
 pullback (:mod:`..compiler.gradients`) computes the step again from them, and turns the gradient with respect to its
@@ -15,11 +15,11 @@ from ...compiler.functions import Specialised, address_of, empty_lanes, leaves, 
 from ...compiler.gradients import pullback
 from ..contract.model import Episode
 from .programs import Programs
-from .reward import OWN_REWARDS, teacher_reward
+from .reward import REWARD_FUNCTIONS, teacher_reward
 
 
 class TrainingObjective(NamedTuple):
-    """Function whose gradient is computed."""
+    """Reward whose gradient is computed."""
 
     kind: str
     """Kind of reward."""
@@ -28,7 +28,7 @@ class TrainingObjective(NamedTuple):
 
 
 def _unpack(like: Episode, state: Any) -> Episode:
-    """Return the episode whose numbers are the rows of an array, ``(rows, N)``."""
+    """Return the episode whose arrays are the rows of one array, ``(rows, N)``."""
     row = 0
 
     def leaf(array: numpy.ndarray) -> Any:
@@ -49,10 +49,10 @@ def _pack(episode: Episode) -> Any:
 def _forward(
     programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *teacher: Any
 ) -> Any:
-    """Return the episodes at the next measurement, reward, and observation."""
+    """Return the episodes at the next measurement as rows, their reward and observation."""
     model = programs.traced
     after = model.act(_unpack(programs.later.episode, state), action)
-    episode, own = model.measure(after, noise), OWN_REWARDS[reward.kind](model, after)
+    episode, own = model.measure(after, noise), REWARD_FUNCTIONS[reward.kind](model, after)
     if teacher:
         taught = teacher_reward(reward.kind, model, after, *teacher)
         own = (1.0 - reward.teacher_share) * own + reward.teacher_share * taught
@@ -62,8 +62,7 @@ def _forward(
 def _backward(
     programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *others: Any
 ) -> Any:
-    """Return the gradients with respect to episodes and action, from those with respect to what :func:`_forward`
-    returns.
+    """Return the gradients with respect to episodes and action, from those of the outputs of :func:`_forward`.
 
     The last three arguments are the latter; those before them are the teacher's.
     """
@@ -88,7 +87,7 @@ def _compile(programs: Programs, reward: TrainingObjective) -> tuple[Specialised
 
 
 class Rollout:
-    """Episodes of a compiled model under continuous actions, with the gradient of their rewards.
+    """Episodes of a compiled model under continuous actions, and the gradient of their rewards.
 
     Args:
         model: compiled.
@@ -140,18 +139,18 @@ class Rollout:
         self._width, self._flown = width, 0
 
     def load(self, episode: Episode) -> None:
-        """Begin with other episodes."""
+        """Replace the current episodes, and delete the stored measurements."""
         values = [numpy.asarray(leaf).reshape(-1, self._width) for leaf in leaves(episode)]
         self._states[0][...] = numpy.concatenate(values)
         self._flown = 0
 
     def go_on(self) -> None:
-        """Begin with the current episodes, and delete the stored measurements."""
+        """Delete the stored measurements and continue from the current episodes."""
         self._states[0][...] = self._states[self._flown]
         self._flown = 0
 
     def forward(self) -> None:
-        """Apply the action of the present measurement in all lanes, and simulate to the next one."""
+        """Apply :attr:`action` at the current measurement in all lanes, and step to the next measurement."""
         here = self._flown
         self._forward.table[self._addresses] = self._places[here]
         self._forward(0, self._width)
@@ -160,11 +159,11 @@ class Rollout:
         self._flown += 1
 
     def backward_from_here(self) -> None:
-        """Set the gradient with respect to the present episodes to zero."""
+        """Set the gradient with respect to the current episodes to zero, before :meth:`backward`."""
         self._backward[0].arrays[self._adjoint][...] = 0.0
 
     def backward(self, measurement: int) -> None:
-        """Propagate the gradient back over a measurement, the last one first."""
+        """Propagate the gradient back through one stored measurement; call it for the last one first."""
         backward = self._backward[0]
         backward.table[self._addresses] = self._places[measurement]
         backward(0, self._width)

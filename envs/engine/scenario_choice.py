@@ -1,4 +1,4 @@
-"""Choice of a task by names and keywords, and of its scenario."""
+"""Construction of a task from names and keywords, and choice of its scenario."""
 
 import math
 import re
@@ -29,7 +29,7 @@ def _is_name(cls: type[Task], scenario: str) -> bool:
 
 
 def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
-    """Return the weights of a mixture of scenarios, which sum to one; None for a choice that is no mixture.
+    """Return the weights, summing to one, of a mixture of scenarios by name; None if the choice is no mixture.
 
     Args:
         cls: the environment.
@@ -77,7 +77,7 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
 
 
 def read_files(cls: type[Task], scenario: Any) -> Any:
-    """Return the flights or the recording of a path, so that files are read once; return other choices unchanged.
+    """Return the flights or the recording that a path contains; return any other choice unchanged.
 
     Args:
         cls: the environment.
@@ -104,7 +104,7 @@ def find_scenario(
     scenario: ScenarioChoice | Scenario,
     keywords: Mapping[str, Any] | None = None,
 ) -> Scenario:
-    """Return a scenario by name (default: the environment's own), or make one from a user's trajectory.
+    """Return the :class:`Scenario` of a name (default: the environment's first) or of a user's trajectory or flights.
 
     Args:
         cls: the environment.
@@ -145,7 +145,7 @@ def make_task(
     device: Any = None,
     **keywords: Any,
 ) -> Task:
-    """Make a task.
+    """Return a task of a class, with a scenario and parameters, on the arrays of a namespace.
 
     Args:
         cls: the class of tasks.

@@ -1,4 +1,4 @@
-"""Episodes of a compiled model in memory of their own, bound to its code once and for all."""
+"""Stepper of compiled episodes, whose memory is bound to native code once."""
 
 import itertools
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ from .episode_noise import EpisodeNoise
 from .programs import Report
 
 
-def mean_of(rewards: Sequence[Any]) -> Any:
-    """Return the mean over the measurements of one decision."""
+def mean_reward(rewards: Sequence[Any]) -> Any:
+    """Return the mean of the rewards at the measurements of one decision."""
     return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
 
 
@@ -39,7 +39,7 @@ is read faster in one piece than row by row."""
 
 
 class Stepper:
-    """Episodes of a compiled model in memory of their own, stepped by actions.
+    """Episodes of a compiled model in fixed memory, which native code steps by actions.
 
     Args:
         model: compiled.
@@ -161,24 +161,24 @@ class Stepper:
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
         self._action_place, self._report_place = len(update.inputs) - 1, len(report_code.inputs)
 
-    def load(self, episode: Episode, shown: Array = None) -> None:
-        """Continue from other episodes with this observation, ``(fields, width)``."""
+    def load(self, episode: Episode, observation: Array = None) -> None:
+        """Replace the current episodes and their observation, ``(fields, width)``."""
         own = zip(self._copies[self._now], leaves(episode), strict=True)
         for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values.reshape(memory.shape)
         self._policy_memory = None
-        if shown is not None:
-            self._shown[...] = shown.T
+        if observation is not None:
+            self._shown[...] = observation.T
 
     def episode(self) -> Episode:
-        """Return the episodes, in arrays that do not change."""
+        """Return the current episodes of all lanes, in arrays that are never changed."""
         arrays = [array.reshape(*array.shape[:-2], self.width) for array in self._copies[self._now]]
         return copy_arrays(self._template, arrays, self._kinds)
 
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Start episodes in all lanes up to their first measurement, in other steppers too.
+        """Start new episodes in all lanes up to their first measurement; return the uniform and normal numbers used.
 
         Args:
             identities: of the episodes, ``(2, lanes)``, see :mod:`.episode_noise`; the other lanes are padding.
@@ -194,7 +194,7 @@ class Stepper:
         return self._drawn
 
     def _bind_beginnings(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
-        """Bind the start and the first measurement, of the task and of the other steppers, to memory."""
+        """Return the native call that starts episodes up to the first measurement, bound to memory."""
         turns = [[noise.start_call(self._start_numbers), draw] for _ in (0, 1)]
         for each in (self, *others):
             for begin, turn in zip(each._begin, turns, strict=True):
@@ -211,7 +211,7 @@ class Stepper:
         return _bound(draw, sequences, shown)
 
     def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
-        """Run whole decisions, or beginnings, of the task and of the other steppers, as one native call."""
+        """Run one decision, or one start, of this and the other steppers as one native call."""
         draw = noise.call_of_each()
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
@@ -235,7 +235,7 @@ class Stepper:
         noise: EpisodeNoise,
         others: "Sequence[Stepper]" = (),
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Start episodes in some lanes up to their first measurement, in other steppers too.
+        """Start new episodes in some lanes up to their first measurement; return the uniform and normal numbers used.
 
         Args:
             lanes: numbers of the lanes, ascending.
@@ -249,8 +249,8 @@ class Stepper:
         steppers = (self, *others)
         for each in steppers:
             if noise.width not in each._small:
-                beside = None if each._world_of is None else self._small[noise.width]
-                each._small[noise.width] = Stepper(each._model, each._report, noise.width, beside)
+                baseline = None if each._world_of is None else self._small[noise.width]
+                each._small[noise.width] = Stepper(each._model, each._report, noise.width, baseline)
         small, *smalls = [each._small[noise.width] for each in steppers]
         start = small.begin(identities, noise, smalls)
         for each, begun in zip(steppers, (small, *smalls), strict=True):
@@ -263,15 +263,15 @@ class Stepper:
         return start
 
     def take(self, action: numpy.ndarray) -> None:
-        """Apply an action from the next step on, batch first, of all lanes or of the first."""
+        """Set the action for the next steps, batch first, for all lanes or for the first ones."""
         self.action[..., : len(action)] = action.T if action.ndim == 2 else action
 
     def take_alone(self, action: numpy.ndarray) -> None:
-        """Apply an action of the first lane from the next step on."""
+        """Set the action of the first lane for the next steps."""
         self._first_action[...] = action
 
     def decide(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
-        """Update with all measurements of a decision and the action, and report on each, in other steppers too.
+        """Step all lanes of this and the other steppers through the measurements for which one action holds.
 
         One native call runs all of it for a tile of lanes.
         """
@@ -284,7 +284,7 @@ class Stepper:
             self._shown[:, self._means.columns] = total[:, self._averages]
 
     def _bind_decisions(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
-        """Bind all measurements of a decision, of the task and of the other steppers, to memory."""
+        """Return the native call for all measurements of a decision, bound to memory."""
         columns, interval = self._means.columns, self._interval
         if columns:
             self._passing = numpy.empty((interval, *self._shown.shape))
@@ -315,8 +315,10 @@ class Stepper:
     def _let_pass(
         self, turns: Sequence[Sequence[Call]], noise: EpisodeNoise, others: "Sequence[Stepper]"
     ) -> list[tuple[Call, int, int]]:
-        """Give calls of decisions memory of one tile for temporary values: noise, and filters between update and
-        prediction. Returns the places, as of :class:`.CallSequence`.
+        """Bind the temporary values of calls to memory of one tile of lanes, and return their places.
+
+        Temporary are the noise, and the filters between update and prediction. The places are those of
+        :class:`.CallSequence`.
         """
         row = noise.call_of_each().arrays[2]
         places = {
@@ -346,8 +348,8 @@ class Stepper:
     def _bound_copies(
         self, now: int, noise: EpisodeNoise, reported: Sequence[numpy.ndarray], moving: list[Moving]
     ) -> list[Call]:
-        """Return the calls of a step that begins with one of the copies, for tables of which entries move: reports
-        are added.
+        """Return copies of the calls of a step that begins with copy ``now``; append the report arrays to
+        ``moving``.
         """
         calls = [call.copy() for call in self._calls[now]]
         if self._world_of is None:
@@ -356,7 +358,7 @@ class Stepper:
         return calls
 
     def run(self, noise: EpisodeNoise, steps: int, compiled_policy: Specialised | None) -> tuple[Any, Any]:
-        """Run over many measurements without returning to Python between them.
+        """Run many measurements in one native call; return the reports on each and the policy's actions.
 
         Args:
             noise: of the measurements.
@@ -399,33 +401,32 @@ class Stepper:
         return map_arrays(lambda i: reports[i], self._report_template), actions
 
     def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
-        """Return the memory of a policy before its first action."""
+        """Return zero arrays in the shape of a compiled policy's memory."""
         blank = memory_of(compiled_policy.outputs[1:] if compiled_policy else (), self.width)
         for array in blank:
             array[...] = 0.0
         return blank
 
     def reports(self) -> list[Any]:
-        """Return the reports on the measurements of the last :meth:`decide`, each as of :meth:`report`."""
+        """Return the reports of the last :meth:`decide`, one a measurement, of arrays ``(..., width)``."""
         return [
             copy_arrays(self._report_template, [rows[k] for rows in self.reported], self._report_kinds)
             for k in range(self._interval)
         ]
 
-    def first_reward(self, beside: "Stepper | None") -> float:
-        """Return the mean of these reports of the first lane, where each is one number, less those of the
-        stepper beside it.
-        """
+    def first_reward(self, baseline: "Stepper | None") -> float:
+        """Return the first lane's mean reward of the last decision, minus that of a baseline stepper if given."""
         if self._interval == 1:
             own: float = self._first_rewards.item(0)
-            return own if beside is None else own - beside._first_rewards.item(0)
-        rewards = self._first_rewards if beside is None else self._first_rewards - beside._first_rewards
-        return mean_of(rewards.tolist())
+            return own if baseline is None else own - baseline._first_rewards.item(0)
+        rewards = self._first_rewards if baseline is None else self._first_rewards - baseline._first_rewards
+        return mean_reward(rewards.tolist())
 
     @property
     def rewards(self) -> numpy.ndarray:
-        """Return these reports where each is one number, ``(interval, width)``; several rows are valid until the next
-        decision.
+        """Rewards at the measurements of the last decision, where the report is a reward, ``(interval, width)``.
+
+        Several rows are valid until the next decision.
         """
         return self.reported[0] if self._interval > 1 else self.reported[0].copy()
 
@@ -434,23 +435,23 @@ class Stepper:
         return self._shown.T
 
     def observation(self, count: int) -> numpy.ndarray:
-        """Return the observation of the first lanes, batch first, in memory that the caller may keep."""
+        """Return the observation of the first ``count`` lanes, batch first, in memory that is not overwritten."""
         if count < MANY:
             return self._shown[:count].copy()
         self._given = True
         return self._shown[:count]
 
     def observation_of_first(self) -> numpy.ndarray:
-        """Return the observation of the first lane, in memory that the caller may keep."""
+        """Return the observation of the first lane, ``(fields,)``, in memory that is not overwritten."""
         return self._first_shown.copy()
 
     def _show_in(self, memory: numpy.ndarray) -> None:
-        """Write observations into other memory, ``(width, fields)``, from now on."""
+        """Set the memory, ``(width, fields)``, into which later observations are written."""
         self._shown, self._first_shown, self._given = memory, memory[0], False
 
 
 class _Bound(NamedTuple):
-    """One native call, from either of the two copies of the episodes."""
+    """One native call, in two forms: from either of the two copies of the episodes."""
 
     draw: Call
     """Call that makes the noise of a measurement."""
@@ -460,14 +461,15 @@ class _Bound(NamedTuple):
 
 
 def _bound(draw: Call, sequences: list[CallSequence], shown: list[list[Call]]) -> _Bound:
-    """Combine the calls from both copies, which have the same code."""
+    """Return the native calls that start from either copy of the episodes, combined in one object."""
     sequences[1].count_with(sequences[0])
     return _Bound(draw, sequences, shown)
 
 
 def _side_by_side(arrays: Sequence[Leaf], width: int, tile: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
-    """Return the memory of all numbers of some arrays, ``(numbers, tiles, tile)``, and the arrays in it, ``(...,
-    tiles, tile)``: those of a tile side by side.
+    """Return memory for several arrays, ``(numbers, tiles, tile)``, and views of it, ``(..., tiles, tile)`` each.
+
+    The numbers of a tile are adjacent.
     """
     starts = numpy.cumsum([0, *(leaf.rows for leaf in arrays)]).tolist()
     if tile == width:

@@ -1,4 +1,4 @@
-"""One episode of a task as a Gymnasium environment; many are in :mod:`.vector_environment`."""
+"""A Gymnasium environment that runs one episode of a task at a time; for many see :mod:`.vector_environment`."""
 
 import functools
 import math
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
-    """One episode of a task at a time.
+    """Gymnasium environment of one episode of a task at a time.
 
     Args:
         task: environment id.
@@ -37,7 +37,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
             return.
-        context: whether ``info["context"]`` contains the random draws of the episode and those in force now
+        context: whether ``info["context"]`` contains the random draws of the episode and their current values
             (:meth:`.World.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
             and of "privileged" values, the context and the error after the last action in units of its reported
@@ -86,7 +86,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         self._plain_action = self.action_space.shape if is_row else None
 
     def _picture_of(self, scenario: str) -> None:
-        """Draw episodes of the present task, of a scenario of this name."""
+        """Create the picture of episodes of the current task, with the name of their scenario."""
         # Only here: matplotlib takes longer to import than an episode takes to run.
         from ..drawing.rendering import EpisodePicture
         from .late_picture import LatePicture
@@ -97,7 +97,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode and observe its first measurement.
+        """Start a new episode; return the observation of its first measurement, and ``info``.
 
         ``options["scenario"]``: as the argument ``scenario`` of the environment; None: the environment's own again.
         ``options["parameters"]``: parameters that override those of the environment; ``{}`` for none. Each applies
@@ -123,7 +123,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), self._with_context({})
 
     def _single_observation(self) -> Any:
-        """Return the observation of the one episode."""
+        """Return the observation of the only lane in the chosen type, with privileged values if wanted."""
         if not self.privileged:
             return self._to_dtype(self.fleet.observe()[0])
         return {name: values[0] for name, values in self._observations().items()}
@@ -134,9 +134,9 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Apply the action to the last measurement, then observe the next one."""
+        """Apply the action to the last measurement; return the next observation and Gymnasium's further results."""
         lanes = self.fleet.whole if self._plain and self._late is None else None
-        if lanes is not None and lanes.flies_alone:
+        if lanes is not None and lanes.has_running_episode:
             if not (
                 action.__class__ is numpy.ndarray
                 and action.shape == self._plain_action
@@ -164,17 +164,17 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), reward, False, bool(self.fleet.done[0]), info
 
     def _show(self) -> None:
-        """Draw into the window of render mode "human"."""
+        """Draw the episode into the window of render mode "human"."""
         if self._late is not None and self.render_mode == "human":
             self._late.show()
 
     @property
     def picture(self) -> "EpisodePicture | None":
-        """Picture of the episode, up to date; None without a render mode."""
+        """Up-to-date picture of the episode; None without a render mode."""
         return None if self._late is None else self._late.picture
 
     def render(self) -> numpy.ndarray | None:
-        """Draw the episode so far.
+        """Return an image of the episode so far in mode "rgb_array"; None otherwise.
 
         Returns:
             ``(height, width, 3)`` bytes in render mode "rgb_array"; None in "human", whose window is drawn by
@@ -196,6 +196,6 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._late.frame()
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window of render mode "human"."""
         if self._late is not None:
             self._late.close()

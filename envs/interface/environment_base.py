@@ -1,4 +1,4 @@
-"""Common base of both Gymnasium classes: lanes of one task or of several, observations, and the reward."""
+"""Base class of both Gymnasium environments: lanes of one task or of several, observations, and the reward."""
 
 import inspect
 import math
@@ -16,7 +16,7 @@ from ..engine.catalogue import check_names, nearest, task_class
 from ..engine.lanes import Lanes
 from ..engine.reward import REWARDS
 from ..engine.scenario_choice import find_mixture, find_scenario
-from ..engine.stepper import mean_of
+from ..engine.stepper import mean_reward
 from .fleet import EpisodeDistribution, Fleet, check_alike
 from .privileged import context_shapes, in_sigmas
 from .requests import EnvOptions
@@ -33,7 +33,7 @@ def _no_truth(distribution: EpisodeDistribution) -> str:
 
 
 class EnvBase:
-    """Common base of both environments: a task, its spaces, and the reward."""
+    """Base class of both Gymnasium environments: a task, its spaces, and the reward."""
 
     model: Model
     """Model of the episode; with a mixture of scenarios in a vector environment, of the first scenario."""
@@ -48,11 +48,11 @@ class EnvBase:
 
     @property
     def task(self) -> Task:
-        """Task of the model."""
+        """Task of the current model."""
         return self.model.task
 
     def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
-        """Store the options; raise ValueError for an unknown environment or parameter, before a model is made."""
+        """Store the options of the environment; raise ValueError for an unknown task or parameter."""
         self._class = task_class(task)
         check_names(self._class, names, inspect.signature(type(self)).parameters)
         self.options = options
@@ -61,7 +61,7 @@ class EnvBase:
             raise nearest("reward", self.reward_kind, REWARDS)
         self._rewards_only = not (options.detailed_info or options.privileged)
         self._plain = self._rewards_only and not options.context and options.dtype == "float64"
-        """Whether a step returns only observation and reward, as they are computed."""
+        """Whether a step returns observation and reward without further processing."""
         if self.privileged:
             self.metadata: dict[str, Any] = {**self.metadata, "privileged": True}
 
@@ -78,7 +78,7 @@ class EnvBase:
         count: int,
         longest: int | None,
     ) -> None:
-        """Make the lanes.
+        """Create the models of a scenario, their lanes, and the spaces of the environment.
 
         Args:
             make: function that makes a model from a scenario and parameters.
@@ -100,7 +100,7 @@ class EnvBase:
             self._scaled_errors = self.task.constant(numpy.zeros((count, len(self.task.components))))
 
     def _disable_reward(self, distribution: EpisodeDistribution) -> None:
-        """Set every reward to zero, for an unknown truth.
+        """Set the reward to zero for scenarios without truth.
 
         Raises:
             ValueError: if the user has chosen a reward, or privileged observations.
@@ -114,7 +114,7 @@ class EnvBase:
     # --- scenarios
 
     def _distribution(self, scenario: Any, parameters: Mapping[str, Any]) -> EpisodeDistribution:
-        """Make the tasks of a scenario or a mixture, with parameters that override those of the environment.
+        """Return the distribution of episodes over the tasks of a scenario or mixture, with overriding parameters.
 
         Raises:
             ValueError: for an unknown name, a value out of its limits, or a task with other spaces.
@@ -138,7 +138,7 @@ class EnvBase:
             and not all(t.task.has_whole_truth for t in models)
         ):
             raise ValueError(
-                f"{_no_truth(distribution)}, and this environment gives rewards: make another one of it"
+                f"{_no_truth(distribution)}, and this environment gives rewards: make another environment for it"
             )
         first = getattr(self, "model", models[0])
         for model, name in zip(models, names, strict=True):
@@ -151,7 +151,7 @@ class EnvBase:
         return distribution
 
     def _apply_reset_options(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
-        """Apply the scenario and the parameters of a reset to the coming episodes of these lanes."""
+        """Set the scenario and the parameters of a reset for the next episodes of these lanes."""
         if not {"scenario", "parameters"} & wanted.keys():
             return
         parameters = wanted.get("parameters")
@@ -162,7 +162,7 @@ class EnvBase:
         known = [self._first_distribution, *self.fleet.distributions()]
         distributions = []
         for lane in chosen:
-            now = self.fleet.course_of(lane)
+            now = self.fleet.distribution_of(lane)
             choice = now.scenario, now.parameters
             if "scenario" in wanted:
                 scenario = wanted["scenario"]
@@ -175,7 +175,7 @@ class EnvBase:
                 known.append(found)
             distributions.append(found)
         for lane, distribution in zip(chosen, distributions, strict=True):
-            self.fleet.send(lane, distribution)
+            self.fleet.set_distribution(lane, distribution)
         self.last_decision = self.fleet.decisions_per_episode
 
     # --- observations
@@ -197,13 +197,13 @@ class EnvBase:
         )
 
     def _to_dtype(self, values: Array) -> Array:
-        """Return the numbers in the chosen type."""
+        """Return numbers in the environment's floating-point type."""
         if self.options.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
 
     def _observations(self) -> Any:
-        """Return the observations of all lanes, batch first."""
+        """Return the observations of all lanes, batch first, with privileged values if wanted."""
         shown = self._to_dtype(self.fleet.observe())
         if not self.privileged:
             return shown
@@ -215,7 +215,7 @@ class EnvBase:
         }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Return the context of all lanes, batch first, and whether a lane has each part of it."""
+        """Return the context of all lanes by name, batch first, and for each part a mask of the lanes that have it."""
         found = []
         for (part,) in self.fleet.parts():
             context, xp = part.model.context(part.state), part.task.xp
@@ -225,7 +225,7 @@ class EnvBase:
     def _gather_reports(
         self, found: Sequence[Mapping[str, Array]]
     ) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Combine the reports of lanes of several tasks; return them with masks of the lanes that have each part.
+        """Return the reports of all lanes by name, combined from several tasks, and masks of the lanes with each part.
 
         NaN stands for missing numbers.
         """
@@ -252,7 +252,7 @@ class EnvBase:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Specification of Gymnasium; its ``max_episode_steps`` is the length of an episode in decisions."""
+        """Gymnasium specification; its ``max_episode_steps`` is the length of an episode in decisions."""
         return self._spec
 
     @spec.setter
@@ -261,7 +261,7 @@ class EnvBase:
 
     @property
     def backend(self) -> str:
-        """Code that computes the steps: "compiled", "numpy" or "torch"."""
+        """Name of the backend that computes the steps: "compiled", "numpy" or "torch"."""
         return self.model.backend
 
     # --- a step
@@ -269,7 +269,7 @@ class EnvBase:
     def _step_lanes(
         self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
     ) -> Array:
-        """Step the lanes and return the mean reward over the measurements of this decision, ``(count,)``.
+        """Apply an action in all lanes and return the mean reward over its measurements, ``(count,)``.
 
         ``watch`` is called with the state after the action, once for each measurement.
         """
@@ -288,7 +288,9 @@ class EnvBase:
     def _step_part(
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
     ) -> tuple[Array, Array]:
-        """Step lanes of one task; return rewards, and errors in sigmas for privileged observations."""
+        """Apply an action in the lanes of one task; return rewards, and errors in sigmas for privileged
+        observations.
+        """
         task, count = lanes.task, lanes.count
         report = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
         results = lanes.decide(action, report)
@@ -300,10 +302,10 @@ class EnvBase:
             info[name] = task.xp.moveaxis(values[..., :count], -1, 0)
         rewards = [own.reward if other is None else own.reward - other.reward for own, other in results]
         scaled = in_sigmas(last.error, last.covariance, count, task.xp) if self.privileged else None
-        return mean_of(rewards)[:count], scaled
+        return mean_reward(rewards)[:count], scaled
 
     def _forget_errors(self, lanes: Sequence[int]) -> None:
-        """Set the errors of lanes to zero, since new episodes have no estimate after an action."""
+        """Set the stored errors of lanes to zero, since new episodes have no estimate after an action."""
         if self.privileged:
             keep = numpy.ones((self.fleet.count, 1))
             keep[list(lanes)] = 0.0
@@ -311,5 +313,5 @@ class EnvBase:
 
     @property
     def observation_fields(self) -> tuple[Field, ...]:
-        """Name, unit and scale of every component of the observation."""
+        """Name, unit and scale of every component of the observation, in order."""
         return self.model.fields

@@ -1,4 +1,4 @@
-"""The fleet of an environment: its lanes, of one task or of several side by side.
+"""The fleet of an environment: its lanes (parallel episodes), of one task or of several tasks.
 
 A task has one set of parameters. While all episodes are of one task, the fleet is that task's
 :class:`~.lanes.Lanes`, and every call goes directly to them. Where scenarios are mixed, or a reset names another
@@ -20,7 +20,7 @@ from ..contract.model import Model
 from ..contract.observation import Array
 from ..data.recording import Recording
 from ..engine.lanes import Lanes
-from ..engine.reward import OWN_REWARDS, reference
+from ..engine.reward import REWARD_FUNCTIONS, reference
 from .specification import plain
 
 ROOM = 8
@@ -28,7 +28,7 @@ ROOM = 8
 
 
 class EpisodeDistribution(NamedTuple):
-    """Distribution of the coming episodes of a lane."""
+    """Distribution of the next episodes of a lane over scenarios."""
 
     scenario: Any
     """Choice of the user."""
@@ -38,10 +38,10 @@ class EpisodeDistribution(NamedTuple):
     names: tuple[str, ...]
     """Names of the scenarios."""
     weights: tuple[float, ...]
-    """Their weights, which sum to one."""
+    """Weights of the scenarios, which sum to one."""
 
     def is_of(self, scenario: Any, parameters: Mapping[str, Any]) -> bool:
-        """Return whether the distribution is of this scenario and these parameters."""
+        """Return whether the distribution was made from this scenario and these parameters."""
         if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long for a message
             alike = scenario is self.scenario
         else:
@@ -49,7 +49,7 @@ class EpisodeDistribution(NamedTuple):
         return alike and repr(plain(self.parameters)) == repr(plain(parameters))
 
     def draw_task(self, generator: numpy.random.Generator) -> int:
-        """Return the number of the task of the next episode; one task takes no random number."""
+        """Draw the index of the next episode's task by the weights; with one task, without a random number."""
         if len(self.models) == 1:
             return 0
         chosen = int(numpy.searchsorted(numpy.cumsum(self.weights), generator.random(), side="right"))
@@ -57,7 +57,7 @@ class EpisodeDistribution(NamedTuple):
 
 
 def check_alike(model: Model, other: Model, name: str) -> None:
-    """Raise ValueError if episodes of another task would not fit the spaces of a task.
+    """Raise ValueError if two tasks have different observation or action spaces.
 
     Args:
         model: model with the spaces of the environment.
@@ -79,11 +79,11 @@ def check_alike(model: Model, other: Model, name: str) -> None:
 
 
 class Fleet:
-    """``count`` lanes, each with a :class:`EpisodeDistribution` of its own.
+    """``count`` lanes (parallel episodes), each with its own :class:`EpisodeDistribution`.
 
     Args:
         count: number of lanes.
-        distribution: of the episodes of all lanes, until :meth:`send` sets another.
+        distribution: of the episodes of all lanes, until :meth:`set_distribution` sets another.
         kind: kind of reward, which may need a baseline beside every episode.
         longest: decisions after which an episode ends at the latest; default: its task's horizon.
     """
@@ -113,7 +113,7 @@ class Fleet:
 
     @property
     def only(self) -> Lanes:
-        """The lanes of the only task.
+        """The :class:`.Lanes` of the only task.
 
         Raises:
             ValueError: for several tasks.
@@ -126,38 +126,38 @@ class Fleet:
 
     @property
     def mixes_scenarios(self) -> bool:
-        """Whether the coming episodes may be of several tasks."""
+        """Whether the next episodes may be of several tasks."""
         return len({id(model) for distribution in self._distributions for model in distribution.models}) > 1
 
     def distributions(self) -> list[EpisodeDistribution]:
-        """Return the different distributions of the lanes."""
+        """Return the distinct distributions of the lanes as a list."""
         return list({id(distribution): distribution for distribution in self._distributions}.values())
 
-    def course_of(self, lane: int) -> EpisodeDistribution:
-        """Return the distribution of the coming episodes of a lane."""
+    def distribution_of(self, lane: int) -> EpisodeDistribution:
+        """Return the :class:`EpisodeDistribution` of a lane's next episodes."""
         return self._distributions[lane]
 
-    def send(self, lane: int, distribution: EpisodeDistribution) -> None:
-        """Draw the coming episodes of a lane from a distribution, from its next restart on."""
+    def set_distribution(self, lane: int, distribution: EpisodeDistribution) -> None:
+        """Set the distribution from which a lane's episodes are drawn after its next restart."""
         self._sent = self._sent or distribution is not self._distributions[lane]
         self._distributions[lane] = distribution
 
     def model_of(self, lane: int) -> Model:
-        """Return the task of a lane's episode."""
+        """Return the model of the task of a lane's current episode."""
         return self._parts[self._part[lane]].model
 
     def identity_of(self, lane: int) -> numpy.ndarray:
-        """Return the identity of a lane's episode, ``(2, 1)``, see :mod:`.episode_noise`."""
+        """Return the identity of a lane's current episode, ``(2, 1)``, see :mod:`.episode_noise`."""
         place = self._place[lane]
         return self._parts[self._part[lane]].noise.identities[:, place : place + 1].copy()
 
     def scenario_of(self, lane: int) -> str:
-        """Return the name of the scenario of a lane's episode."""
+        """Return the name of the scenario of a lane's current episode."""
         return self._names[lane]
 
     @property
     def decisions_per_episode(self) -> int:
-        """Decisions of the longest possible episode."""
+        """Number of decisions of the longest possible episode."""
         models = {
             id(model): model for distribution in self.distributions() for model in distribution.models
         }.values()
@@ -165,11 +165,11 @@ class Fleet:
         return most if self._longest is None else min(most, self._longest)
 
     def _make_lanes(self, model: Model, count: int) -> Lanes:
-        beside, report = reference(self._kind, model), OWN_REWARDS[self._kind]
+        beside, report = reference(self._kind, model), REWARD_FUNCTIONS[self._kind]
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
-        """Return the lanes of a task, made on first use."""
+        """Return the :class:`.Lanes` of a task, which are made on first use."""
         for part in self._parts:
             if part.model is model or part.model.task.parameters == model.task.parameters:
                 return part
@@ -181,7 +181,7 @@ class Fleet:
         return part
 
     def _arrange(self) -> None:
-        """Remove unused lanes, and store the place of every environment."""
+        """Delete the lanes of tasks no longer in use, and update the index of every environment's lane."""
         needed = [
             model.task.parameters for distribution in self._distributions for model in distribution.models
         ]
@@ -209,7 +209,7 @@ class Fleet:
         self.whole = self._parts[0] if own_places and alone else None
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
-        """Give a lane the generator that its coming episodes are drawn from."""
+        """Set the generator from which a lane's next episodes are drawn."""
         while len(self.generators) <= lane:
             self.generators.append(generator)
         self.generators[lane] = generator
@@ -217,7 +217,7 @@ class Fleet:
             self.whole.seed(lane, generator)
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
-        """Start new episodes in some lanes (default: all), each of a task drawn from its distribution."""
+        """Draw and start new episodes in some lanes (default: all), each of a task from its distribution."""
         if self.whole is not None and not self._sent:
             self.whole.restart(lanes)
             return
@@ -248,7 +248,7 @@ class Fleet:
         self._arrange()
 
     def _leave(self, whole: Lanes) -> None:
-        """Prepare for lanes of other tasks."""
+        """Switch from the lanes of a single task to lanes of several tasks, and keep running episodes."""
         self.whole = None
         if whole.has_episodes:
             whole.grow(whole.width)
@@ -258,14 +258,14 @@ class Fleet:
     # --- steps of the lanes
 
     def parts(self, *values: Array) -> list[tuple[Any, ...]]:
-        """Return the lanes of every task in use, each with its entries of arrays ``(count, ...)``."""
+        """Return a list of the :class:`.Lanes` of every task in use, with their entries of arrays ``(count, ...)``."""
         return [
             (self._parts[i], *(v[source] for v in values))
             for i, source in zip(self._flying, self._sources, strict=True)
         ]
 
     def gather(self, values: Sequence[Array]) -> Array:
-        """Combine results of the :meth:`parts`, ``(places, ...)`` each, in a new array ``(count, ...)``."""
+        """Return a new array ``(count, ...)`` from results for the :meth:`parts`, ``(places, ...)`` each."""
         if isinstance(values[0], numpy.ndarray):
             return (
                 numpy.array(values[0]) if self.whole is not None else numpy.concatenate(values)[self._where]
@@ -275,31 +275,33 @@ class Fleet:
         return self._parts[0].model.task.xp.concat(list(values))[self._where]
 
     def step_reward(self, action: Array, kind: str) -> Array:
-        """Apply one decision and return its reward, see :meth:`.lanes.Lanes.step_reward`."""
+        """Apply one action in all lanes and return the mean reward over its measurements, ``(count,)``."""
         if self.whole is not None:
             return self.whole.step_reward(action, kind)
         return self.gather([part.step_reward(own, kind) for part, own in self.parts(action)])
 
     def observe(self) -> Array:
-        """Return the observation of every lane, batch first."""
+        """Return the observations of all lanes, batch first."""
         if self.whole is not None:
             return self.whole.observe()
         return self.gather([part.observe() for (part,) in self.parts()])
 
     @property
     def decisions(self) -> numpy.ndarray:
-        """Actions taken in each lane's current episode, ``(count,)``."""
+        """Number of decisions in each lane's current episode, ``(count,)``."""
         return numpy.asarray(self.gather([part.decisions for (part,) in self.parts()]))
 
     @property
     def done(self) -> numpy.ndarray:
-        """Lanes whose episode is over, ``(count,)`` booleans; episodes of different tasks may differ in length."""
+        """Whether the episode of each lane is over, booleans ``(count,)``; episodes of different tasks may differ in
+        length.
+        """
         if self.whole is not None:
             return self.whole.done
         return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Shorten the episodes that have just begun in some lanes by numbers of decisions, to at least one."""
+        """Shorten the episodes that just began in some lanes by numbers of decisions, to at least one."""
         for lane, by in zip(lanes, decisions, strict=True):
             self._parts[self._part[lane]].shorten([int(self._place[lane])], by)
 
@@ -309,17 +311,17 @@ class Fleet:
         return self.whole.has_episodes if self.whole is not None else bool((self._part >= 0).all())
 
     def detach(self) -> None:
-        """Detach the episodes from the graph of the gradient (torch only)."""
+        """Detach the episodes from the autograd graph (torch only)."""
         for (part,) in self.parts():
             part.detach()
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the complete state of the coming steps; :meth:`restore` returns to it any number of times."""
+        """Return a copy of the complete state, random numbers included, for :meth:`restore`."""
         kept = {name: copy.deepcopy(getattr(self, name)) for name in _STATE_ATTRIBUTES}
         return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Continue from a snapshot of lanes of the same tasks.
+        """Restore the state of a snapshot of lanes of the same tasks.
 
         Raises:
             ValueError: if their number differs.

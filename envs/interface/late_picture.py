@@ -1,4 +1,4 @@
-"""Picture of an episode that is computed again on request.
+"""Picture of an episode that is computed on request from the stored actions.
 
 This module imports matplotlib; the environment imports it only for a render mode.
 """
@@ -13,10 +13,10 @@ from ..engine.lanes import Lanes
 
 
 class LatePicture:
-    """Picture of one episode, which is computed again on request.
+    """Picture of one episode, computed on request from its identity and actions.
 
-    Libraries set a render mode for environments that are not shown (Stable-Baselines3's ``make_vec_env`` always), and
-    recording the values of a picture takes far longer than a step. So only the actions are stored: they and the
+    Libraries set a render mode for environments that are not displayed (Stable-Baselines3's ``make_vec_env`` always),
+    and recording the values of a picture takes far longer than a step. So only the actions are stored: they and the
     identity determine an episode.
 
     Args:
@@ -37,12 +37,12 @@ class LatePicture:
         self._identity, self._actions = identity, []
 
     def keep(self, action: Array) -> None:
-        """Store an action, ``(A,)`` or a scalar."""
+        """Store an applied action, ``(A,)`` or a scalar."""
         self._actions.append(numpy.array(host_array(action)))
 
     @property
     def picture(self) -> EpisodePicture:
-        """Return the picture of all steps so far."""
+        """Picture of the episode, after all stored actions have been applied."""
         lanes, picture = self._lanes, self._picture
         if self._identity is not None:
             lanes.begin(self._identity)
@@ -59,11 +59,11 @@ class LatePicture:
             self._picture.keep(state, action, shown)
 
     def frame(self) -> numpy.ndarray:
-        """Draw and return the picture, ``(height, width, 3)`` bytes."""
+        """Return an image of the episode, ``(height, width, 3)`` bytes."""
         return self.picture.frame(self._lanes.state)
 
     def show(self) -> None:
-        """Draw into the window."""
+        """Draw the episode into the window."""
         self.picture.show(self._lanes.state)
 
     def close(self) -> None:

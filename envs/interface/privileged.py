@@ -12,8 +12,7 @@ from ..contract.task import Task
 
 
 def in_sigmas(error: Array, covariance: Array, count: int, xp: Any) -> Array:
-    """Return the errors of the first lanes in units of their reported standard deviations, zero where those are,
-    ``(count, C)``.
+    """Return errors over their reported standard deviations, ``(count, C)``; zero where these are zero.
 
     Args:
         error: ``(C, N)``.
@@ -28,7 +27,7 @@ def in_sigmas(error: Array, covariance: Array, count: int, xp: Any) -> Array:
 
 
 def context_shapes(task: Task) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parts of an episode's context, without the batch."""
+    """Return the shape of each part of an episode's context by name, without the batch axis."""
     xp, noise = task.xp, task.noise
 
     def numbers(rows: int, value: float) -> Array:

@@ -1,4 +1,4 @@
-"""Checks of the arguments of an environment: options, seeds, options of a reset, actions."""
+"""Checks of the arguments of an environment: constructor options, seeds, reset options, actions."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -16,11 +16,11 @@ from ..engine.catalogue import nearest
 DTYPES = ("float64", "float32")
 """Types of observations and rewards; inside everything is float64."""
 OBSERVATIONS = ("measured", "asymmetric")
-"""Kinds of observation: measured values; or with privileged values beside them, for critics in training."""
+"""Kinds of observation: measured values, or these with privileged values, for critics in training."""
 
 
 def check_seed(seed: Any) -> int | None:
-    """Return the seed of a reset, or raise ValueError for an invalid one."""
+    """Return the seed of a reset as an int or None; raise ValueError if it is invalid."""
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, int | numpy.integer) or seed < 0:
@@ -29,7 +29,7 @@ def check_seed(seed: Any) -> int | None:
 
 
 def check_options(options: Any, known: Iterable[str]) -> Mapping[str, Any]:
-    """Return the options of a reset, or raise ValueError for another type or an unknown name."""
+    """Return the options of a reset as a mapping; raise ValueError for another type or an unknown name."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):
@@ -41,7 +41,7 @@ def check_options(options: Any, known: Iterable[str]) -> Mapping[str, Any]:
 
 
 FEW = 16
-"""Count of numbers up to which a check one by one is faster than NumPy."""
+"""Largest count of numbers for which a check one by one is faster than NumPy."""
 
 
 def _all_finite(values: Array) -> bool:
@@ -53,7 +53,7 @@ def _all_finite(values: Array) -> bool:
 
 
 def check_action(space: gymnasium.Space[Any], action: Any, count: int | None) -> Array:
-    """Return the action as an array or tensor, or raise an error with the received and the expected action."""
+    """Return the action as an array or tensor; raise an error if it does not lie in the action space."""
     if is_tensor(action):
         array, values = action, action.detach()
         floating, real = (

@@ -12,7 +12,7 @@ from ..data.scenario_data import ScenarioData
 
 
 def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
-    """Return a spec with the length of an episode, and with keywords that JSON can store.
+    """Return a copy of a Gymnasium spec with the length of an episode, and keywords that JSON can store.
 
     Gymnasium registers one length for an id; here it follows from scenario and parameters. It is computed on request:
     the environment truncates by itself, without a ``TimeLimit`` wrapper.
@@ -26,7 +26,7 @@ def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
 
 
 def plain(value: Any) -> Any:
-    """Return a keyword's value in a form that JSON can store and that makes the same environment."""
+    """Return a keyword's value in a JSON-compatible form from which the same environment can be made."""
     if isinstance(value, ScenarioData):
         return {name: plain(item) for name, item in value.fields().items()}
     if isinstance(value, enum.Enum):

@@ -1,4 +1,4 @@
-"""Report of an environment on every measurement, after the action."""
+"""Report function of an environment, computed at every measurement after the action."""
 
 import functools
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
 from ..engine.programs import Report
-from ..engine.reward import OWN_REWARDS
+from ..engine.reward import REWARD_FUNCTIONS
 
 
 class StepReport(NamedTuple):
@@ -26,15 +26,15 @@ class StepReport(NamedTuple):
 
 @functools.cache
 def step_report(kind: str, errors: bool = False, details: bool = False, episode: bool = False) -> Report:
-    """Return the function that makes a :class:`StepReport`, the same one for the same arguments.
+    """Return the function that computes a :class:`StepReport`; equal arguments return the same function.
 
     Args:
-        kind: of reward, one of :data:`.reward.OWN_REWARDS`.
+        kind: of reward, one of :data:`.reward.REWARD_FUNCTIONS`.
         errors: whether error and covariance are reported.
         details: whether ``info`` contains the details of the measurement.
         episode: whether ``info`` contains the statistics of the episode.
     """
-    reward = OWN_REWARDS[kind]
+    reward = REWARD_FUNCTIONS[kind]
 
     def report(model: Model, state: Episode) -> StepReport:
         found = StepReport(reward(model, state))

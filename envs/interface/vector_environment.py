@@ -1,4 +1,4 @@
-"""Many episodes of a task as a Gymnasium vector environment."""
+"""A Gymnasium vector environment that runs many episodes of a task in parallel."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -24,15 +24,16 @@ if TYPE_CHECKING:
 
 
 class _OneThread:
-    """Guard that admits one thread at a time to a block. It uses a list, since a lock can be neither copied nor pickled
-    with an environment.
+    """Context manager that admits one thread at a time.
+
+    It uses a list, since a lock can be neither copied nor pickled with an environment.
     """
 
     def __init__(self) -> None:
         self._free = [True]
 
     def __enter__(self) -> None:
-        """Enter, or raise gymnasium.error.Error if another thread is inside."""
+        """Raise gymnasium.error.Error if another thread is inside."""
         try:
             self._free.pop()
         except IndexError:
@@ -45,7 +46,7 @@ class _OneThread:
 
 
 class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Many episodes of a task side by side, natively vectorised.
+    """Gymnasium vector environment of many episodes of a task, natively vectorised.
 
     Args:
         task: environment id.
@@ -70,7 +71,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             cost and the further records of an evaluation.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
             return.
-        context: whether ``info["context"]`` contains the random draws of the episode and those in force now
+        context: whether ``info["context"]`` contains the random draws of the episode and their current values
             (:meth:`.World.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
             and of "privileged" values, the context and the error after the last action in units of its reported
@@ -169,7 +170,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start new episodes everywhere, or where ``options["reset_mask"]`` is true.
+        """Start new episodes in all sub-environments, or where ``options["reset_mask"]`` is true.
 
         ``options["shortened_by"]``: integers ``(num_envs,)``, by how many decisions each of these episodes ends
         early (later ones are whole again), so that episodes of one horizon need not all end together.
@@ -227,7 +228,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self._observations(), self._with_context({}, begun)
 
     def _with_context(self, info: dict[str, Any], lanes: numpy.ndarray) -> dict[str, Any]:
-        """Add the context of some lanes to ``info``, in Gymnasium's form, if it is wanted."""
+        """Return ``info`` with the context of some lanes added in Gymnasium's form, if it is wanted."""
         if self.options.context and lanes.any():
             values, present = self._context()
             context = {}
@@ -260,7 +261,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.pictures.begin(self.fleet.only.state, lanes)
 
     def step(self, actions: Any) -> tuple[Any, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
-        """Apply the actions to the last measurements, then observe the next ones.
+        """Apply the actions to the last measurements; return the next observations and Gymnasium's further results.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset, and where an episode has ended without a reset.
@@ -305,14 +306,14 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return shown, reward, self._mask(self._never), self._mask(finished), info
 
     def _watch(self, action: Array) -> Callable[[Any], None] | None:
-        """Return the function that adds the states of this step to the pictures; None without a render mode."""
+        """Return a function that adds the states of this step to the pictures; None without a render mode."""
         if self.pictures is None:
             return None
         pictures, actions, shown = self.pictures, host_array(action), host_array(self.fleet.observe())
         return lambda state: pictures.keep(state, actions, shown)
 
     def render(self) -> tuple[numpy.ndarray, ...] | None:
-        """Draw the episodes so far of the first few sub-environments (:data:`.rendering.MAX_PICTURES`).
+        """Return images of the first few sub-environments in mode "rgb_array"; None otherwise.
 
         Returns:
             A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few: drawing takes
@@ -331,12 +332,12 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self.pictures.frames(self.fleet.only.state)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Delete the figures."""
+        """Close the figures in which sub-environments are drawn."""
         if self.pictures is not None:
             self.pictures.close()
 
     def _with_masks(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
-        """Return the reports of some sub-environments in Gymnasium's form: a mask beside every key."""
+        """Return ``info`` in Gymnasium's form: beside every key the mask of the sub-environments that have it."""
         if not mask.any():
             return {}
         masked = {}
@@ -351,11 +352,11 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return tensor_on(array, self.device)
 
     def _mask(self, lanes: numpy.ndarray) -> Array:
-        """Return a copy of booleans of the lanes, on the device of the backend."""
+        """Return a copy of booleans ``(num_envs,)`` on the device of the backend."""
         return lanes.copy() if self.backend != "torch" else tensor_on(lanes, self.device)
 
     def _final_observations(self, last: Any, done: numpy.ndarray) -> Array:
-        """Return last observations in Gymnasium's form: an object for each finished sub-environment, None elsewhere.
+        """Return last observations in Gymnasium's form: an object for each finished sub-environment, else None.
 
         With the torch backend one tensor, the last observation of every lane: splitting it would need a
         transfer for each lane.

@@ -1,4 +1,4 @@
-"""Environments from a state-space model in a few lines: the world and its banks.
+"""Environments made from a state-space model: the world and its banks.
 
-Knows the contract. Begin with :mod:`.state_space`; ``filtergym.state_space`` is the door to it.
+Imports the contract. Begin with :mod:`.state_space`; ``filtergym.state_space`` makes such an environment.
 """

@@ -28,7 +28,7 @@ from ...filters.angles import shorten, unwrap
 from ...filters.gaussian import log_density
 from ...filters.innovation_update import Received, kalman_gain, keep_received
 from ...filters.small_matrices import apply, product, transpose
-from ...filters.unscented import GAUSSIAN, Spread, narrow, sigma_points
+from ...filters.unscented import GAUSSIAN, Spread, limit_spread, sigma_points
 from ..contract.observation import Array
 from ..contract.task import Task
 from .inputs import Input
@@ -38,20 +38,23 @@ from .sensors import Channel
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceModel:
-    """Equations of a state-space model. Functions of the motion take the state, then the interval where the model is
-    timed, s, and then the inputs.
+    """Equations of a state-space model.
+
+    Functions of the motion take the state, then the interval where the model is timed, s, and then the inputs.
     """
 
     f: VectorFunction
     h: VectorFunction
     Q: numpy.ndarray | VectorFunction
-    """``(n, n)``; or a function that returns its n^2 numbers row by row: then the model is timed."""
+    """Process noise covariance, ``(n, n)``; or a function that returns its n^2 numbers row by row: then the model is
+    timed."""
     R: numpy.ndarray | VectorFunction
-    """``(m, m)``; or a function that returns its m^2 numbers row by row."""
+    """Measurement noise covariance, ``(m, m)``; or a function that returns its m^2 numbers row by row."""
     G: VectorFunction | None = None
-    """f as a function of the inputs first, then of its other arguments; None where no input has noise."""
+    """The function f with the inputs as its first arguments; None where no input has noise."""
     D: VectorFunction | None = None
-    """h as a function of the inputs first; None where no input has noise or h does not depend on the inputs."""
+    """The function h with the inputs as its first arguments; None where no input has noise or h does not depend on
+    inputs."""
     sources: Mapping[str, numpy.ndarray | VectorFunction] = field(default_factory=dict)
     """Terms of which Q is the sum, by the names of the noises; empty where the noises have no names."""
     warned: dict[str, str] = field(default_factory=dict)
@@ -59,17 +62,18 @@ class StateSpaceModel:
 
     @property
     def timed(self) -> bool:
-        """Return whether f and Q are functions of the interval between measurements."""
+        """Return whether f and Q depend on the interval between measurements."""
         return isinstance(self.Q, VectorFunction)
 
     def allows_zero_interval(self, mean: numpy.ndarray, inputs: numpy.ndarray) -> bool:
-        """Return whether f is the identity and Q zero for an interval of zero.
+        """Return whether f is the identity and Q zero for an interval of zero, so that measurements may be
+        simultaneous.
 
-        Measurements may then be simultaneous. The method checks this numerically at a few states.
+        The method checks this numerically at a few states.
 
         Args:
             mean: centre of the states that are checked, ``(n,)``.
-            inputs: usual inputs, ``(p,)``.
+            inputs: typical inputs, ``(p,)``.
         """
         if not isinstance(self.Q, VectorFunction):
             return False
@@ -81,7 +85,7 @@ class StateSpaceModel:
 
     @property
     def is_linear(self) -> bool:
-        """Return whether f and h are matrices."""
+        """Return whether both f and h are given as matrices."""
         maps = (self.f, self.h)
         return all(one.matrix is not None and not numpy.any(one.offset) for one in maps)
 
@@ -112,26 +116,26 @@ class StateSpaceDefinition:
     """Sensors, each of which measures some of the m numbers; one for all of them where they have no names."""
 
     @property
-    def usual_inputs(self) -> numpy.ndarray:
-        """Return the means of the inputs, ``(p,)``."""
+    def nominal_inputs(self) -> numpy.ndarray:
+        """Return the mean values of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
     @property
     def measurement_words(self) -> str:
-        """Return a sentence that names the numbers of a measurement and the inputs."""
+        """Return a sentence that lists the numbers of a measurement and the inputs, with units."""
         words = f"Of a measurement, values and available are of {', '.join(self.measured)}, in this order"
         inputs = ", ".join(self.inputs)
         return f"{words}; inputs, which acted since the one before, are {inputs}." if inputs else f"{words}."
 
-    def usual_noise(self, interval: float) -> numpy.ndarray:
-        """Return the Q of the filters' first model for an interval, s, at the initial mean, ``(n, n)``."""
-        return process_noise(self.filters[0], self.mean, interval, self.usual_inputs)
+    def nominal_process_noise(self, interval: float) -> numpy.ndarray:
+        """Return Q of the filters' first model at the initial mean for an interval, s, ``(n, n)``."""
+        return process_noise(self.filters[0], self.mean, interval, self.nominal_inputs)
 
 
 def process_noise(
     model: StateSpaceModel, x: numpy.ndarray, interval: float, inputs: numpy.ndarray
 ) -> numpy.ndarray:
-    """Return the Q of a model, ``(n, n)``; constant where the model is not timed.
+    """Return the process noise covariance Q of a model, ``(n, n)``; constant if the model is not timed.
 
     Args:
         model: the equations.
@@ -149,7 +153,7 @@ def process_noise(
 def sensor_noise(
     model: StateSpaceModel, x: numpy.ndarray, interval: numpy.ndarray, inputs: numpy.ndarray
 ) -> numpy.ndarray:
-    """Return the R of a model at K measurements, ``(m, m, K)``.
+    """Return the measurement noise covariance R of a model at K measurements, ``(m, m, K)``.
 
     Args:
         model: the equations.
@@ -164,10 +168,10 @@ def sensor_noise(
     return numpy.reshape(model.R.value(numpy.concatenate(rows), numpy), (m, m, K))
 
 
-def usual_sensor_noise(
+def nominal_sensor_noise(
     model: StateSpaceModel, mean: numpy.ndarray, interval: float, inputs: Mapping[str, Input]
 ) -> numpy.ndarray:
-    """Return the R of a model at the initial mean, averaged over the inputs of a simulation, ``(m, m)``.
+    """Return R of a model at the initial mean, averaged over the distribution of the inputs, ``(m, m)``.
 
     The average is that of 2 p sigma points, which is exact where R is quadratic in the inputs: where the standard
     deviation is an input, R is the sum of its squared mean and its variance.
@@ -188,7 +192,7 @@ def usual_sensor_noise(
 
 
 class InvalidNoise(NamedTuple):
-    """A measurement with an R that is not positive definite."""
+    """A measurement whose R is not positive definite."""
 
     place: int
     """Index of the measurement."""
@@ -200,9 +204,9 @@ class InvalidNoise(NamedTuple):
 def find_invalid_noise(
     definition: StateSpaceDefinition, available: numpy.ndarray, interval: numpy.ndarray, inputs: numpy.ndarray
 ) -> InvalidNoise | None:
-    """Find one of K measurements with a sensor whose R is not positive definite under a model of the filters.
+    """Return the first of K measurements at which a sensor's R is not positive definite; None if there is none.
 
-    The function returns None where there is none. It skips sensors whose R depends on the state.
+    Sensors whose R depends on the state are skipped.
 
     Args:
         definition: the models.
@@ -249,7 +253,7 @@ class StateSpaceMeasurement(NamedTuple):
 
 
 class Passage(NamedTuple):
-    """Interval and inputs until a measurement that has not been made yet."""
+    """Interval and inputs up to a measurement that has not been made yet."""
 
     interval: Array | None
     inputs: Array | None
@@ -262,15 +266,15 @@ Passed = StateSpaceMeasurement | Passage
 
 
 class StateSpaceProblem(Task):
-    """The part of a task of state-space models that equations, world, filters and live input use."""
+    """Base class of a task of state-space models, used by equations, world, filters and live input."""
 
     definition: ClassVar[StateSpaceDefinition]
     parameters: StateSpaceParameters
 
     def set_up(self) -> None:
-        """Put the models of the filters on the task's arrays."""
+        """Create the :class:`Equations` of the filters' models on the task's arrays."""
         own = self.definition
-        self.believed: list[Equations] = [Equations(self, model) for model in own.filters]
+        self.filter_equations: list[Equations] = [Equations(self, model) for model in own.filters]
         count = len(own.filters)
         self.modes: tuple[str, ...] = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
         self.transition: Array = self.constant([list(row) for row in own.transition])
@@ -281,7 +285,7 @@ class StateSpaceProblem(Task):
 
 
 class Equations:
-    """A model on the arrays of a task.
+    """The equations of a model on the arrays of a task.
 
     Args:
         task: the task, which provides the arrays.
@@ -310,7 +314,7 @@ class Equations:
         return None if isinstance(noise, VectorFunction) else task.constant(noise)
 
     def move(self, x: Array, passed: Passed) -> Array:
-        """Return the state at the next measurement without noise, ``(n, ...)``.
+        """Return the state f(x) at the next measurement, without process noise, ``(n, ...)``.
 
         Args:
             x: ``(n, ...)``.
@@ -319,14 +323,14 @@ class Equations:
         return self._value("f", self.model.f, self._with_passed(x, passed))
 
     def _with_passed(self, x: Array, passed: Passed) -> Array:
-        """Return the state with the interval and the inputs as its last rows, ``(n + 1 + p, ...)``."""
+        """Return the state with the interval and the inputs appended as rows, ``(n + 1 + p, ...)``."""
         rows = [] if passed.interval is None else [passed.interval]
         if passed.inputs is not None:
             rows += [passed.inputs[j] for j in range(passed.inputs.shape[0])]
         return self.xp.concat([x, *((0.0 * x[0] + row)[None] for row in rows)]) if rows else x
 
     def process_noise(self, x: Array, passed: Passed, of_sources: Mapping[str, Any] | None = None) -> Array:
-        """Return Q, ``(n, n, N)``; ``(n, n, 1)`` where the model is not timed.
+        """Return the process noise covariance Q, ``(n, n, N)``; ``(n, n, 1)`` where the model is not timed.
 
         Args:
             x: predicted state, ``(n, N)``.
@@ -353,7 +357,8 @@ class Equations:
         return self.xp.reshape(entries, (size, size, *x.shape[1:]))
 
     def input_noise(self, x: Array, passed: Passed) -> Array | float:
-        """Return the covariance ``G N G^T`` that noise of the inputs adds, ``(n, n, N)``; 0.0 without such noise.
+        """Return the covariance ``G N G^T`` that the inputs' noise adds to the prediction, ``(n, n, N)``, or 0.0
+        without it.
 
         Args:
             x: state at the previous measurement, ``(n, N)``.
@@ -362,11 +367,11 @@ class Equations:
         return self._through(self.model.G, self._with_passed(x, Passage(passed.interval, None)), passed)
 
     def measured_noise(self, R: Array, x: Array, passed: Passed) -> Array:
-        """Return ``R + D N D^T``, R with the noise of the inputs, ``(m, m, N)``, at the state of the measurement."""
+        """Return ``R + D N D^T``: R plus the effect of the inputs' noise on the measurement, ``(m, m, N)``."""
         return R if self.model.D is None else R + self._through(self.model.D, x, passed)
 
     def _through(self, function: VectorFunction | None, given: Array, passed: Passed) -> Array | float:
-        """Return the covariance that noise of the inputs gives to a function of inputs and further arguments."""
+        """Return the covariance that the inputs' noise causes in the output of a function of inputs and state."""
         if function is None:
             return 0.0
         assert passed.inputs is not None
@@ -380,7 +385,7 @@ class Equations:
     def sensor_noise(
         self, x: Array, passed: Passed, factor: Any = 1.0, of_sensors: Mapping[str, Any] | None = None
     ) -> Array:
-        """Return R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
+        """Return the measurement noise covariance R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
 
         Args:
             x: state at the measurement, ``(n, N)``.
@@ -398,7 +403,7 @@ class Equations:
         return self.xp.stack(rows)
 
     def measure(self, x: Array, passed: Passed) -> Array:
-        """Return the measurement without noise, ``(m, ...)``.
+        """Return the measurement h(x) without noise, ``(m, ...)``.
 
         Args:
             x: ``(n, ...)``.
@@ -410,13 +415,13 @@ class Equations:
         return self._with_passed(x, Passage(None, passed.inputs)) if self.model.h.given else x
 
     def subtract(self, z: Array, predicted: Array) -> Array:
-        """Return the innovation, measurement minus prediction, ``(m, ...)``, angles within half a turn."""
+        """Return the innovation, measurement minus prediction, ``(m, ...)``; angles lie within half a turn."""
         return shorten(z - predicted, self.periods)
 
     def continuous_measurement(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Return the measurement function and sigma points of a transform in which angles are continuous.
+        """Return the measurement function with unwrapped angles, and the sigma points of an unscented transform for it.
 
         Along a state in which an angle is linear it follows its slope over any number of turns. Along the others it
         changes by less than half a turn, for which the points are close enough.
@@ -436,7 +441,7 @@ class Equations:
     def continuous_motion(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Return the motion and sigma points of a transform in which angles stay on the turn nearest the mean.
+        """Return the motion function with angles unwrapped to the mean's turn, and sigma points for it.
 
         Args:
             mean: state, ``(n, N)``.
@@ -457,7 +462,7 @@ class Equations:
         mean: Array,
         covariance: Array,
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Return the function with angles continuous from the mean to each point, and points close enough for that.
+        """Return a function with angles unwrapped from the mean to each sigma point, and points close enough for that.
 
         Args:
             function: from points ``(n, 2n + 1, N)``.
@@ -479,10 +484,10 @@ class Equations:
         if not bent:
             return continuous, GAUSSIAN
         turns = self.xp.stack([(J[row] - slopes[row]) / periods[row] for row in bent])
-        return continuous, narrow(turns, covariance, QUARTER)
+        return continuous, limit_spread(turns, covariance, QUARTER)
 
     def receive(self, measurement: StateSpaceMeasurement, mean: Array, R: Array) -> Received:
-        """Return the innovation, H and R of the received numbers of a measurement.
+        """Return the innovation, Jacobian H and noise R of the received numbers of a measurement.
 
         Args:
             measurement: finite also where nothing was received.
@@ -494,7 +499,9 @@ class Equations:
         return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
 
     def gain(self, covariance: Array, received: Received) -> Array:
-        """Return the Kalman gain ``(n, m, N)`` for a covariance ``(n, n, N)``, zero for sensors beyond their gates."""
+        """Return the Kalman gain, ``(n, m, N)``, for a covariance ``(n, n, N)``; zero for sensors outside their
+        gates.
+        """
         if self.gated:
             S = product(product(received.H, covariance), transpose(received.H)) + received.R
             kept = self.within_gates(received.innovation, S)
@@ -502,7 +509,7 @@ class Equations:
         return kalman_gain(covariance, received)
 
     def within_gates(self, nu: Array, S: Array) -> Array:
-        """Return 1 for numbers of sensors whose innovation is within their gate, else 0, ``(m, N)``.
+        """Return 1 for numbers of sensors whose innovation passes the sensor's gate, else 0, ``(m, N)``.
 
         Args:
             nu: innovation, ``(m, N)``.
@@ -522,7 +529,9 @@ class Equations:
         return self.xp.reshape(values, (function.size, *x.shape[1:]))
 
     def _warn(self, name: str, compute: Callable[[Array, Any], Array], x: Array) -> Array:
-        """Return the values at vectors ``(n, N)``; warn with the function's name where NumPy would warn."""
+        """Return a function's values at vectors ``(n, N)``; name the function in a warning about values that are not
+        finite.
+        """
         if self.xp is not numpy:
             return compute(x, self.xp)
         with numpy.errstate(all="ignore"):
@@ -535,7 +544,7 @@ class Equations:
         return values
 
     def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
-        """Describe the first finite state with a value that is not finite; return an empty text if there is none."""
+        """Return a text on a function's first value that is not finite, at a finite state; empty if there is none."""
         entries = values.reshape(len(values), -1, x.shape[1])
         wrong = numpy.asarray(~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0))
         if not wrong.any():
@@ -558,7 +567,7 @@ class Equations:
     def explain_loss(
         self, mean: numpy.ndarray, covariance: numpy.ndarray, measurement: StateSpaceMeasurement
     ) -> str:
-        """Name the function that is not finite near an estimate at the update with the next measurement.
+        """Return a sentence naming the function that is not finite near an estimate at the next measurement.
 
         Args:
             mean: last valid mean, ``(n, N)``.
@@ -579,19 +588,19 @@ class Equations:
             return self._describe("h", self.model.h.value(given, numpy), given)
 
     def transition_matrix(self, x: Array, passed: Passed) -> Array:
-        """Return the Jacobian of f, ``(n, n, N)``; the last axis has length 1 where it is constant."""
+        """Return the Jacobian F of f, ``(n, n, N)``; the last axis has length 1 where it is constant."""
         if self._F is not None:
             return self._F[:, :, None]
         return self._warn("the derivative of f", self.model.f.jacobian, self._with_passed(x, passed))
 
     def measurement_matrix(self, x: Array, passed: Passed) -> Array:
-        """Return the Jacobian of h, ``(m, n, N)``; the last axis has length 1 where it is constant."""
+        """Return the Jacobian H of h, ``(m, n, N)``; the last axis has length 1 where it is constant."""
         if self._H is not None:
             return self._H[:, :, None]
         return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))
 
     def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
-        """Return the mean and covariance at the next measurement, without process noise.
+        """Return the predicted mean and covariance at the next measurement, without process noise.
 
         Args:
             mean: ``(n, N)``.

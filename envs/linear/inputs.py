@@ -18,7 +18,7 @@ from ..contract.observation import Array
 
 @dataclass(frozen=True)
 class Input:
-    """A known input: its Gauss-Markov process in a simulation, and the noise with which filters know it.
+    """A known input: its Gauss-Markov process in a simulation, and the noise of the value that filters receive.
 
     Raises:
         ValueError: for a number that is not finite or out of range.
@@ -64,7 +64,7 @@ class InputProcesses:
         self.normals: int = len(inputs) + len(self.noisy)
 
     def begin(self, normals: Array) -> Array | None:
-        """Return the inputs before the first measurement, ``(p, N)``; None without inputs.
+        """Return the initial inputs, ``(p, N)``, drawn from their stationary distribution; None without inputs.
 
         Args:
             normals: standard normal numbers, ``(p, N)``.
@@ -90,7 +90,7 @@ class InputProcesses:
         return xp.stack(after)
 
     def report(self, inputs: Array, normals: Array) -> Array:
-        """Return the inputs as filters receive them, ``(p, N)``.
+        """Return the inputs with noise, as filters receive them, ``(p, N)``.
 
         Args:
             inputs: those that act, ``(p, N)``.

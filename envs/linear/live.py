@@ -14,7 +14,7 @@ UNEVEN = 0.01
 
 
 class StateSpaceInput(LiveInput):
-    """Reader of live values of sensors and inputs, by the names of their numbers or of the sensors.
+    """Converter of live values of sensors and inputs into measurements, by the names of numbers or sensors.
 
     A timed model accepts any interval, and zero where the state does not move in it. Any other model accepts only its
     sampling interval.
@@ -28,13 +28,13 @@ class StateSpaceInput(LiveInput):
         super().__init__(task, initial, measurement, tracks)
         own = task.definition
         self.fuses: bool = all(
-            model.allows_zero_interval(own.mean, own.usual_inputs) for model in own.filters
+            model.allows_zero_interval(own.mean, own.nominal_inputs) for model in own.filters
         )
         self._noise_varies = any(isinstance(model.R, VectorFunction) for model in own.filters)
         self._names = ["values", *(channel.name for channel in self.groups), *self.measured]
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return descriptions of the values by name, and of those at the start; the interval follows from the times."""
+        """Return the names and descriptions of the values of a measurement, and of those at the start."""
         values, at_start = super().describe()
         found = {name: text for name, text in values.items() if name not in ("interval", "inputs")}
         sensors = {channel.name: f"shape ({channel.size},)" for channel in self.groups}
@@ -44,13 +44,13 @@ class StateSpaceInput(LiveInput):
         )
         return {**names, **inputs, **found}, at_start
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Start with inputs that are not known yet (NaN)."""
-        initial, memory = super().start(time, given)
-        return initial, {**memory, "inputs": self.same_of_all(numpy.nan, (len(self.inputs),))}
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Return the initial estimate and a memory in which the inputs are unknown (NaN)."""
+        initial, memory = super().start(time, initial_values)
+        return initial, {**memory, "inputs": self.broadcast(numpy.nan, (len(self.inputs),))}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the measurement and the memory.
+        """Return the measurement from the values of one time, and the memory for the next one.
 
         Raises:
             ValueError: if the model cannot move by this interval.
@@ -72,7 +72,7 @@ class StateSpaceInput(LiveInput):
         return self._checked(super().measure(memory, time, values), interval)
 
     def _checked(self, made: tuple[Any, Memory], interval: Any) -> tuple[Any, Memory]:
-        """Return the measurement; raise ValueError where its inputs make R of a sensor not positive definite."""
+        """Return ``made`` unchanged; raise ValueError if the inputs make R of a sensor not positive definite."""
         if not self._noise_varies:
             return made
         measurement, N = made[0], self.tracks
@@ -88,7 +88,7 @@ class StateSpaceInput(LiveInput):
         return made
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values with all sensors in one array, ``(m, N)``, for one track ``(m,)``.
+        """Return the values by name with the numbers of all sensors in one array, ``(m, N)``, for one track ``(m,)``.
 
         Raises:
             ValueError: if a number is given twice.
@@ -109,7 +109,7 @@ class StateSpaceInput(LiveInput):
         return {**values, "values": rows}
 
     def _hold(self, before: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Return the newest value of each input, ``(p, N)``, for one track ``(p,)``.
+        """Return the newest value of each input, ``(p, N)``, for one track ``(p,)``: without a new one the last.
 
         Raises:
             ValueError: if an input has had no value so far.

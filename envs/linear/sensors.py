@@ -1,4 +1,4 @@
-"""Named sensors of a state-space model: what they measure, when, and their faults.
+"""Named sensors of a state-space model: their measurements, rates and faults.
 
 A measurement contains the numbers of all sensors, one after the other, and which of them were received. Filters update
 with simultaneous sensors jointly: their noises are independent, so the order would matter only to linearisation.
@@ -51,7 +51,8 @@ class Sensor:
     """Mahalanobis distance of an innovation from zero beyond which no filter updates with the measurement; None: no
     gate. The likelihood includes the measurement in any case."""
     wraps: str | None = None
-    """``"rad"`` or ``"deg"``: the sensor measures angles, and innovations are between minus and plus half a turn."""
+    """Unit of a sensor that measures angles, ``"rad"`` or ``"deg"``: innovations are between minus and plus half a
+    turn."""
     names: Sequence[str] = ()
     """Names of its m numbers, columns of a table ``SENSOR_NAME``; default: 1, 2 and so on. A single number has the name
     of the sensor."""
@@ -77,16 +78,16 @@ class Channel(NamedTuple):
 
     @property
     def places(self) -> slice:
-        """Return the slice of its numbers."""
+        """Return the slice of the sensor's numbers in a measurement."""
         return slice(self.first, self.first + self.size)
 
     @property
     def numbers(self) -> range:
-        """Return the indices of its numbers."""
+        """Return the indices of the sensor's numbers in a measurement."""
         return range(self.first, self.first + self.size)
 
     def is_received(self, available: Array) -> Array:
-        """Return whether any of its numbers was received, ``(N,)``, from ``available``, ``(m, N)``."""
+        """Return booleans ``(N,)``: whether any number of the sensor was received, from ``available``, ``(m, N)``."""
         found = available[self.first] > 0.0
         for place in self.numbers[1:]:
             found = found | (available[place] > 0.0)
@@ -94,7 +95,7 @@ class Channel(NamedTuple):
 
 
 def missing_value_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
-    """Return for each of several sensors the cause of costs that it gives no value."""
+    """Return one cause for each of several sensors: that it gives no value at a measurement."""
 
     def cause(channel: Channel) -> Cause:
         def holds(moment: Moment) -> Array:
@@ -117,7 +118,7 @@ class SensorStates(NamedTuple):
 
 
 class Receptions:
-    """Rates, gaps, losses and the offset of the sensors of a simulation.
+    """Simulation of which sensor values arrive: rates, gaps and losses; and of one sensor's offset.
 
     Args:
         parameters: parameters of the task.
@@ -146,7 +147,7 @@ class Receptions:
         self.row_uniforms: int = len(self.lossy) + len(self.channels) * self.has_gaps
 
     def begin(self, draws: Draws, zero: Array) -> SensorStates | None:
-        """Return the state at the start of the track from zeros ``(N,)``; None where the sensors have no state."""
+        """Return the sensors' state at the start of the track from zeros ``(N,)``; None where they have no state."""
         states = SensorStates(
             self.xp.stack([zero] * len(self.due)) if self.due else None,
             self.xp.stack([zero] * len(self.channels)) if self.has_gaps else None,
@@ -155,7 +156,7 @@ class Receptions:
         return None if all(part is None for part in states) else states
 
     def _bias(self, draws: Draws, zero: Array) -> Array:
-        """Return the offset of one sensor, up or down, ``(m, N)``."""
+        """Return the constant errors of all numbers, ``(m, N)``: an offset of one sensor, up or down."""
         biased = draws.integer("biased_sensor", (0, len(self.channels) - 1))
         sign = 2.0 * draws.integer("sign", (0, 1)) - 1.0
         size, rows = (self.parameters.bias * self.deviations).tolist(), []
@@ -167,7 +168,8 @@ class Receptions:
     def advance(
         self, states: SensorStates | None, interval: Array, uniforms: Array
     ) -> tuple[SensorStates | None, Array | None]:
-        """Return the state at a measurement, and 1 for each number received, else 0, ``(m, N)``; None where all are.
+        """Return the sensors' state at a measurement, and 1 for each number received, else 0, ``(m, N)``; None if all
+        are.
 
         Args:
             states: state at the previous measurement.

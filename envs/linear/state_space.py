@@ -1,4 +1,4 @@
-r"""A task made of a user's state-space model: its world and its class.
+r"""A task made from a user's state-space model: its world and its class.
 
     x(k) = f(x(k-1)) + w,  w ~ N(0, Q)          z(k) = h(x(k)) + v,  v ~ N(0, R)          x(0) ~ N(mean, covariance)
 
@@ -34,7 +34,7 @@ from .equations import (
     StateSpaceDefinition,
     StateSpaceMeasurement,
     StateSpaceProblem,
-    usual_sensor_noise,
+    nominal_sensor_noise,
 )
 from .inputs import InputProcesses
 from .live import StateSpaceInput
@@ -47,9 +47,9 @@ class StateSpaceTruth(NamedTuple):
     """True state, model, noise factors and inputs."""
 
     state: Array
-    """``(n, N)``."""
+    """True state, ``(n, N)``."""
     hypothesis: Array
-    """Index of the model in force since the previous measurement, ``(N,)``."""
+    """Index of the model that holds since the previous measurement, ``(N,)``."""
     process_noise: Array
     """Ratio of the true Q to the model's, ``(N,)``."""
     measurement_noise: Array
@@ -64,7 +64,7 @@ class StateSpaceTruth(NamedTuple):
 
 
 class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasurement]):
-    """A state that moves by one model, or switches between several."""
+    """World in which a state moves by one state-space model, or switches between several."""
 
     parameters: StateSpaceParameters
     received_field: ClassVar[str] = "values"
@@ -94,7 +94,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.is_switching: bool = own.switching and len(own.world) > 1
         self.has_losses: bool = self.parameters.availability < 1.0
         self.drawn: int = int(self.is_switching) + int(self.has_jitter) + int(self.has_losses)
-        usual = usual_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
+        usual = nominal_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
         deviations = numpy.sqrt(numpy.diag(usual))
         self.receptions: Receptions = Receptions(task.parameters, task.xp, own.channels, deviations)
         self.delayed: int = self.drawn + self.receptions.row_uniforms
@@ -110,7 +110,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
     def begin(self, draws: Draws, normals: Array) -> tuple[StateSpaceTruth, Initial]:
-        """Draw initial state and noise of the episode; every filter starts with the same mean and covariance."""
+        """Return the drawn truth (initial state, noise factors of the episode) and the initial estimate."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
         process, measurement = (
             draw_between(draws.log_uniform, name, limits) + zero
@@ -135,7 +135,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def advance(
         self, truth: StateSpaceTruth, noise: Array, feedback: Any
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Switch the model, move the state and measure it."""
+        """Return the truth at the next measurement, possibly under another model, and that measurement."""
         xp, n = self.xp, self.states
         uniforms = noise[self.normals :]
         hypothesis = truth.hypothesis
@@ -170,7 +170,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def _delay(
         self, truth: StateSpaceTruth, received: StateSpaceMeasurement, uniforms: Array
     ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
-        """Delay the values of some sensors, and add the delayed values that arrive now.
+        """Return truth and measurement with some sensors' values delayed, and delayed values that arrive now added.
 
         Args:
             truth: truth at this measurement, with the delayed values of earlier ones.
@@ -209,7 +209,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return values, available
 
     def _seconds(self, truth: StateSpaceTruth, interval: Array | None) -> Array:
-        """Return the time until the next measurement, s, ``(N,)``, also for a model that is not timed."""
+        """Return the time until the next measurement, s, ``(N,)``; the sampling interval if the model is not timed."""
         usual: Array = self.parameters.sampling_interval + 0.0 * truth.process_noise
         return usual if interval is None else interval
 
@@ -223,7 +223,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return inputs, self.input_processes.report(inputs, normals)
 
     def _interval(self, truth: StateSpaceTruth, uniform: Array | None) -> Array | None:
-        """Return the time until the next measurement, s, ``(N,)``; None where the model is not timed."""
+        """Return the random time until the next measurement, s, ``(N,)``; None if the model is not timed."""
         if not self.timed:
             return None
         interval = self.parameters.sampling_interval + 0.0 * truth.process_noise
@@ -247,17 +247,17 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self.xp.astype(category(uniform, thresholds, self.xp), self.xp.float64)
 
     def error_cost(self, error: Array) -> Array:
-        """Return the weighted sum of squared errors; a component with weight zero need not be known."""
+        """Return the weighted sum of squared errors, ``(N,)``; a component with weight zero need not be known."""
         weights = self.task.definition.weights.tolist()
         terms = [weight * error[i] ** 2 for i, weight in enumerate(weights) if weight]
         return sum(terms[1:], terms[0])
 
     def reading_deviations(self, measurement: StateSpaceMeasurement) -> Array:
-        """Return the standard deviations of the filters' R, ``(m, N)``; at the initial mean if R varies with x."""
+        """Return the standard deviations by the filters' R, ``(m, N)``; at the initial mean if R varies with x."""
         values = measurement.values
         mean = self.task.constant(self.task.definition.mean)
         x = self.xp.stack([mean[i] + 0.0 * values[0] for i in range(self.states)])
-        R = self.task.believed[0].sensor_noise(x, measurement)
+        R = self.task.filter_equations[0].sensor_noise(x, measurement)
         return self.xp.stack([self.xp.sqrt(R[j, j]) + 0.0 * values[j] for j in range(values.shape[0])])
 
     def component_readings(self, measurement: StateSpaceMeasurement) -> Array | None:
@@ -265,7 +265,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         return self._of_components(measurement.values, measurement.available)
 
     def component_deviations(self, measurement: StateSpaceMeasurement) -> Array | None:
-        """Return the standard deviations of the readings of components, ``(n, N)``, by the filters' model."""
+        """Return the standard deviations of :meth:`component_readings`, ``(n, N)``, by the filters' model."""
         return self._of_components(self.reading_deviations(measurement), measurement.available)
 
     def _of_components(self, values: Array, available: Array) -> Array | None:
@@ -278,7 +278,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         )
 
     def context(self, truth: StateSpaceTruth) -> dict[str, Array]:
-        """Return the model in force and the factors on Q and R."""
+        """Return the index of the current model and the factors on Q and R, by name."""
         return {
             "hypothesis": truth.hypothesis,
             "process_noise": truth.process_noise,
@@ -287,7 +287,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
 
 
 def measurement_indices(h: VectorFunction) -> list[int | None]:
-    """Return the index of the measurement of each component that h measures directly, otherwise None."""
+    """Return for each component the index of the number that measures it directly (a unit row of h), or None."""
     if h.matrix is None or numpy.any(h.offset):
         return [None] * (0 if h.matrix is None else h.matrix.shape[1])
     rows = h.matrix.tolist()
@@ -296,7 +296,7 @@ def measurement_indices(h: VectorFunction) -> list[int | None]:
 
 
 class StateSpace(StateSpaceProblem):
-    """A state-space model of your own, and the filters that estimate its state.
+    """A user's state-space model, and the filters that estimate its state.
 
     ## Description
 
@@ -342,7 +342,7 @@ REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("ev
 def _explain_loss(
     task: StateSpaceProblem, mean: Array, covariance: Array, measurement: StateSpaceMeasurement
 ) -> str:
-    return task.believed[0].explain_loss(mean, covariance, measurement)
+    return task.filter_equations[0].explain_loss(mean, covariance, measurement)
 
 
 def state_space_attributes(
@@ -350,7 +350,7 @@ def state_space_attributes(
     components: tuple[Component, ...],
     defaults: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return the attributes of a task's class that follow from its definition.
+    """Return the class attributes of a task that follow from its state-space definition, by name.
 
     Args:
         definition: the models.

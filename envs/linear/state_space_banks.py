@@ -25,9 +25,9 @@ from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
     AVERAGE_OF_LOG1P,
-    KEPT_AS_LOG,
     SHARE,
     SIGNED_LOG,
+    STORED_AS_LOG,
     Array,
     Block,
     availability_block,
@@ -42,20 +42,20 @@ from .parameters import StateSpaceParameters
 AVERAGE_WEIGHT = 0.1
 """Weight of the newest measurement in the observed averages."""
 NOISE_RANGE = 20.0
-"""``kalman-net``: largest factor and divisor of each standard deviation of the process and measurement noise."""
+"""Largest factor and divisor of each standard deviation of the process and measurement noise, in ``kalman-net``."""
 AGILITY = 5.0
-"""``kalman-net``: largest factor and divisor of the standard deviations in the gain alone."""
+"""Largest factor and divisor of the standard deviations in the gain alone, in ``kalman-net``."""
 OFFSET = 5.0
-"""``kalman-net``: largest offset of the predicted state, in standard deviations of the process noise."""
+"""Largest offset of the predicted state, in standard deviations of the process noise, in ``kalman-net``."""
 
 
 class ExtendedKalmanState(NamedTuple):
     """State of an extended Kalman filter."""
 
     mean: Array
-    """``(n, N)``; predicted between ``predict`` and the action."""
+    """Mean, ``(n, N)``; predicted between ``predict`` and the action."""
     covariance: Array
-    """``(n, n, N)``; between ``predict`` and the action predicted without process noise."""
+    """Covariance, ``(n, n, N)``; between ``predict`` and the action predicted without process noise."""
     innovation: Array
     """Innovation over its predicted sigma, ``(m, N)``."""
     nis: Array
@@ -72,30 +72,30 @@ class ExtendedKalmanState(NamedTuple):
 
 
 class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalmanState]):
-    """Base of the banks with one filter."""
+    """Base class of the banks with one extended Kalman filter."""
 
     parameters: StateSpaceParameters
 
     def __init__(self, task: StateSpaceProblem, control: str) -> None:
         super().__init__(task, control)
-        self.equations: Equations = task.believed[0]
+        self.equations: Equations = task.filter_equations[0]
         own = self.equations.model
         self.states: int = own.f.size
         self.sensors: int = own.h.size
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return a box from -1 to 1 for each entry of the action."""
-        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
+        """Gymnasium box [-1, 1] with one number for each entry of the action."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
-    def answers(self) -> Sequence[str]:
-        """Return the names of the entries of the action."""
+    def action_names(self) -> Sequence[str]:
+        """Names of the entries of the action, in order."""
         raise NotImplementedError
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the observation blocks of a filter with one model."""
+        """Observation blocks: normalised innovations, NIS, averages, availability, and the last action."""
         parts = tuple(map(str, range(1, self.sensors + 1))) if self.sensors > 1 else ()
         return (
             innovation_block(parts, text="innovations over their sigma"),
@@ -107,11 +107,11 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
                 compression=AVERAGE_OF_LOG1P,
             ),
             availability_block(parts=parts),
-            last_action_block(self.answers),
+            last_action_block(self.action_names),
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Return the filter at the initial estimate."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         zero = 0.0 * initial.mean[0]
         return ExtendedKalmanState(
             initial.mean,
@@ -120,24 +120,24 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
             zero,
             zero,
             zero + math.log(2.0),
-            self.xp.stack([zero] * len(self.answers)),
+            self.xp.stack([zero] * len(self.action_names)),
         )
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return Q at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
+        """Return the process noise Q at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return R at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
+        """Return the measurement noise R at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
         return self.equations.sensor_noise(mean, measurement)
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Predict, and compute the innovation statistics under the noises of the last action."""
+        """Return the state predicted to a measurement, with innovation statistics for the last action's noises."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def compare(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Compute the innovation, NIS and log-likelihood of the measurement under its prediction."""
+        """Return the state with the innovation, NIS and log-likelihood of a measurement under its prediction."""
         xp = self.xp
         received = self.receive(state, measurement, state.action)
         P = state.covariance + self.process_noise(state.mean, measurement, state.action)
@@ -173,25 +173,25 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
 
 class StateSpaceNoiseBank(StateSpaceBank):
-    """Control ``noise``: the action scales Q and R."""
+    """Bank of the control ``noise``: the action scales Q and R."""
 
-    answers: Sequence[str] = ("process", "measurement")
+    action_names: Sequence[str] = ("process", "measurement")
 
     def _scale(self, action: Array, entry: int) -> Array:
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return Q scaled by the action, ``(n, n, N)``."""
+        """Return the process noise Q scaled by the action, ``(n, n, N)``."""
         return self._scale(action, 0) * self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return R scaled by the action, ``(m, m, N)``."""
+        """Return the measurement noise R scaled by the action, ``(m, m, N)``."""
         return self.equations.sensor_noise(mean, measurement, self._scale(action, 1))
 
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the noises of the action."""
+        """Return the state updated with Q and R scaled by the action."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
@@ -200,17 +200,17 @@ class StateSpaceNoiseBank(StateSpaceBank):
 
 
 class StateSpaceGainBank(StateSpaceBank):
-    """Control ``gain``: the action multiplies the gain of each component."""
+    """Bank of the control ``gain``: the action multiplies the Kalman gain of each component."""
 
     @property
-    def answers(self) -> Sequence[str]:
-        """Return the names of the components."""
+    def action_names(self) -> Sequence[str]:
+        """Names of the components, one for each entry of the action."""
         return tuple(component.name for component in self.task.components)
 
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the gain of the action."""
+        """Return the state updated with the Kalman gain multiplied by the action's factors."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.receive(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
@@ -237,21 +237,21 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
     def __init__(self, task: StateSpaceProblem, control: str) -> None:
         super().__init__(task, control)
-        usual = task.definition.usual_noise(self.parameters.sampling_interval)
+        usual = task.definition.nominal_process_noise(self.parameters.sampling_interval)
         sigma = numpy.sqrt(numpy.diag(usual))
         self.deviations: Array = task.constant(sigma)[:, None]
         self.scales: Array = task.constant(1.0 / numpy.where(sigma > 0.0, sigma, 1.0))[:, None]
 
     @property
-    def answers(self) -> Sequence[str]:
-        """Return the names of the noises, their factors in the gain alone, and the offset."""
+    def action_names(self) -> Sequence[str]:
+        """Names of the action's entries: noises, their factors in the gain alone, and offsets."""
         counts = {"process": self.states, "sensor": self.sensors, "agility": self.states}
         counts |= {"caution": self.sensors, "offset": self.states}
         return tuple(f"{name}_{i + 1}" for name, count in counts.items() for i in range(count))
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of one filter, with the state, the last correction and the log-deviation of the state."""
+        """Observation blocks: those of one filter, the state, the last correction, and the log-deviations."""
         names = tuple(component.name for component in self.task.components)
         names = names if len(names) > 1 else ()
         xp = self.xp
@@ -281,27 +281,27 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
                 spread,
                 "deviation of the state over that of the process noise",
                 names,
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
         )
 
     def start(self, initial: Initial) -> ExtendedKalmanState:
-        """Return the filter at the initial estimate."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         return super().start(initial)._replace(correction=0.0 * initial.mean)
 
     def _part(self, action: Array, place: int) -> Array:
-        """Return a part of an action: 0 process, 1 sensor, 2 agility, 3 caution, 4 offset."""
+        """Return a part of the action by its number: 0 process, 1 sensor, 2 agility, 3 caution, 4 offset."""
         n, m = self.states, self.sensors
         ends = numpy.cumsum([0, n, m, n, m, n]).tolist()
         return action[ends[place] : ends[place + 1]]
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return Q under the action, ``D Q D``, ``(n, n, N)``."""
+        """Return the process noise ``D Q D`` that the action sets, ``(n, n, N)``."""
         Q = self.equations.process_noise(mean, measurement)
         return self._scaled(Q, NOISE_RANGE, self._part(action, 0))
 
     def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
-        """Return R under the action, ``W R W``, ``(m, m, N)``."""
+        """Return the measurement noise ``W R W`` that the action sets, ``(m, m, N)``."""
         R = self.equations.sensor_noise(mean, measurement)
         return self._scaled(R, NOISE_RANGE, self._part(action, 1))
 
@@ -310,7 +310,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         return outer(scale, scale) * matrix
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Predict with the offset of the last action, and compute the innovation statistics."""
+        """Return the state predicted with the last action's offset, with the innovation statistics."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
@@ -318,7 +318,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
     def act(
         self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
     ) -> ExtendedKalmanState:
-        """Update with the noises, gain factors and offset of the network."""
+        """Return the state updated with the noises, gain factors and offset that the network's action sets."""
         action = self.xp.clip(action, -1.0, 1.0)
         Q = self.process_noise(state.mean, measurement, action)
         received = self.receive(state, measurement, action)
@@ -358,7 +358,7 @@ class Mixture(NamedTuple):
 
 
 class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture]):
-    """Control ``evidence``: an interacting multiple model of extended Kalman filters, see :mod:`..filters.imm`.
+    """Bank of the control ``evidence``: an interacting multiple model (IMM) of extended Kalman filters.
 
     Args:
         task: the problem.
@@ -381,19 +381,19 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         of_sensors: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(task, control)
-        self.count: int = len(task.believed)
+        self.count: int = len(task.filter_equations)
         self.factor = process_noise
         self.of_sources = of_sources
         self.sensor_factors: tuple[Any, Mapping[str, Any] | None] = measurement_noise, of_sensors
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return the space of the evidence, one number for each hypothesis."""
+        """Gymnasium space of the evidence, one number for each hypothesis."""
         return bank_action_space(self.control, self.count)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of probabilities, likelihoods, availability and the last action."""
+        """Observation blocks of probabilities, likelihoods, availability and the last action."""
         xp, modes = self.xp, self.task.modes
         parts = tuple(map(str, range(1, self.task.definition.filters[0].h.size + 1)))
         return (
@@ -404,7 +404,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
                 lambda f, _: f.log_predicted,
                 "predicted probabilities",
                 modes,
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
             Block(
                 "probability",
@@ -418,7 +418,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def start(self, initial: Initial) -> Mixture:
-        """Return all hypotheses at the initial estimate, equally probable."""
+        """Return the state with all hypotheses at the initial estimate, equally probable."""
         xp, zero = self.xp, 0.0 * initial.mean[0]
         one = xp.stack([zero] * self.count)
         return Mixture(
@@ -434,12 +434,12 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def predict(self, state: Mixture, measurement: StateSpaceMeasurement) -> Mixture:
-        """Mix, predict and update every hypothesis; none of that depends on the action."""
+        """Return the IMM's hypotheses mixed, predicted and updated with the measurement, independent of the action."""
         xp = self.xp
         chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
         means, covariances = imm.mix(self._align(state.means), state.covariances, chain.mixing)
         updates = []
-        for j, equations in enumerate(self.task.believed):
+        for j, equations in enumerate(self.task.filter_equations):
             mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
             P = carried + self.factor * equations.process_noise(mean, measurement, self.of_sources)
             R = equations.sensor_noise(mean, measurement, *self.sensor_factors)
@@ -454,11 +454,11 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         )
 
     def _align(self, means: Array) -> Array:
-        """Return the means ``(n, M, N)`` with angles on the turn of the first hypothesis."""
+        """Return the means ``(n, M, N)`` with angles shifted by whole turns next to the first hypothesis."""
         return unwrap(means, means[:, :1], self.task.periods)
 
     def act(self, state: Mixture, measurement: StateSpaceMeasurement, action: Array) -> Mixture:
-        """Weight the hypotheses with the evidence of the action, and combine them."""
+        """Return the hypotheses weighted with the evidence of the action and combined into one estimate."""
         probabilities = bank_probabilities(
             self.control,
             action,
@@ -472,7 +472,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         return state._replace(mean=mean, covariance=covariance, probabilities=probabilities, action=action)
 
     def records(self, state: Mixture, measurement: StateSpaceMeasurement) -> dict[str, Array]:
-        """Return the log-likelihood of the measurement and the probabilities of the hypotheses."""
+        """Return the log-likelihood of the measurement and the hypotheses' probabilities, by name."""
         there = ordered_sum(measurement.available) > 0.0
         density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
         return {
@@ -482,7 +482,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
 
 def bank_tables(count: int) -> tuple[Mapping[str, Any], Mapping[str, str]]:
-    """Return banks and descriptions of actions by control, the default first, for a number of hypotheses."""
+    """Return the bank classes and the descriptions of actions, each by control, the default control first."""
     banks: dict[str, Any] = {"noise": StateSpaceNoiseBank, "gain": StateSpaceGainBank}
     actions = {
         "noise": "times `noise_decades` decades: factors on Q and R; **0 is the filter as written**",

@@ -1,4 +1,4 @@
-"""Logs of users: recorded flights, recorded measurements, logs of receivers, and truth in files of its own.
+"""Readers of users' logs: recorded flights, recorded measurements, receiver logs, and files of the truth.
 
 Imports the engine and the state-space models. Begin with :mod:`.reading`, which detects the kind of a file;
 :mod:`.recorded_tables` reads tables, :mod:`.receiver_logs` the formats of receivers, :mod:`.flights`

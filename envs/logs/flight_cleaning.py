@@ -23,7 +23,7 @@ class Cleaning(NamedTuple):
     smoothing: float
 
     def check(self) -> None:
-        """Raise ValueError if a limit is out of range."""
+        """Raise ValueError if a limit of the cleaning is out of its range."""
         check("longest_gap", self.longest_gap, float, ParameterLimits(above=0.0))
         check(
             "speeds", freeze(self.speeds), tuple[float, float], ParameterLimits(at_least=0.0, ascending=True)
@@ -51,7 +51,7 @@ LONGEST_PAUSE = 1800.0
 def clean_flight(
     name: str, rows: "pandas.DataFrame", limits: Cleaning
 ) -> tuple[list[Trajectory], dict[str, int]]:
-    """Cut one flight into pieces.
+    """Return the valid pieces of one recorded flight, and the counts of removed rows and cuts.
 
     Args:
         name: name of the flight.
@@ -116,7 +116,7 @@ def clean_flight(
 
 
 def _arrays(rows: "pandas.DataFrame") -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray | None]:
-    """Return times ``(n,)``, positions and velocities ``(n, 2)``."""
+    """Return the times ``(n,)``, positions and velocities ``(n, 2)`` of a flight's rows; velocities may be None."""
     # In the order of rows in memory, on which the last bit of a fit depends.
     pairs = [
         numpy.ascontiguousarray(rows[[*pair]].to_numpy())

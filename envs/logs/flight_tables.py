@@ -57,8 +57,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 ``time`` in seconds, in ISO 8601 or as dates of any resolution; ``x``, ``y`` in metres, ``vx``, ``vy`` in m/s; or
 latitude and longitude in degrees, altitude in metres. The state vectors of OpenSky have this form. Files of the Python
 package ``traffic``, recognised by ``groundspeed``, have altitudes in feet. Rows of one ``flight`` belong together, in
-the order of their times; rows on the ``ground`` are left out.
-"""
+the order of their times; rows on the ``ground`` are left out."""
 FOOT = 0.3048
 DELIMITERS = ",;\t"
 """Delimiters of cells in CSV: the first of these in the line of names applies."""
@@ -103,7 +102,7 @@ class ColumnNames(frozenset[str]):
     prefix: str
 
     def __new__(cls, names: Iterable[str], prefix: str = "") -> "ColumnNames":
-        """Create the set from names and a prefix."""
+        """Return a set of the names, with a prefix of further names."""
         found = super().__new__(cls, names)
         found.prefix = prefix
         return found
@@ -113,7 +112,7 @@ class ColumnNames(frozenset[str]):
 
     @property
     def request(self) -> dict[str, Any]:
-        """Return the names in the form of a parser's arguments."""
+        """The names and the prefix as arguments of a parser in a subprocess."""
         return {"names": sorted(self), "prefix": self.prefix}
 
 
@@ -142,7 +141,7 @@ def _csv(file: Path, known: ColumnNames) -> FlightTable:
 
 
 def _bounded_lines(text: TextIO) -> Iterator[str]:
-    """Return the lines of a text.
+    """Yield the lines of a text, none of which may exceed ``LONGEST_LINE``.
 
     Raises:
         ValueError: for a line longer than ``LONGEST_LINE``.
@@ -154,14 +153,14 @@ def _bounded_lines(text: TextIO) -> Iterator[str]:
 
 
 def _replace_decimal_commas(cells: Sequence[str]) -> Sequence[str]:
-    """Return the cells with points for decimal commas, if the column has commas and no points."""
+    """Return the cells with decimal points, if the column has commas and no points."""
     if not any("," in cell for cell in cells) or any("." in cell for cell in cells):
         return cells
     return [cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in cells]
 
 
 def open_netcdf(file: Path, wanted: ColumnNames | None = None, **decoding: Any) -> "xarray.Dataset":
-    """Open a NetCDF file, of the third or the fourth version.
+    """Return the content of a NetCDF file, version 3 or 4, as a decoded dataset.
 
     Args:
         file: its path.
@@ -199,7 +198,7 @@ def netcdf_attribute_names(file: Path) -> list[str]:
 
 
 def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xarray.Dataset":
-    """Read a NetCDF file without decoding."""
+    """Return the content of a NetCDF file as a dataset, without decoding."""
     import xarray
 
     if not _is_hdf(file):
@@ -209,7 +208,7 @@ def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xa
             numbers = sum(variable.size for variable in data.variables.values())
             if numbers > MOST_NUMBERS:
                 raise ValueError(
-                    f"it holds {numbers:,} numbers, more than the {MOST_NUMBERS:,} that it may: split it"
+                    f"it holds {numbers:,} numbers, more than the limit of {MOST_NUMBERS:,}: split it"
                 )
             return data.load()
     found = parse_apart(
@@ -232,7 +231,7 @@ def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xa
 
 
 def _plain_attributes(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the attributes, with arrays of one number as that number."""
+    """Return attributes by name, with arrays of one number as that number."""
     return {
         name: value[()] if isinstance(value, numpy.ndarray) and value.ndim == 0 else value
         for name, value in pairs
@@ -329,7 +328,7 @@ def suffix_of(file: Path) -> str:
 
 
 def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTable:
-    """Read the known columns of a file.
+    """Return the known columns of a file, the names of all its columns, and notes.
 
     Args:
         file: path with one of ``FLIGHT_SUFFIXES``.
@@ -354,7 +353,7 @@ def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTab
 
 
 def list_names(names: Sequence[str], most: int = 20) -> str:
-    """Return the first names as text, with the number of the others."""
+    """Return the first names as one text, with the number of the others."""
     return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")
 
 
@@ -383,7 +382,7 @@ def flight_columns(table: FlightTable) -> tuple["pandas.DataFrame", bool]:
 
 
 def numbers(name: str, values: "pandas.Series") -> "pandas.Series":
-    """Return a column as numbers; empty cells are NaN.
+    """Return a column of numbers or text as numbers; empty cells are NaN.
 
     Raises:
         ValueError: for a cell that is no number.
@@ -411,7 +410,7 @@ def _is_number(cell: Any) -> bool:
 
 
 def is_true(values: "pandas.Series") -> "pandas.Series":
-    """Return the mask of rows with a true value, as text or as a number; an empty cell is false."""
+    """Return a mask of the rows with a true value, as text or as a number; an empty cell is false."""
     return values.astype(str).str.strip().str.lower().isin(["true", "1", "1.0"])
 
 
@@ -500,14 +499,14 @@ def check_order(time: numpy.ndarray, written: numpy.ndarray | None = None) -> No
 
 
 def _counter_turn(step: float) -> float | None:
-    """Return the range of the counter that restarts at a step of time, s; None at other steps."""
+    """Return the range of the counter that wraps around at a step of time, s; None for other steps."""
     return next((turn for turn in COUNTERS if abs(step + turn) < COUNTER_SHARE * turn), None)
 
 
 def sort_by_time(
     table: "pandas.DataFrame", times: "pandas.Series", group: numpy.ndarray | None = None
 ) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Sort the rows of a table by time; those of a counter that restarts are not sorted.
+    """Return the rows of a table sorted by time, unless a counter wraps around, and a note on rows out of order.
 
     Args:
         table: rows, numbered from zero.

@@ -88,13 +88,13 @@ class Flights(FlightData):
             object.__setattr__(self, "sources", found)
 
     def fields(self) -> dict[str, Any]:
-        """Return the trajectories and the other arguments that make the same set."""
+        """Return the trajectories and other constructor arguments of the set, by name."""
         flown = [trajectory.fields() for trajectory in self.trajectories]
         return {"trajectories": flown, "name": self.name, "fewest_scans": self.fewest_scans}
 
     def flyable(self, interval: float, farthest: float) -> tuple[list[Trajectory], list[str]]:
-        """Return the pieces in range that are long enough to fly, and a line for each source that was cut or lost
-        pieces.
+        """Return the pieces within range that are long enough, and a note for each source that was shortened or
+        dropped.
 
         Args:
             interval: sampling interval, s.
@@ -135,12 +135,12 @@ class Flights(FlightData):
 
 
 def flight_of(trajectory: Trajectory) -> str:
-    """Return the name of a trajectory's flight, of which it may be a piece."""
+    """Return the name of the flight of which a trajectory is a piece, or its own name."""
     return trajectory.flight or trajectory.name
 
 
 def _number_namesakes(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Assign numbers to whole flights with the same name, which are not pieces of one flight."""
+    """Return the trajectories with numbers appended to the names of different flights with the same name."""
     names = [flight_of(trajectory) for trajectory in trajectories]
     return [
         replace(trajectory, name=f"{trajectory.name} {i}")
@@ -158,7 +158,7 @@ def _nothing(name: str, reasons: Sequence[str]) -> str:
 
 
 def flights_from(fields: Mapping[str, Any]) -> Flights:
-    """Return the set of flights from a dictionary of its fields, as JSON gives it.
+    """Return a :class:`Flights` from a dictionary of its fields, as read from JSON.
 
     Raises:
         ValueError: if there is an unknown field, or no valid list of trajectories.
@@ -183,7 +183,7 @@ def flights_from(fields: Mapping[str, Any]) -> Flights:
 
 
 def names_flights(source: Any) -> bool:
-    """Return whether a scenario is a path or pattern of files of flights, a folder of them, or a sequence."""
+    """Return whether a scenario is a path or pattern of flight files, a folder of them, or a sequence."""
     if isinstance(source, Path):
         return True
     if isinstance(source, str):
@@ -199,7 +199,7 @@ TRAFFIC = "traffic:"
 
 
 def traffic_samples() -> dict[str, Path]:
-    """Return the sample files of the package ``traffic`` by their names; none if it is not installed.
+    """Return the sample files of the Python package ``traffic`` by name; empty if it is not installed.
 
     The package is not imported: that would import many libraries, and the samples are JSON.
     """
@@ -271,7 +271,7 @@ def read_flights(
     smoothing: float = 0.0,
     fewest_scans: int = 10,
 ) -> Flights:
-    """Read recorded flights, clean them and cut them into pieces without gaps.
+    """Return recorded flights, read from files, cleaned and cut into pieces without gaps.
 
     Args:
         source: a file (CSV, NetCDF, Parquet), a folder of such, a pattern such as ``"flights/*.csv"``, a
@@ -355,7 +355,7 @@ def _check_site(site: Any) -> tuple[float, float] | None:
 
 
 def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[FlightSource]:
-    """Read one file, with a source for it and one for every flight in it that cannot be used.
+    """Return the flights of one file as sources, with a reason for every flight that cannot be used.
 
     Raises:
         ValueError: if nothing of it can be used.
@@ -455,7 +455,7 @@ def _check_degrees(site: tuple[float, float] | None, rows: "pandas.DataFrame") -
 
 
 def _around(site: tuple[float, float], rows: "pandas.DataFrame") -> "pandas.DataFrame":
-    """Add x and y, m east and north of a site, to the rows of one flight."""
+    """Return the rows of one flight with x and y, m east and north of a site, added."""
     latitude, longitude = (numpy.radians(rows[name].to_numpy()) for name in ("latitude", "longitude"))
     altitude = numpy.zeros_like(latitude)
     if "altitude" in rows:

@@ -67,7 +67,7 @@ def read_onboard(path: Any) -> OnboardTrack | None:
 
 
 def _px4_track(topic: str, fields: dict[str, numpy.ndarray]) -> OnboardTrack:
-    """Invert the azimuthal equidistant projection of PX4's ``map_projection``."""
+    """Return the track of a PX4 log: the inverse of the azimuthal equidistant projection of its ``map_projection``."""
     valid = fields.get("xy_valid", numpy.ones(len(fields["timestamp"]))) > 0
     # Time of the sample of the estimate; its publication is some ms later.
     time, x, y, latitude, longitude = (
@@ -89,7 +89,7 @@ def _px4_track(topic: str, fields: dict[str, numpy.ndarray]) -> OnboardTrack:
 
 
 def _ardupilot_track(topic: str, estimates: numpy.ndarray, origins: numpy.ndarray) -> OnboardTrack | None:
-    """Add metres north and east to the origin in force.
+    """Return the track of an ArduPilot log: metres north and east added to the last origin.
 
     Estimates ``(3, n)`` and origins ``(4, m)`` have times in us; origins of type 0 are those of the filter.
     """

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..contract.log_format import Column, LogFormat, PlainRows, Predicted, TrackLog, TrackStart
+from ..contract.log_format import Column, LogFormat, PlainRows, PredictedCoordinate, TrackLog, TrackStart
 from ..linear.equations import find_invalid_noise
 from .recorded_tables import UNEVEN, Columns
 
@@ -32,7 +32,7 @@ SIMULATION_PARAMETERS = (
 
 
 def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping[str, Any]) -> LogFormat:
-    """Return the log format of a state-space model.
+    """Return the :class:`LogFormat` of a state-space model.
 
     Args:
         definition: the models.
@@ -47,7 +47,7 @@ def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping
         functools.partial(_read, definition, dict(defaults)),
         _start,
         predict=functools.partial(_predict, definition) if one else None,
-        predicted=tuple(Predicted(name, unit, name) for name, unit in definition.measured.items()),
+        predicted=tuple(PredictedCoordinate(name, unit, name) for name, unit in definition.measured.items()),
         plain_rows=PlainRows(
             tuple(definition.measured),
             tuple(definition.inputs),
@@ -64,7 +64,7 @@ def _read(
     defaults: Mapping[str, Any],
     columns: Columns,
 ) -> TrackLog:
-    """Return the measurements of one track.
+    """Return the measurements of one track from the columns of a table.
 
     Raises:
         ValueError: if a column is missing or a value is not possible.
@@ -77,7 +77,7 @@ def _read(
             f"nothing was received; if it has another name, give --rename 'NAME={lacking[0]}'"
         )
     known = {name: value for name, value in defaults.items() if name not in SIMULATION_PARAMETERS}
-    parameters = {name: value for name, value in known.items() if name not in columns.given}
+    parameters = {name: value for name, value in known.items() if name not in columns.user_parameters}
     timed = definition.world[0].timed
     typical: dict[str, float] = {}
     notes: tuple[str, ...] = ()
@@ -87,7 +87,7 @@ def _read(
         typical["sampling_interval"] = usual
         rows, time = numpy.arange(len(columns.time)), columns.time
     else:
-        usual = float({"sampling_interval": 1.0, **known, **columns.given}["sampling_interval"])
+        usual = float({"sampling_interval": 1.0, **known, **columns.user_parameters}["sampling_interval"])
         rows, time = _fill_gaps(columns.time, usual)
         missed = int((rows < 0).sum())
         notes = (f"{missed:,} measurements without a row: nothing was received",) * bool(missed)
@@ -109,7 +109,7 @@ def _read(
 def _check_noise(
     definition: "StateSpaceDefinition", made: Mapping[str, numpy.ndarray], rows: numpy.ndarray, usual: float
 ) -> None:
-    """Raise ValueError for a row that makes R of a sensor not positive definite, such as an accuracy of zero."""
+    """Raise ValueError for a row that makes a sensor's R not positive definite, such as an accuracy of zero."""
     count = len(rows)
     interval = made.get("interval", numpy.full(count, usual))
     inputs = made.get("inputs", numpy.zeros((count, 0)))
@@ -170,7 +170,7 @@ def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, pa
 def _predict(
     definition: "StateSpaceDefinition", mean: numpy.ndarray, measurement: Any, parameters: Any
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the predicted and the received measurement, ``(m, ...)`` each, with angles on the nearest turn."""
+    """Return the predicted and the received measurement, ``(m, ...)`` each; predicted angles on the nearest turn."""
     model = definition.filters[0]
     rows = [mean]
     rows += [measurement.interval[None]] if model.timed else []

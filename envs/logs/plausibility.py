@@ -75,7 +75,7 @@ def check_speed(
     sigma: float = 0.0,
     moving: bool = True,
 ) -> None:
-    """Check that positions in metres and times in seconds give a possible speed.
+    """Raise ValueError if positions in metres and times in seconds give an impossible speed.
 
     Args:
         time: s, ``(n,)``, increasing.
@@ -127,7 +127,7 @@ def check_speed(
 
 
 def check_velocity(what: str, time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray) -> None:
-    """Check velocities against the differences of exact positions.
+    """Raise ValueError if velocities disagree with the differences of exact positions.
 
     Args:
         what: names of the velocities, for the error message.
@@ -161,7 +161,7 @@ def check_degrees(name: str, values: numpy.ndarray, most: float) -> None:
 
 
 def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma: float) -> list[str]:
-    """Check that bearings are degrees, and return notes on them.
+    """Return notes on bearings; raise ValueError if they cannot be degrees.
 
     Args:
         name: name of the column.
@@ -239,7 +239,7 @@ def find_outliers(
 
 
 def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
-    """Return the deviation of values ``(n, k)`` from the line through their neighbours, ``(n - 2, k)``.
+    """Return the deviations of values ``(n, k)`` from the line through their neighbours, ``(n - 2, k)``.
 
     The deviations are scaled to the variance of the noise of the values.
     """
@@ -306,7 +306,7 @@ def _is_noise(name: str) -> bool:
 
 
 def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, float]) -> list[str]:
-    """Check every episode of a recording.
+    """Return notes on every episode of a recording; raise ValueError for impossible values.
 
     Args:
         recording: the recording.
@@ -365,7 +365,7 @@ def limit_notes(notes: list[str]) -> list[str]:
 
 
 def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) -> None:
-    """Check true velocities against the differences of true positions."""
+    """Raise ValueError if true velocities disagree with the differences of true positions."""
     pairs = [
         (i, names.index(rate))
         for i, name in enumerate(names)
@@ -381,7 +381,7 @@ def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) ->
 
 
 def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.ndarray) -> None:
-    """Raise ValueError if the truth is far from the measurements."""
+    """Raise ValueError if the truth is much farther from the measurements than their deviations."""
     known = numpy.isfinite(truth).all(axis=1)
     if not known.any():
         return
@@ -390,7 +390,7 @@ def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.nda
     if apart > 100.0 * float(numpy.median(sigma)):
         ratio = float(numpy.median(_length(truth)) / numpy.median(_length(position)))
         cause = "kilometres" if 0.5 < 1e3 * ratio < 2.0 else "metres, of the same origin and the same clock"
-        raise ValueError(f"truth lies {apart:,.0f} m from what was measured: is it {cause}?")
+        raise ValueError(f"truth lies {apart:,.0f} m from the measured positions: is it {cause}?")
 
 
 def _check_scale(
@@ -401,7 +401,7 @@ def _check_scale(
     moving: bool,
     known_unit: bool,
 ) -> None:
-    """Check that measured positions are metres, by their speed and by their noise."""
+    """Raise ValueError if measured positions cannot be metres, by their speed and their noise."""
     check_speed(time, position, speeds, float(numpy.median(sigma)), moving)
     if len(time) < FEWEST or known_unit:
         return

@@ -1,4 +1,4 @@
-"""Readers of files of flights or measurements that a user gives in place of a scenario."""
+"""Reader of files of measurements that a user gives in place of a scenario."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ def read_recording(
     sort: bool = False,
     **keywords: Any,
 ) -> Recording:
-    """Read recorded measurements, and check their plausibility (:mod:`.plausibility`).
+    """Return recorded measurements read from files, after a check of their plausibility (:mod:`.plausibility`).
 
     Args:
         path: a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; a table (CSV,

@@ -54,7 +54,7 @@ def count_of(count: int, what: str, plural: str = "") -> str:
 
 
 def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
-    """Return the note on lines that were left out.
+    """Return a note on the number of skipped lines; raise ValueError if most are broken.
 
     Raises:
         ValueError: if most lines are broken.
@@ -77,7 +77,7 @@ QUALITY = ("none", "fixed", "float", "SBAS", "DGPS", "single", "PPP")
 
 
 def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
-    """Read a solution of RTKLIB, as its manual 2.4.2, B.1, describes it.
+    """Return the columns of an RTKLIB solution file (manual 2.4.2, B.1).
 
     Args:
         file: path of the log.
@@ -131,14 +131,14 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _rtklib_time(cells: Sequence[str]) -> tuple[str, float]:
-    """Return date and time as written; or, for a GPS week and its seconds, no date and the seconds since 1980."""
+    """Return date and time as written; for a GPS week and seconds, no date and the seconds since 1980."""
     if "/" in cells[0]:
         return f"{cells[0]} {cells[1]}", 0.0
     return "", WEEK * int(cells[0]) + float(cells[1])
 
 
 def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return positions and standard deviations, and notes on them."""
+    """Return the columns of positions and standard deviations, and notes on them."""
     if {"latitude", "longitude"} <= {*found}:
         columns = {"latitude": found["latitude"], "longitude": found["longitude"]}
         if "height" in found:
@@ -171,7 +171,7 @@ def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any
 
 
 def _rotate_sigmas(sigmas: numpy.ndarray, latitude: float, longitude: float) -> dict[str, numpy.ndarray]:
-    """Return the standard deviations east and north from Earth-fixed ones.
+    """Return the standard deviations east and north from Earth-fixed ones, m, by name.
 
     Args:
         sigmas: standard deviations of x, y, z, and signed roots of the covariances xy, yz, zx, m, ``(6, n)``.
@@ -193,7 +193,7 @@ SENTENCE = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GST),[^\r\n$]*")
 
 
 class _Epoch:
-    """Contents of the sentences of one time."""
+    """Contents of the NMEA sentences of one time."""
 
     def __init__(self, time: float) -> None:
         self.time = time
@@ -206,7 +206,7 @@ class _Epoch:
 
 
 def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
-    """Read GGA, RMC and GST of NMEA 0183, and skip other sentences.
+    """Return the columns of a file of NMEA 0183 sentences GGA, RMC and GST; skip other sentences.
 
     Args:
         file: path of the log; lines may begin with other text, such as a time of the logger.
@@ -252,7 +252,7 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
-    """Add the contents of a sentence to the epoch of its time.
+    """Add the contents of an NMEA sentence to the epoch of its time.
 
     Raises:
         ValueError: if a field is no number, or there is no position.
@@ -318,7 +318,7 @@ def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, nump
 
 
 def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
-    """Read positions of the receiver from a log of PX4.
+    """Return the columns of the receiver's positions in a log of PX4.
 
     Reading: ``eph`` is the standard deviation of the distance in the plane, so that of each axis is ``eph / sqrt(2)``.
 
@@ -372,7 +372,7 @@ DATAFLASH_SUFFIXES = (".bin", ".BIN")
 
 
 def read_dataflash(file: Path, most_rows: int) -> ReceiverLog:
-    """Read positions of the first receiver from a log of ArduPilot.
+    """Return the columns of the first receiver's positions in a log of ArduPilot.
 
     Reading: ``HAcc`` of ``GPA`` is the standard deviation of the distance in the plane. Altitudes are above the sea:
     some tens of metres move a position in the plane by 1e-5 of its distance.
@@ -403,7 +403,7 @@ UNKNOWN_COVARIANCE, NO_FIX = 0, -1
 
 
 def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
-    """Read positions from a bag of ROS 1 or a storage file of ROS 2, of the topic with the most messages.
+    """Return the columns of positions in a bag of ROS 1 or a storage file of ROS 2, of the largest topic.
 
     The positions are ``NavSatFix``, with displacements of ``Odometry`` for a second sensor; without them, positions of
     ``Odometry`` or of poses, metres in their own frame.
@@ -450,7 +450,7 @@ def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _add_odometry(log: ReceiverLog, values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Add displacements since the previous row from poses ``(5, n)`` of :func:`.parse_bag`."""
+    """Return the log with displacements since the previous row added, from poses ``(5, n)`` of :func:`.parse_bag`."""
     order = numpy.argsort(values[0], kind="stable")
     time, x, y, *_ = values[:, order]
     now = log.columns["time"]

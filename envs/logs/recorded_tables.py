@@ -64,12 +64,12 @@ class Columns:
         self,
         name: str,
         table: "pandas.DataFrame",
-        given: Mapping[str, Any],
+        user_parameters: Mapping[str, Any],
         log_time: numpy.ndarray | None = None,
     ) -> None:
         self.name = name
         self.table = table
-        self.given = given
+        self.user_parameters = user_parameters
         self.log_time: numpy.ndarray = self.time if log_time is None else log_time
         self.notes: list[str] = []
         """Changes that were made to the table, one line each."""
@@ -77,21 +77,21 @@ class Columns:
         """Origin of x (east) and y (north); None where the table has x and y itself."""
 
     def has(self, *names: str) -> bool:
-        """Return whether the table has all of these columns."""
+        """Return whether the table has a column under each of these names."""
         return {*names} <= {*self.table}
 
     @property
     def time(self) -> numpy.ndarray:
-        """Return the times, s, ``(rows,)``."""
+        """Times of the rows, s, ``(rows,)``."""
         return self["time"]
 
     @property
     def true(self) -> list[str]:
-        """Return the names of the columns with true values."""
+        """Names of the columns with true values."""
         return [name for name in self.table if name.startswith(TRUTH)]
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the column, NaN where a cell is empty."""
+        """Return the numbers of a column, ``(rows,)``; NaN where a cell is empty."""
         return self.table[name].to_numpy()
 
     def place(self, number: int) -> str:
@@ -99,11 +99,11 @@ class Columns:
         return f"row {self.table.index[number]}"
 
     def only(self, rows: numpy.ndarray) -> "Columns":
-        """Return the columns with some of the rows only."""
-        return Columns(self.name, self.table[rows], self.given, self.log_time[rows])
+        """Return a copy of the columns with only some of the rows."""
+        return Columns(self.name, self.table[rows], self.user_parameters, self.log_time[rows])
 
     def drop_duplicates(self) -> None:
-        """Merge rows of one time that fill each other's empty cells, as rows of several sensors do.
+        """Merge rows of one time that fill each other's empty cells, and drop other rows of the same time.
 
         The method drops all other rows with the time of the previous row, and notes how many.
 
@@ -199,7 +199,7 @@ class Columns:
             self.table = self.table.assign(**dict(zip(names, found, strict=True)))
 
     def note_turns(self, angles: Collection[str]) -> None:
-        """Note true values that jump by a whole turn although their component is not a declared angle.
+        """Add a note if true values jump by a whole turn although their component is no declared angle.
 
         Args:
             angles: columns of the declared angles.
@@ -215,7 +215,7 @@ class Columns:
                     )
 
     def _drop_null_positions(self, latitude: str, longitude: str) -> None:
-        """Clear the positions at latitude 0 and longitude 0, which many receivers write without a fix."""
+        """Replace positions at latitude 0 and longitude 0, which receivers write without a fix, with NaN."""
         null = ((self.table[latitude] == 0.0) & (self.table[longitude] == 0.0)).to_numpy()
         if not null.any():
             return
@@ -229,7 +229,7 @@ class Columns:
         )
 
     def note_offset(self, plane: tuple[str, ...]) -> None:
-        """Note the clock offset of the truth that would reduce its distance to the measurements, if there is one.
+        """Add a note if a clock offset of the truth would reduce its distance to the measurements.
 
         Args:
             plane: names of the columns, see :attr:`.LogFormat.plane`.
@@ -245,7 +245,7 @@ class Columns:
         return float(numpy.median(height[there])) if there.any() else 0.0
 
     def whole(self, *names: str) -> numpy.ndarray:
-        """Return the columns without an empty cell, ``(rows, columns)``.
+        """Return columns that have no empty cell, ``(rows, columns)``.
 
         Raises:
             ValueError: if there is one.
@@ -259,7 +259,7 @@ class Columns:
         return numpy.ascontiguousarray(self.table[[*names]].to_numpy())
 
     def sigmas(self, *names: str) -> numpy.ndarray:
-        """Return the standard deviations without an empty cell, ``(rows, columns)``.
+        """Return columns of standard deviations, all above zero and without an empty cell, ``(rows, columns)``.
 
         Raises:
             ValueError: if one is not above zero.
@@ -270,14 +270,14 @@ class Columns:
         return found
 
     def interval(self) -> float:
-        """Return the sampling interval, s: the one that the user has set, or the median of the table."""
-        if "sampling_interval" in self.given:
-            return float(self.given["sampling_interval"])
+        """Return the sampling interval, s: the user's parameter, or the median of the table."""
+        if "sampling_interval" in self.user_parameters:
+            return float(self.user_parameters["sampling_interval"])
         # Rounded as times are, so that files of one sensor have the same interval.
         return float(f"{numpy.median(numpy.diff(self.time)):.6g}")
 
     def regular(self, why: str) -> float:
-        """Return the sampling interval, s, of measurements that must be regular.
+        """Return the sampling interval, s, after a check that the times are regular.
 
         Args:
             why: reason, for the error message.
@@ -315,7 +315,7 @@ def read_columns(
     rename: Mapping[str, str | Sequence[str]] | None = None,
     sort: bool = False,
 ) -> Recording:
-    """Read a table of measurements.
+    """Return the :class:`.Recording` made of a table of measurements.
 
     Args:
         path: path of a file.
@@ -413,7 +413,7 @@ def _add_truth(
     components: Sequence[Component],
     truth: TruthFile,
 ) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Add the truth of a separate file to the rows of a log, and return it with notes.
+    """Return a log's table with the truth of a separate file added, and notes.
 
     Raises:
         ValueError: if it cannot be read or matched, or the log has a truth already.
@@ -433,7 +433,7 @@ def _add_truth(
 def _rename(
     read: "pandas.DataFrame", names: list[str], renamed: Sequence[tuple[str, str]], known: ColumnNames
 ) -> tuple["pandas.DataFrame", list[tuple[str, str]]]:
-    """Return the renamed columns, and the old and new name of all columns of the file.
+    """Return the table with renamed columns, and the old and new names of all columns of the file.
 
     Args:
         read: the columns.
@@ -481,7 +481,7 @@ def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str])
 
 
 def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:
-    """Rename aliases to latitude, longitude and altitude, and drop further aliases.
+    """Return the table with aliases of latitude, longitude and altitude renamed, and the names of all columns.
 
     Args:
         read: the columns.
@@ -532,7 +532,7 @@ def _side_by_side(
     reading_notes: Iterable[str],
     original: Mapping[str, str],
 ) -> Recording:
-    """Put the recordings of a file side by side; ``original`` gives the names of renamed columns in the file."""
+    """Return one recording that contains all recordings of a file."""
     first, known = parts[0][0], parts[0][1].parameters
     task = cls(cls.Parameters(**{**known, **keywords}))
     true = _true_columns(task, first)

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     import xarray
 
 OWN = ("seconds", "length", "truth", "started")
-"""Variables other than measurements."""
+"""Names of the variables that are not measurements."""
 
 
 def is_recording(path: Any) -> bool:
-    """Return whether this is the path of a NetCDF file that names the environment of its measurements."""
+    """Return whether a path is a NetCDF file of a recording: it names the environment of its measurements."""
     try:
         return names_environment(Path(path))
     except Exception:  # the reader of this kind of file reports the error
@@ -109,7 +109,7 @@ def _whole(name: str, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapping[str, Any]) -> Recording:
-    """Read a recording from a NetCDF file.
+    """Return the recording in a NetCDF file, after checks of environment and parameters.
 
     Args:
         path: path of the file.
@@ -145,7 +145,7 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
 
 
 def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any]) -> None:
-    """Start the tracks from their first measurements."""
+    """Set the initial estimate in ``fields``, computed from the first measurements of the tracks."""
     log_format = find_companion(cls, LogFormat)
     if log_format is None:
         raise ValueError(

@@ -98,7 +98,7 @@ def check_pyins() -> None:
 
 
 def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0) -> Alignment:
-    """Align the INS at the standstill at the beginning.
+    """Return the INS aligned at the standstill at the beginning of a log.
 
     Args:
         inertial: measurements of the IMU.
@@ -237,7 +237,7 @@ def aid(
     lever: Sequence[float] = (0.0, 0.0, 0.0),
     errors: InertialErrors | None = None,
 ) -> AidedInertial:
-    """Aid the INS by fixes from the end of the standstill on.
+    """Return the INS aided by position and velocity fixes from the end of the standstill on.
 
     Args:
         alignment: result of :func:`align`.
@@ -284,7 +284,7 @@ def aid(
 
 @contextmanager
 def _no_deprecations() -> Iterator[None]:
-    """Suppress the warning about a keyword that pyins 1.0.1 uses and pandas 4 will not have."""
+    """Context manager: suppress the warning about a keyword that pyins 1.0.1 uses and pandas 4 will not have."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The copy keyword is deprecated")
         yield

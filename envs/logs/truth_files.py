@@ -59,7 +59,7 @@ def read_truth(
     times: Sequence[str],
     sort: bool = False,
 ) -> TruthTable:
-    """Read a file of true positions: a table, or a log of a receiver.
+    """Return the true positions in a file, a table or a receiver log, by time.
 
     Args:
         path: path of the file, with a time and x and y (m), latitude and longitude (degrees), or components.
@@ -122,7 +122,7 @@ def match_truth(
     clock, now = clock_seconds(times)
     if clock != truth.clock:
         raise ValueError(
-            f"the times of the log are {clock} and those of the truth {truth.clock}: write both alike"
+            f"the times of the log are {clock} and those of the truth {truth.clock}: use the same form in both"
         )
     then = truth.time + offset
     after = numpy.clip(numpy.searchsorted(then, now), 1, max(len(then) - 1, 1))

@@ -1,4 +1,4 @@
-"""LooselyCoupledNavigation: everything of one environment; ``task.py`` names it all."""
+"""The environment LooselyCoupledNavigation; ``task.py`` declares its parts."""
 
 ID = "filtergym/LooselyCoupledNavigation-v0"
-"""Known before anything else is imported."""
+"""Gymnasium id, readable without importing the task."""

@@ -1,7 +1,6 @@
-"""The Kalman-Bucy schemes of LooselyCoupledNavigation that are steered: one by its noises or its gain, or three by
-weights.
+"""Kalman-Bucy filters of LooselyCoupledNavigation that an action steers: by noises, by the gain, or by weights.
 
-Equations stand in ``filters/loosely_coupled.py``; (3) is ``Xh' = Xh + dX, nu = Z - Xh', Xh = Xh' + gain nu``.
+The equations are in ``filters/loosely_coupled.py``; (3) is ``Xh' = Xh + dX, nu = Z - Xh', Xh = Xh' + gain nu``.
 """
 
 import math
@@ -17,9 +16,9 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
-    KEPT_AS_LOG,
-    KEPT_AS_LOG1P,
     SHARE,
+    STORED_AS_LOG,
+    STORED_AS_LOG1P,
     Array,
     Block,
     Compression,
@@ -35,87 +34,89 @@ from .parameters import AXES, LooselyCoupledNavigationParameters
 from .world import Measurement
 
 SCHEMES = ("plain-white", "plain-reduced", "augmented")
-"""The bank under ``mode`` and ``weights``."""
-KEPT_AS_DEVIATION_LOG = Compression(
-    "half the log of ", None, lambda shown: numpy.exp(2.0 * shown), KEPT_AS_LOG.limits
+"""Names of the three filters of the bank under ``mode`` and ``weights``."""
+STORED_AS_DEVIATION_LOG = Compression(
+    "half the log of ", None, lambda shown: numpy.exp(2.0 * shown), STORED_AS_LOG.limits
 )
-"""The block's function returns the logarithm of a standard deviation; reading gives the variance."""
+"""Compression of a block whose function returns the log standard deviation; reading gives the variance."""
 
 
 class Innovations(NamedTuple):
     """Innovations and their averages, of one filter ``(A, N)`` or of three ``(3, A, N)``."""
 
     innovation: Array
-    """nu, zero where there is no measurement, m."""
+    """Innovation nu, m, zero where there is no measurement."""
     normalised: Array
-    """The last one that there was, over its standard deviation."""
+    """Last innovation of a measurement over its standard deviation."""
     average: Array
     """Exponential average of the normalised innovation."""
     average_square: Array
-    """Of its square."""
+    """Exponential average of its square."""
     average_product: Array
-    """Of its product with the one before."""
+    """Exponential average of the product of successive normalised innovations."""
     deviation: Array
-    """Standard deviation that is predicted for the innovation at hand, m."""
+    """Predicted standard deviation of the innovation, m."""
 
 
 class GainState(NamedTuple):
-    """The plain scheme with the gain of the action."""
+    """State of the plain scheme, whose gain is the action."""
 
     position: Array
-    """Xh, predicted to the measurement or updated by it, m, ``(A, N)``."""
+    """Position estimate Xh, m, ``(A, N)``: predicted to the measurement, or updated by it."""
     variance: ins_gnss.PlainVariance
-    """Of its error with the gains used, m^2, ``(A, N)`` each. ``assumed``, with the coloured noise reduced to white
-    and no drift, is the scale of the innovations that are shown; ``modelled`` is reported."""
-    seen: Innovations
+    """Variances of the position error under the gains used, m^2, ``(A, N)`` each.
+
+    ``assumed``, with the coloured noise reduced to white and no drift, scales the observed innovations; ``modelled`` is
+    reported."""
+    innovations: Innovations
     action: Array
     """Last action, ``(A, N)``."""
     gain: Array
-    """Gain in force, zero without a measurement, ``(A, N)``."""
+    """Gain of the last update, zero without a measurement, ``(A, N)``."""
 
 
 class Augmented(NamedTuple):
-    """The augmented filter with the noises of the action."""
+    """State of the augmented filter, whose noises the action scales."""
 
     position: Array
-    """Xh, predicted to the measurement or updated by it, m, ``(A, N)``."""
+    """Position estimate Xh, m, ``(A, N)``: predicted to the measurement, or updated by it."""
     drift: Array
-    """Estimate of beta, ``(A, N)``, m/s."""
+    """Estimate of the constant rate error beta, m/s, ``(A, N)``."""
     coloured: Array
-    """Estimate of eta, ``(A, N)``, m/s."""
+    """Estimate of the coloured rate error eta, m/s, ``(A, N)``."""
     covariance: ins_gnss.AugmentedCovariance
-    """After the last measurement that was acted on, the same for all axes, ``(N,)`` each."""
+    """Covariance after the last update, the same for all axes, ``(N,)`` each."""
     deviation: Array
-    """Standard deviation of the position predicted with the noises of the last action, m, ``(N,)``."""
-    seen: Innovations
+    """Standard deviation of the position, m, predicted with the noises of the last action, ``(N,)``."""
+    innovations: Innovations
     action: Array
     """Last action, ``(3, N)``."""
 
 
 class Schemes(NamedTuple):
-    """Three filters side by side, each with its own Kalman gain, and the weights of their estimates."""
+    """State of three parallel filters, each with its own Kalman gain, and the weights of their estimates."""
 
     position: Array
-    """Xh of each filter, ``(3, A, N)``, m."""
+    """Position estimate Xh of each filter, m, ``(3, A, N)``."""
     plain_variance: Array
-    """Of the two plain schemes, the same for all axes, ``(2, 1, N)``, m^2."""
+    """Variances of the two plain schemes, the same for all axes, m^2, ``(2, 1, N)``."""
     drift: Array
-    """Estimate of beta by the augmented filter, ``(A, N)``, m/s."""
+    """Estimate of the constant rate error beta by the augmented filter, m/s, ``(A, N)``."""
     coloured: Array
-    """Estimate of eta, ``(A, N)``, m/s."""
+    """Estimate of the coloured rate error eta by the augmented filter, m/s, ``(A, N)``."""
     covariance: ins_gnss.AugmentedCovariance
-    """Of the augmented filter, the same for all axes, ``(N,)`` each."""
-    seen: Innovations
+    """Covariance of the augmented filter, the same for all axes, ``(N,)`` each."""
+    innovations: Innovations
     weights: Array
-    """In force, ``(3, N)``."""
+    """Weights of the filters in the estimate, ``(3, N)``."""
 
 
 class KalmanBucyBank(Bank[Task, Measurement, Any]):
-    """Common base of the banks: the innovations in the observation, and its end."""
+    """Base class of the banks: innovation statistics, and the observation blocks that all banks share."""
 
     parameters: LooselyCoupledNavigationParameters
     filters: tuple[str, ...] = ()
-    """Names of the filters, where there are several."""
+    """Names of the filters, if there are several."""
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
@@ -126,7 +127,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Innovations, their averages, the receiver's report, the last action, and the clock."""
+        """Observation blocks: innovations, their averages, the receiver's report, the last action, and the time."""
         xp, p = self.xp, self.parameters
         nominal = math.sqrt(p.receiver_variance)
         names = [name.replace("-", "_") for name in self.filters]
@@ -139,34 +140,34 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
         return (
             innovation_block(
                 each,
-                value=lambda f, measurement: measurement.available * f.seen.normalised,
+                value=lambda f, measurement: measurement.available * f.innovations.normalised,
                 text="innovation over its predicted standard deviation",
                 name="innovation_over_sigma",
                 over_interval="mean",
             ),
             innovation_block(
                 each,
-                value=lambda f, measurement: f.seen.innovation / measurement.reported_deviation,
+                value=lambda f, measurement: f.innovations.innovation / measurement.reported_deviation,
                 text="the innovation over the reported noise",
                 name="innovation_over_reported",
                 over_interval="mean",
             ),
             average_block(
                 "average_innovation",
-                lambda f, _: f.seen.average,
+                lambda f, _: f.innovations.average,
                 "short average of the innovation over its predicted standard deviation",
                 each,
             ),
             Block(
                 "average_square",
-                lambda f, _: xp.log(1.0 + f.seen.average_square),
+                lambda f, _: xp.log(1.0 + f.innovations.average_square),
                 "the short average of its square",
                 each,
-                KEPT_AS_LOG1P,
+                STORED_AS_LOG1P,
             ),
             average_block(
                 "average_product",
-                lambda f, _: f.seen.average_product,
+                lambda f, _: f.innovations.average_product,
                 "short average of its product with the one before",
                 each,
             ),
@@ -174,7 +175,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
                 "reported_noise",
                 lambda _, measurement: xp.log(measurement.reported_deviation / nominal),
                 "the reported over the nominal variance of a measurement",
-                compression=KEPT_AS_DEVIATION_LOG,
+                compression=STORED_AS_DEVIATION_LOG,
             ),
             availability_block("1 with a measurement, 0 without", over_interval="mean"),
             self.last_action(),
@@ -185,7 +186,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Reported deviation and innovations, without compression."""
+        """Reported deviation and innovations in m, computed from the observation."""
         nominal = self.parameters.receiver_variance
         return (
             Quantity(
@@ -203,33 +204,33 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
         )
 
     def last_action(self) -> Block:
-        """Block of what was done before."""
+        """Return the observation block of the previous action."""
         raise NotImplementedError
 
     def no_innovations(self, zero: Array) -> Innovations:
-        """Return the innovations at the start of the track, of the shape of ``zero``."""
+        """Return the innovation statistics at the start of the track: zeros, in the shape of ``zero``."""
         return Innovations(zero, zero, zero, zero + 1.0, zero, zero + 1.0)
 
-    def log_density(self, seen: Innovations) -> Array:
-        """Return the log-density of the innovations of each axis."""
-        return -0.5 * seen.normalised * seen.normalised - self.xp.log(
-            math.sqrt(2.0 * math.pi) * seen.deviation
+    def log_density(self, innovations: Innovations) -> Array:
+        """Return the Gaussian log-density of the last innovations, for each axis."""
+        return -0.5 * innovations.normalised * innovations.normalised - self.xp.log(
+            math.sqrt(2.0 * math.pi) * innovations.deviation
         )
 
     def consistency(self, state: Any, measurement: Measurement) -> dict[str, Array]:
-        """Return the NIS and log-density of one filter, NaN without a measurement."""
+        """Return the records NIS, degrees of freedom and log-likelihood of one filter; NaN without a measurement."""
         xp, there = self.xp, measurement.available > 0.0
-        nis = ordered_sum(state.seen.normalised * state.seen.normalised)
+        nis = ordered_sum(state.innovations.normalised * state.innovations.normalised)
         return {
             "nis": xp.where(there, nis, math.nan),
             "nis_degrees": self.parameters.axes * measurement.available,
-            "log_likelihood": xp.where(there, ordered_sum(self.log_density(state.seen)), math.nan),
+            "log_likelihood": xp.where(there, ordered_sum(self.log_density(state.innovations)), math.nan),
         }
 
     def update_innovations(
         self, before: Innovations, measurement: Measurement, position: Array, variance: Array
     ) -> Innovations:
-        """Return the innovations of predicted positions, and their averages; without a measurement these stand still.
+        """Return the innovation statistics of predicted positions; without a measurement the averages do not change.
 
         Args:
             before: at the measurement before.
@@ -254,22 +255,22 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
 
 
 NOISES = ("receiver", "coloured", "white")
-"""What the action scales under ``noise``."""
+"""Names of the noises that the action scales under ``noise``."""
 
 
 class NoiseBank(KalmanBucyBank):
-    """Control ``noise``: the augmented filter, with the noises scaled by the action."""
+    """Bank of the control ``noise``: the augmented filter, whose noises the action scales."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
 
     @property
     def reach(self) -> float:
-        """Share of the logarithms of the largest factors that an action of one has."""
+        """Share of the logarithm of the largest factor that an action of one applies."""
         return self.parameters.noise_reach
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation of every filter, and the deviation that this one predicts."""
+        """Observation blocks of every filter, and the predicted standard deviation of the position."""
         nominal = math.sqrt(self.parameters.receiver_variance)
         return (
             *super().blocks,
@@ -277,16 +278,16 @@ class NoiseBank(KalmanBucyBank):
                 "predicted_deviation",
                 lambda f, _: self.xp.log(f.deviation / nominal),
                 "the predicted standard deviation of the position over the nominal one of a measurement",
-                compression=KEPT_AS_LOG,
+                compression=STORED_AS_LOG,
             ),
         )
 
     def last_action(self) -> Block:
-        """Block of the action applied before."""
+        """Return the observation block of the previous action."""
         return last_action_block(NOISES)
 
     def start(self, initial: Initial) -> Augmented:
-        """Start where INS and reference agree, with the modelled prior of the rate errors."""
+        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
         zero = 0.0 * initial.mean
         covariance = self.parameters.prior_covariance(zero[0])
         return Augmented(
@@ -295,12 +296,12 @@ class NoiseBank(KalmanBucyBank):
             coloured=zero,
             covariance=covariance,
             deviation=zero[0],
-            seen=self.no_innovations(zero),
+            innovations=self.no_innovations(zero),
             action=self.xp.stack([zero[0]] * len(NOISES)),
         )
 
     def predict_covariance(self, state: Augmented, action: Array) -> ins_gnss.AugmentedCovariance:
-        """Return the covariance predicted to the measurement with the noises of an action."""
+        """Return the covariance predicted to the measurement with the noises that an action scales."""
         p, xp = self.parameters, self.xp
         coloured, white = xp.exp(self.reach * math.log(p.process_scale) * action[1:])
         growth, displacement = p.variance_growth
@@ -309,14 +310,14 @@ class NoiseBank(KalmanBucyBank):
         return ins_gnss.predict_augmented(state.covariance, p.sampling, coloured * growth, white_growth)
 
     def receiver_variance(self, measurement: Measurement, action: Array) -> Array:
-        """Return the variance of a measurement by an action, ``(N,)``, m^2."""
+        """Return the variance of the receiver's noise scaled by an action, m^2, ``(N,)``."""
         p = self.parameters
         up, down = (self.reach * math.log(most) for most in (p.receiver_scale, p.receiver_reduction))
         scale = self.xp.exp(self.xp.where(action[0] > 0.0, up * action[0], down * action[0]))
         return scale * measurement.reported_deviation * measurement.reported_deviation
 
     def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
-        """Predict by the increment of the INS less the estimated rate errors; show it with the last action's noises."""
+        """Return the state predicted by the INS increment less rate errors, with innovation statistics."""
         s = self.parameters.sampling
         position = state.position + measurement.increment - (s.step * state.drift + s.drive * state.coloured)
         variance = self.predict_covariance(state, state.action).position
@@ -324,12 +325,12 @@ class NoiseBank(KalmanBucyBank):
             position=position,
             coloured=s.decay * state.coloured,
             deviation=self.xp.sqrt(variance),
-            seen=self.update_innovations(state.seen, measurement, position, variance),
+            innovations=self.update_innovations(state.innovations, measurement, position, variance),
         )
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
-        """Update by the Kalman gain that follows from the noises of the action."""
-        innovation = state.seen.innovation
+        """Return the state updated with the Kalman gain that follows from the noises of the action."""
+        innovation = state.innovations.innovation
         action = self.xp.clip(action, -1.0, 1.0)
         R = self.receiver_variance(measurement, action)
         predicted = self.predict_covariance(state, action)
@@ -344,20 +345,20 @@ class NoiseBank(KalmanBucyBank):
         )
 
     def mean(self, state: Augmented) -> Array:
-        """Return the position, ``(A, N)``, m."""
+        """Return the position estimate, m, ``(A, N)``."""
         return state.position
 
     def covariance(self, state: Augmented) -> Array:
-        """Return the covariance of the filter, ``(A, A, N)``, m^2."""
+        """Return the covariance of the position estimate, m^2, ``(A, A, N)``."""
         return self.eye * state.covariance.position
 
     def records(self, state: Augmented, measurement: Measurement) -> dict[str, Array]:
-        """Return the NIS and log-density (NaN without a measurement)."""
+        """Return the values to record at a measurement, by name: NIS and log-likelihood, NaN without a fix."""
         return self.consistency(state, measurement)
 
 
 class GainBank(KalmanBucyBank):
-    """Control ``gain``: the plain scheme, whose gain on every axis the action sets."""
+    """Bank of the control ``gain``: the plain scheme with one gain for each axis, which the action sets."""
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
@@ -365,33 +366,34 @@ class GainBank(KalmanBucyBank):
         self.error_model = p.sampling, p.plain_growth[1], p.drift, p.coloured, p.white_intensity
         smallest = math.log(p.smallest_gain)
         self.middle: float = min(max(math.log(p.steady_state_gains[1]), 0.9 * smallest), 0.1 * smallest)
-        """Logarithm of the gain at action 0: of the paper's, where that leaves room on both sides."""
+        """Logarithm of the gain at action 0: that of the paper, if it leaves room on both sides."""
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """A number for each axis."""
+        """Gymnasium box [-1, 1] with one number for each axis."""
         return gymnasium.spaces.Box(-1.0, 1.0, (self.parameters.axes,), numpy.float32)
 
     def last_action(self) -> Block:
-        """Block of the action applied before."""
+        """Return the observation block of the previous action."""
         return last_action_block(self.axes)
 
     def start(self, initial: Initial) -> GainState:
-        """Start where INS and reference agree."""
+        """Return the bank's state at the start of the track, where INS and reference agree."""
         zero = 0.0 * initial.mean
         variance = ins_gnss.PlainVariance(zero, zero, zero, zero)
         return GainState(initial.mean, variance, self.no_innovations(zero), zero, zero)
 
     def predict(self, state: GainState, measurement: Measurement) -> GainState:
-        """Predict by the increment of the INS."""
+        """Return the state predicted by the INS increment, with innovation statistics."""
         position = state.position + measurement.increment
         variance = ins_gnss.predict_plain(state.variance, *self.error_model)
-        seen = self.update_innovations(state.seen, measurement, position, variance.assumed)
-        return state._replace(position=position, variance=variance, seen=seen)
+        innovations = self.update_innovations(state.innovations, measurement, position, variance.assumed)
+        return state._replace(position=position, variance=variance, innovations=innovations)
 
     def gain(self, action: Array) -> Array:
-        """Return the gain that an action sets, logarithmic from the paper's at 0 to 1 at 1 and to the smallest;
-        zero at -1.
+        """Return the gain that an action in [-1, 1] sets: 0 at -1, the paper's at 0, and 1 at +1.
+
+        Its logarithm is linear in the action on either side of 0, from ``smallest_gain`` just above -1.
         """
         middle, smallest = self.middle, math.log(self.parameters.smallest_gain)
         # Torch would choose between two numbers in float32.
@@ -399,8 +401,9 @@ class GainBank(KalmanBucyBank):
         return self.xp.where(action <= -1.0, 0.0, self.xp.exp(middle + beyond))
 
     def action_for_gain(self, gain: Any) -> Any:
-        """Return the action that sets gains from 0 to 1, NumPy: the inverse of :meth:`gain`; the smallest one and
-        less count as zero.
+        """Return the action, as a NumPy array, for which :meth:`gain` returns gains in [0, 1].
+
+        Gains up to ``smallest_gain`` give -1, the action of gain zero.
         """
         smallest, middle = self.parameters.smallest_gain, self.middle
         beyond = numpy.log(numpy.maximum(gain, smallest)) - middle
@@ -408,30 +411,32 @@ class GainBank(KalmanBucyBank):
         return numpy.where(gain <= smallest, -1.0, action)
 
     def act(self, state: GainState, measurement: Measurement, action: Array) -> GainState:
-        """Update by the gain of the action; without a measurement the gain is zero."""
+        """Return the state updated with the gain that the action sets; without a measurement the gain is zero."""
         action = self.xp.clip(action, -1.0, 1.0)
         gain = measurement.available * self.gain(action)
         R = measurement.reported_deviation * measurement.reported_deviation
         return state._replace(
-            position=state.position + gain * state.seen.innovation,
+            position=state.position + gain * state.innovations.innovation,
             variance=ins_gnss.update_plain(state.variance, R, gain),
             action=action,
             gain=gain,
         )
 
     def mean(self, state: GainState) -> Array:
-        """Return the position, ``(A, N)``, m."""
+        """Return the position estimate, m, ``(A, N)``."""
         return state.position
 
     def covariance(self, state: GainState) -> Array:
-        """Return the covariance that belongs to the gains used, ``(A, A, N)``, m^2.
+        """Return the covariance of the position error under the gains used, m^2, ``(A, A, N)``.
 
         It holds for the modelled noises, and for gains that do not depend on the innovations.
         """
         return self.eye * state.variance.modelled
 
     def records(self, state: GainState, measurement: Measurement) -> dict[str, Array]:
-        """Return the NIS and log-density (NaN without a measurement), gain and K."""
+        """Return the values to record at a measurement, by name: NIS, log-likelihood (NaN without a fix), gain and
+        K.
+        """
         found = self.consistency(state, measurement)
         for i, ending in enumerate([f"_{axis}" for axis in self.axes] or [""]):
             found[f"gain{ending}"] = state.gain[i]
@@ -440,12 +445,15 @@ class GainBank(KalmanBucyBank):
 
 
 LEAST_GROWTH = 1e-12
-"""Of a scheme's variance between two measurements, over that of a measurement: with less its variance is lost in
-rounding, and it reports to be certain."""
+"""Smallest growth of a scheme's variance between two measurements, over that of a measurement.
+
+With less its variance is lost in rounding, and the filter reports certainty."""
 
 
 class SchemeBank(KalmanBucyBank):
-    """Controls ``mode`` and ``weights``: three filters run side by side without mixing; the action reports."""
+    """Bank of the controls ``mode`` and ``weights``: three parallel filters without mixing, whose estimates it
+    weights.
+    """
 
     filters: tuple[str, ...] = SCHEMES
 
@@ -457,16 +465,16 @@ class SchemeBank(KalmanBucyBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """One filter, or a weight for each."""
+        """Gymnasium space of the selected filter (``mode``) or of a weight for each filter."""
         return bank_action_space(self.control, len(SCHEMES))
 
     def last_action(self) -> Block:
-        """Block of the weights in force before."""
+        """Return the observation block of the weights before this measurement."""
         names = [name.replace("-", "_") for name in SCHEMES]
-        return last_weight_block(names, value=lambda f: f.weights, text="weight put in force before")
+        return last_weight_block(names, value=lambda f: f.weights, text="weight of the last measurement")
 
     def start(self, initial: Initial) -> Schemes:
-        """Start all filters where INS and reference agree, with the modelled prior of the rate errors."""
+        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
         xp, p = self.xp, self.parameters
         zero = 0.0 * initial.mean
         each = xp.stack([zero] * 3)
@@ -476,12 +484,12 @@ class SchemeBank(KalmanBucyBank):
             drift=zero,
             coloured=zero,
             covariance=p.prior_covariance(zero[0]),
-            seen=self.no_innovations(each),
+            innovations=self.no_innovations(each),
             weights=each[:, 0],
         )
 
     def predict(self, state: Schemes, measurement: Measurement) -> Schemes:
-        """Predict every filter by the increment of the INS, the augmented one less its rate errors."""
+        """Return every filter predicted by the INS increment; the augmented one subtracts its rate errors."""
         xp, s = self.xp, self.parameters.sampling
         position = state.position + measurement.increment
         corrected = position[2] - (s.step * state.drift + s.drive * state.coloured)
@@ -494,12 +502,12 @@ class SchemeBank(KalmanBucyBank):
             plain_variance=plain,
             coloured=s.decay * state.coloured,
             covariance=P,
-            seen=self.update_innovations(state.seen, measurement, position, variance),
+            innovations=self.update_innovations(state.innovations, measurement, position, variance),
         )
 
     def act(self, state: Schemes, measurement: Measurement, action: Array) -> Schemes:
-        """Update each filter by its own Kalman gain, and put the weights of the action in force."""
-        xp, available, innovation = self.xp, measurement.available, state.seen.innovation
+        """Return every filter updated with its own Kalman gain, and the weights of the action."""
+        xp, available, innovation = self.xp, measurement.available, state.innovations.innovation
         R = measurement.reported_deviation * measurement.reported_deviation
         plain = state.plain_variance
         plain_gain = available * plain / (plain + R)
@@ -510,7 +518,7 @@ class SchemeBank(KalmanBucyBank):
                 (state.position[2] + gain.position * innovation[2])[None],
             ]
         )
-        # Neither control asks for likelihoods, only for the shape of the bank.
+        # Neither control uses likelihoods, only the shape of the bank.
         no_evidence = xp.zeros_like(innovation[:, 0])
         return state._replace(
             position=position,
@@ -523,24 +531,26 @@ class SchemeBank(KalmanBucyBank):
         )
 
     def mean(self, state: Schemes) -> Array:
-        """Return the combination of the estimates, ``(A, N)``, m."""
+        """Return the weighted mean of the filters' positions, m, ``(A, N)``."""
         return weighted_sum(state.weights, self.xp.moveaxis(state.position, 0, 1))
 
     def covariance(self, state: Schemes) -> Array:
-        """Return the covariance of the combination, the spread of the estimates included, ``(A, A, N)``, m^2."""
+        """Return the covariance of the weighted mean with the spread of the estimates, m^2, ``(A, A, N)``."""
         xp = self.xp
         variance = xp.concat([state.plain_variance[:, 0], state.covariance.position[None]])
         position = xp.moveaxis(state.position, 0, 1)
         return imm.combine(position, self.eye[..., None] * variance, state.weights)[1]
 
     def records(self, state: Schemes, measurement: Measurement) -> dict[str, Array]:
-        """Return the weights, the mean of the filters' NIS by them, of the filter believed, and the log-density of
-        their mixture (NaN without a measurement).
+        """Return the values to record at a measurement, by name: weights, NIS, and the mixture's log-likelihood.
+
+        They are NaN without a measurement. The NIS is the weighted mean of the filters', or that of the selected
+        filter.
         """
         there = measurement.available > 0.0
-        of_each = ordered_sum(self.xp.moveaxis(self.log_density(state.seen), 1, 0))
+        of_each = ordered_sum(self.xp.moveaxis(self.log_density(state.innovations), 1, 0))
         log_likelihood = imm.log_mixture_density(imm.log_probabilities(state.weights), of_each)
-        squares = self.xp.moveaxis(state.seen.normalised * state.seen.normalised, 1, 0)
+        squares = self.xp.moveaxis(state.innovations.normalised * state.innovations.normalised, 1, 0)
         nis = weighted_sum(state.weights, ordered_sum(squares))
         return {
             "nis": self.xp.where(there, nis, math.nan),

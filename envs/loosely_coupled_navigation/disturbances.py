@@ -1,26 +1,26 @@
-"""Disturbances of the receiver of LooselyCoupledNavigation: a class for each."""
+"""Disturbances of the receiver of LooselyCoupledNavigation: one class each."""
 
 import math
 from typing import Any, ClassVar, NamedTuple
 
 from ...filters.array_namespace import namespace
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment
-from ..contract.draws import Draws, StepSignal, draw_between, within
+from ..contract.draws import Draws, StepSignal, draw_between, is_within
 from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput, Outliers
 from ..contract.observation import Array
 from ..contract.task import Task
 from .parameters import LooselyCoupledNavigationParameters
 
 NEVER = 1e9
-"""Number of the measurement at which happens what does not; finite, so that arithmetic on it stays finite."""
+"""Measurement number of an event that does not occur; finite, so that arithmetic on it stays finite."""
 UNREPORTED = 1.2
-"""Noise of the receiver over what it reports, from which it is not reported."""
+"""Ratio of true to reported receiver noise above which the noise counts as unreported."""
 AFTERMATH = 25.0
-"""Measurements after an outage: a quarter of a second."""
+"""Number of measurements that count as after an outage: a quarter of a second."""
 
 
 def _follows_outage(moment: Moment) -> Array | None:
-    if not moment.knows("outage"):
+    if not moment.has_context("outage"):
         return None
     end = moment.context["outage"][1]
     since = moment.measurement.number - end
@@ -28,16 +28,20 @@ def _follows_outage(moment: Moment) -> Array | None:
 
 
 def _is_unreported(moment: Moment) -> Array | None:
-    if not moment.knows("receiver_deviation"):
+    if not moment.has_context("receiver_deviation"):
         return None
     return moment.context["receiver_deviation"] > UNREPORTED * moment.measurement.reported_deviation
 
 
 def _within(window: str, phrase: str) -> Cause:
-    """Return the cause that holds in a window of the context."""
+    """Return the cause that a measurement lies in a window of the context."""
 
     def holds(moment: Moment) -> Array | None:
-        return within(moment.measurement.number, moment.context[window]) if moment.knows(window) else None
+        return (
+            is_within(moment.measurement.number, moment.context[window])
+            if moment.has_context(window)
+            else None
+        )
 
     return Cause(window, phrase, holds)
 
@@ -53,23 +57,23 @@ class Levels(NamedTuple):
     true: Array
     """Standard deviation of the receiver noise before, between and after its changes, m, ``(3, N)``."""
     reported: Array
-    """What the receiver reports in its place, m, ``(3, N)``."""
+    """Standard deviation that the receiver reports, m, ``(3, N)``."""
     change: Array
     """First measurement after each change, ``(2, N)``."""
     level: Array
-    """True one of this measurement, ``(N,)``."""
+    """True standard deviation at this measurement, m, ``(N,)``."""
     report: Array
-    """Report of it, ``(N,)``."""
+    """Reported standard deviation at this measurement, m, ``(N,)``."""
 
 
 class NoiseChanges(Disturbance):
-    """The noise of the receiver is another one in each episode, and changes in it up to twice, reported or not."""
+    """Receiver noise that differs between episodes and changes up to twice in each, reported or not."""
 
     name = "noise_changes"
     causes = (Cause("unreported noise", "where the receiver is noisier than it reports", _is_unreported),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Levels:
-        """Draw levels, and when they change."""
+        """Return the drawn noise levels of the receiver, the times of their changes, and the reported levels."""
         xp, p = self.xp, self.parameters
         factor = draws.log_uniform("receiver_factor", p.receiver_factor)
         changes = draws.integer("noise_changes", p.noise_changes)
@@ -86,12 +90,12 @@ class NoiseChanges(Disturbance):
         change = xp.stack([earlier, later])
         return Levels(xp.stack(levels), xp.stack(reported), change, levels[0], reported[0])
 
-    def quiet(self, state: Levels, calm: Array) -> Levels:
-        """Return the law of the reports unchanged: the receiver reports its true noise."""
-        return state._replace(true=self.xp.where(calm, state.reported, state.true))
+    def switch_off(self, state: Levels, undisturbed: Array) -> Levels:
+        """Return the state with the true noise equal to the reported one where ``undisturbed``."""
+        return state._replace(true=self.xp.where(undisturbed, state.reported, state.true))
 
     def advance(self, state: Levels, step: DisturbanceInput) -> Levels:
-        """Take the levels of this measurement."""
+        """Return the state with the true and reported levels of this measurement."""
         if not self.parameters.noise_changes[1]:
             return state
         level, report = (
@@ -101,17 +105,17 @@ class NoiseChanges(Disturbance):
         return state._replace(level=level, report=report)
 
     def change_deviations(self, state: Levels, deviations: Array) -> Array:
-        """Bring them to the level, m."""
+        """Return the standard deviations times the receiver's true level at this measurement, m."""
         return state.level * deviations
 
     def change_measurement(
         self, state: Levels, measurement: Any, step: DisturbanceInput
     ) -> tuple[Levels, Any]:
-        """Report it."""
+        """Return the state, and the measurement with the reported standard deviation filled in."""
         return state, measurement._replace(reported_deviation=state.report)
 
     def context(self, state: Levels) -> dict[str, Array]:
-        """All levels, and the numbers of the measurements from which on they hold, -1 where there is none."""
+        """Return the context: noise levels, and the measurements of their changes (-1 where there is none), by name."""
         return {
             "receiver_levels": state.true,
             "reported_levels": state.reported,
@@ -119,7 +123,7 @@ class NoiseChanges(Disturbance):
         }
 
     def records(self, state: Levels) -> dict[str, Array]:
-        """Return the reports."""
+        """Return the values to record at a measurement, by name: the reported standard deviation."""
         return {"reported_deviation": state.report}
 
 
@@ -128,41 +132,41 @@ def _shown(window: Array) -> Array:
 
 
 class ReceiverColour(ColouredErrors):
-    """Errors of the receiver that last, on each axis its own."""
+    """Errors of the receiver that are correlated in time, independent on each axis."""
 
     def __init__(self, task: Task) -> None:
         p = task.parameters
         super().__init__(task, p.sampling_interval, p.axes, p.receiver_coloured[1] > 0.0)
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw deviation, m, and correlation time, s."""
+        """Return the drawn standard deviation, m, and correlation time, s, of the receiver's coloured errors."""
         p = self.parameters
         deviation = draw_between(draws.uniform, "receiver_coloured", p.receiver_coloured)
         lasting = draw_between(draws.log_uniform, "receiver_correlation_time", p.receiver_correlation_time)
         return zero + deviation, zero + lasting
 
     def change_reading(self, state: ColouredErrorsState, reading: Array) -> tuple[ColouredErrorsState, Array]:
-        """Add them."""
+        """Return the state, and the fix with the correlated errors added."""
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return their decay from one measurement to the next, and the standard deviation of their gain, m."""
+        """Return the context: decay of the errors between measurements, and their driving noise, m, by name."""
         return {"receiver_decay": state.process.decay, "receiver_kick": state.process.kick}
 
 
 class Spell(NamedTuple):
-    """State of what befalls the receiver once in an episode."""
+    """State of a receiver disturbance that occurs at most once in an episode."""
 
     window: Array
-    """First measurement of it and first one after it, ``(2, N)``."""
+    """First measurement of the disturbance and the first one after it, ``(2, N)``."""
     strength: Array
-    """Of it, ``(N,)``; zero where it has none."""
+    """Strength of the disturbance, ``(N,)``; zero where it has none."""
     number: Array
-    """Of this measurement, ``(N,)``."""
+    """Number of the current measurement, ``(N,)``."""
 
 
 class _Once(Disturbance):
-    """Disturbance of the receiver once in an episode, with its probability, limits of its start and of its duration."""
+    """Receiver disturbance that occurs at most once in an episode, in a random window of measurements."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
@@ -171,7 +175,9 @@ class _Once(Disturbance):
         )
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Spell:
-        """Draw whether it happens, and when."""
+        """Return the drawn window of the disturbance: its first measurement and the first one after it, if it
+        occurs.
+        """
         xp, p = self.xp, self.parameters
         happens = draws.event(self.name, self.probability)
         first = number_at(draws.uniform(f"{self.name}_start", self.start), p)
@@ -180,16 +186,16 @@ class _Once(Disturbance):
         return Spell(window, zero, zero)
 
     def advance(self, state: Spell, step: DisturbanceInput) -> Spell:
-        """Count."""
+        """Return the disturbance's state with the number of this measurement, for comparison with its window."""
         return state._replace(number=step.number)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the window, -1 where there is none."""
+        """Return the context: the disturbance's window of measurements (-1 where it does not occur), by name."""
         return {self.name: _shown(state.window)}
 
 
 class Outage(_Once):
-    """The receiver has no fix."""
+    """Receiver outage: there is no fix."""
 
     name = "outage"
     causes: ClassVar[tuple[Cause, ...]] = (
@@ -198,83 +204,83 @@ class Outage(_Once):
     )
 
     def change_measurement(self, state: Spell, measurement: Any, step: DisturbanceInput) -> tuple[Spell, Any]:
-        """Take the fix away."""
+        """Return the state, and the measurement without a fix during the outage."""
         if not self.probability:
             return state, measurement
-        out = within(step.number, state.window)
+        out = is_within(step.number, state.window)
         available = self.xp.where(out, 0.0, measurement.available)
         return state, measurement._replace(fix=available * measurement.fix, available=available)
 
 
 class _Hidden(_Once):
-    """A disturbance that the measurement does not report."""
+    """Receiver disturbance that the measurement does not report."""
 
-    def quiet(self, state: Spell, calm: Array) -> Spell:
-        """Remove it."""
-        return state._replace(window=self.xp.where(calm, NEVER, state.window))
+    def switch_off(self, state: Spell, undisturbed: Array) -> Spell:
+        """Return the state without the disturbance in the episodes where ``undisturbed``."""
+        return state._replace(window=self.xp.where(undisturbed, NEVER, state.window))
 
 
 class Jamming(_Hidden):
-    """The noise of the receiver rises, without a report. Its strength is the standard deviation over that without."""
+    """Jamming: the receiver's noise rises, unreported. Its strength is the factor on the standard deviation."""
 
     name = "jamming"
     causes: ClassVar[tuple[Cause, ...]] = (_within("jamming", "under jamming"),)
 
     def complete(self, state: Spell, draws: Draws) -> Spell:
-        """Draw how much."""
+        """Return the state with the drawn jamming factor on the receiver's standard deviation."""
         factor = draw_between(draws.log_uniform, "jamming_factor", self.parameters.jamming_factor)
         return state._replace(strength=self.xp.sqrt(state.strength + factor))
 
     def change_deviations(self, state: Spell, deviations: Array) -> Array:
-        """Raise them."""
+        """Return the standard deviations, multiplied by the jamming factor during the jamming."""
         if not self.probability:
             return deviations
-        jammed = within(state.number, state.window)
+        jammed = is_within(state.number, state.window)
         return self.xp.where(jammed, state.strength * deviations, deviations)
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the window and strength."""
+        """Return the context: the window of the jamming, and its factor on the standard deviation, by name."""
         return {**super().context(state), "jamming_gain": state.strength}
 
 
 class Spoofing(_Hidden):
-    """Every axis is pulled off; its strength is the rate, m/s."""
+    """Spoofing: the fix drifts off on every axis; its strength is the rate of the drift, m/s."""
 
     name = "spoofing"
     causes: ClassVar[tuple[Cause, ...]] = (_within("spoofing", "under spoofing"),)
 
     def complete(self, state: Spell, draws: Draws) -> Spell:
-        """Draw how fast."""
+        """Return the state with the drawn rate of the spoofed drift, m/s."""
         rate = draw_between(draws.uniform, "spoofing_rate", self.parameters.spoofing_rate)
         return state._replace(strength=state.strength + rate)
 
     def pull(self, state: Spell) -> Array:
-        """Return the error of every axis at this measurement, m, ``(N,)``."""
+        """Return the spoofing error of the fix on every axis at this measurement, m, ``(N,)``."""
         run = (state.strength * self.parameters.sampling_interval) * (state.number - state.window[0] + 1.0)
-        return self.xp.where(within(state.number, state.window), run, 0.0)
+        return self.xp.where(is_within(state.number, state.window), run, 0.0)
 
     def change_reading(self, state: Spell, reading: Array) -> tuple[Spell, Array]:
-        """Pull it off."""
+        """Return the state, and the fix with the spoofing error added."""
         return state, reading + self.pull(state) if self.probability else reading
 
     def context(self, state: Spell) -> dict[str, Array]:
-        """Return the window and rate."""
+        """Return the context: the window of the spoofing and its rate, m/s, by name."""
         return {**super().context(state), "spoofing_rate": state.strength}
 
 
 class ReceiverOutliers(Outliers):
-    """Fixes that are noisier than the others, each one on its own."""
+    """Outliers of the receiver: single fixes with larger noise, independent of each other."""
 
     name = "outliers"
     causes: ClassVar[tuple[Cause, ...]] = (OUTLIER,)
 
     @staticmethod
     def limits(parameters: LooselyCoupledNavigationParameters) -> tuple[float, float]:
-        """Return the limits of the parameters, of an intensity."""
+        """Return the probability of an outlier and the factor on its standard deviation, from the parameters."""
         return parameters.outlier_probability, math.sqrt(parameters.outlier_factor)
 
     def change_deviations(self, state: Array, deviations: Array) -> Array:
-        """Enlarge them."""
+        """Return the standard deviations times the outlier factor of this measurement."""
         return state * deviations if self.probability else deviations
 
 
@@ -286,6 +292,6 @@ DISTURBANCES: tuple[type[Disturbance], ...] = (
     NoiseChanges,
     ReceiverOutliers,
 )
-"""In the order in which they act; a further one comes last, so that episodes stay."""
+"""Disturbances in the order in which they act. New ones are appended, so that episodes do not change."""
 DRAWN_FIRST = (NoiseChanges,)
-"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""
+"""Disturbances that are drawn before the others, in this order, which fixes the random numbers of episodes."""

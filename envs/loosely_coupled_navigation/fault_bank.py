@@ -1,32 +1,32 @@
 r"""A bank of Kalman filters over the hidden faults of LooselyCoupledNavigation: noise levels, coloured error, spoofing.
 
-Every hypothesis is a pair: what the noises are (J points of the INS's drift, coloured and white noise and of the
-receiver's coloured error; the first is what the task models), and since when the receiver is pulled off (not at all, or
-since one of B onsets). Its filter estimates the INS error, the receiver's coloured error and the rate of the pull
-(``filters/receiver_faults.py``). The level of the receiver's white noise is a Markov chain of L levels, which all
-hypotheses share; it enters each filter as a Gaussian sum.
+Every hypothesis is a pair. Its first part is the noises: J points of the INS's drift, coloured and white noise and of
+the receiver's coloured error, the first of them as the task models it. Its second part is the onset of spoofing, which
+pulls the fix off: none, or one of B onsets. The hypothesis' filter estimates the INS error, the receiver's coloured
+error and the rate of the pull (``filters/receiver_faults.py``). The level of the receiver's white noise is a Markov
+chain of L levels, which all hypotheses share; it enters each filter as a Gaussian sum.
 
-Before each measurement, every ``spacing`` measurements, each hypothesis without a pull gives birth to one that is
-pulled from here on, in the place of the oldest. A pull ends with the hazard of a duration that is uniform between
-``shortest`` and ``longest``; what ends is merged with the hypothesis of the same noises that knows of no pull, by its
-moments. What is as modelled is never pulled off: an undisturbed episode has no hidden
-disturbance, and a drift of the INS looks like a slow pull. So there are J + (J - 1) B filters.
+Every ``spacing`` measurements each hypothesis without a pull starts one with a pull from this measurement on, which
+replaces the oldest. A pull ends with the hazard of a duration that is uniform between ``shortest`` and ``longest``; the
+ended hypothesis is merged by its moments with the hypothesis of the same noises without a pull. The modelled noises
+have no hypotheses of a pull: an undisturbed episode has no hidden disturbance, and a drift of the INS looks like a slow
+pull. So there are J + (J - 1) B filters.
 
 Reading: one pull and one chain of levels serve all axes, but the rate of the pull is estimated on each axis alone.
 
-It is the estimator ``fault-bank`` of the baselines, and what the control ``hypotheses`` steers. H hypotheses predict to
-the fix with weights p' and covariances P', and the levels of the receiver have probabilities q'. Factors f of its
-settings change what the fix is weighed with, this once:
+The bank is the estimator ``fault-bank`` of the baselines and the filter that the control ``hypotheses`` steers. H
+hypotheses predict to the fix with weights p' and covariances P', and the levels of the receiver have probabilities q'.
+Factors f of its settings change the update with this fix alone:
 
     p'(h) <- p'(h) f1^pulled(h) f2^modelled(h)                                              renormalised by Bayes' rule
     q'(l) <- q'(l) f3^s(l),    R <- R f4
     P'(h) <- P'(h) + (f5 - 1) Q(h) + (f6 - 1) W(h)
 
-pulled: the receiver is pulled off, whenever that began; modelled: all noises are as modelled; s(l): how far the level
-lies above the reported variance, logarithmically, one for the highest. So f1 multiplies the odds of a pull as other
-hazards would, f2 is the prior of a fault, f3 shifts the level of the receiver and f4 scales its present error.
-Q is what the coloured and the white rate error of the INS add in a step and W what the receiver's coloured error gains:
-a prediction with ``f5 Q`` and ``f6 W``, as these only add. Without a fix nothing changes.
+pulled: the hypothesis has a pull; modelled: all its noises are as modelled; s(l): logarithm of level l over the
+reported variance, one for the highest. So f1 multiplies the odds of a pull as other hazards would, f2 is the prior of a
+fault, f3 shifts the level of the receiver and f4 scales its present error. Q is the covariance that the coloured and
+the white rate error of the INS add in a step, and W that of the receiver's coloured error: a prediction with ``f5 Q``
+and ``f6 W``. Without a fix nothing changes.
 """
 
 import math
@@ -48,73 +48,73 @@ from .fault_prior import TRAINING, FaultPrior, Noises, draw_noises
 from .world import Measurement
 
 SAME_REPORT = 1e-9
-"""Share by which the reported variance may change without being another report: more than rounding does."""
+"""Relative change of the reported variance below which the report counts as unchanged: more than rounding."""
 
 
 class Hypotheses(NamedTuple):
-    """Hypotheses of J noises and M onsets, with S = 4 states (delta, beta, eta, e) or 5 (and the rate of a pull)."""
+    """Hypotheses of J noises and M onsets, with S = 4 states (delta, beta, eta, e), or 5 with the rate of a pull."""
 
     mean: Array
-    """``(S, A, J, M, N)``."""
+    """Means, ``(S, A, J, M, N)``."""
     covariance: faults.FaultCovariance
-    """``(..., J, M, N)``."""
+    """Covariances, ``(..., J, M, N)``."""
     weights: Array
     """Probabilities, ``(J, M, N)``."""
 
 
 class Memory(NamedTuple):
-    """Memory of the bank."""
+    """Hypotheses and levels that the bank keeps from one measurement to the next."""
 
     free: Hypotheses
-    """Those without a pull, M = 1."""
+    """Hypotheses without a pull, M = 1."""
     pulled: Hypotheses
-    """Those of all noises but the modelled ones, M = B."""
+    """Hypotheses with a pull, of all noises but the modelled ones, M = B."""
     levels: Array
     """Probabilities of the receiver's levels, ``(L, N)``."""
     reported: Array
-    """Variance last reported, m^2, ``(N,)``."""
+    """Last reported variance, m^2, ``(N,)``."""
 
 
 class Weighing(NamedTuple):
-    """Predicted hypotheses weighed by a measurement, those without a pull first, H of both together."""
+    """Predicted hypotheses weighted by a measurement: those without a pull first, H in all."""
 
     log_likelihood: Array
-    """Of the measurement, ``(N,)``."""
+    """Log-likelihood of the measurement, ``(N,)``."""
     weights: Array
-    """Probabilities of the hypotheses after it, ``(H, N)``."""
+    """Posterior probabilities of the hypotheses, ``(H, N)``."""
     levels: Array
-    """Those of the receiver's levels, ``(L, N)``."""
+    """Posterior probabilities of the receiver's levels, ``(L, N)``."""
     expected: Array
-    """INS less receiver as it was predicted, m, ``(A, N)``."""
+    """Predicted difference of INS and receiver positions, m, ``(A, N)``."""
     own: Array
-    """Mean of the hypotheses' variances of that without the receiver's noise, m^2, ``(N,)``."""
+    """Mean of the hypotheses' variances of that difference without the receiver's noise, m^2, ``(N,)``."""
     nis: Array
-    """Normalised innovation squared of all together, ``(N,)``."""
+    """Normalised innovation squared of the whole bank, ``(N,)``."""
     innovations: tuple[Array, Array]
-    """Of the hypotheses without and with a pull, m, ``(A, J, M, N)`` each."""
+    """Innovations of the hypotheses without and with a pull, m, ``(A, J, M, N)`` each."""
     directions: tuple[faults.Direction, faults.Direction]
-    """Along which they are updated."""
+    """Directions of their updates."""
     noises: tuple[faults.NoiseMixture, faults.NoiseMixture]
-    """What their innovations say."""
+    """Receiver noise that their innovations indicate."""
 
 
 class FaultState(NamedTuple):
-    """State of the bank over faults."""
+    """State of the fault bank."""
 
     mean: Array
-    """Of all hypotheses together, ``(A, N)``, m."""
+    """Mean of the whole bank, m, ``(A, N)``."""
     covariance: Array
-    """``(A, A, N)``."""
+    """Covariance of the whole bank, m^2, ``(A, A, N)``."""
     memory: Memory
     likelihood: Likelihood
 
 
 class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
-    """Kalman filters over the noises of INS and receiver and since when the receiver is pulled off.
+    """Bank of Kalman filters over the noises of INS and receiver and over the onset of spoofing.
 
     Args:
         task: the problem.
-        prior: what it expects.
+        prior: of faults and noises.
         **changed: fields of the prior.
     """
 
@@ -143,13 +143,13 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         every = range((1 + prior.points) + prior.points * prior.onsets)
         raised = [[float(h > prior.points) for h in every], [float(h == 0) for h in every]]
         self.raised: Array = task.constant(raised)[:, :, None]
-        """Whose weights each of the first two settings multiplies, ``(2, H, 1)``."""
+        """Mask of the hypotheses whose weights each of the first two settings multiplies, ``(2, H, 1)``."""
         highest = math.log(prior.levels[-1]) or 1.0
         self.heights: Array = task.constant([math.log(level) / highest for level in prior.levels])[:, None]
         self.onsets: Array = task.constant(numpy.arange(float(prior.onsets)))[:, None] * self.spacing
 
     def start(self, initial: Initial) -> FaultState:
-        """Start where INS and reference agree, without a pull."""
+        """Return the bank's state at the start of the track: INS and reference agree, no pull (spoofing)."""
         xp, noises = self.xp, self.noises
         none = 0.0 * initial.mean[0]
         zero = none + 0.0 * noises.drift
@@ -157,7 +157,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         P = faults.FaultCovariance(ins, xp.stack([zero[None]] * 3), (zero + noises.wandering**2)[None, None])
         still = xp.stack([0.0 * initial.mean[:, None, None] + zero[None]] * 4)
         free = Hypotheses(still, P, zero + self.noise_weights)
-        born = self.give_birth(free)
+        born = self.start_pulls(free)
         others = [
             xp.stack([values[..., 0, :]] * self.prior.onsets, axis=-2) for values in (born.mean, *_flat(born))
         ]
@@ -165,8 +165,8 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         memory = Memory(free, pulled, self.fresh + none, none)
         return FaultState(initial.mean, initial.covariance, memory, Likelihood.unknown(none))
 
-    def give_birth(self, free: Hypotheses) -> Hypotheses:
-        """Return the hypotheses of all noises but the modelled ones that are pulled from here on, ``(J - 1, 1)``."""
+    def start_pulls(self, free: Hypotheses) -> Hypotheses:
+        """Return hypotheses whose pull begins now, ``(J - 1, 1)``, one for each noise but the modelled one."""
         xp = self.xp
         none = 0.0 * free.weights[1:]
         P = faults.FaultCovariance(
@@ -181,19 +181,21 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
 
     def since_onset(self, number: Array) -> Array:
-        """Return the measurements since the onset of each hypothesis of a pull, ``(B, N)``, at the number of a
-        measurement.
+        """Return the number of measurements since the onset of each pull hypothesis, ``(B, N)``.
+
+        Args:
+            number: of the current measurement.
         """
         cycle = 1.0 * self.spacing * self.prior.onsets
         since = number - self.onsets
         return since - cycle * self.xp.floor(since / cycle)
 
     def age(self, number: Array) -> Array:
-        """Return the age of each pull, s, ``(B, N)``: a pull begins in the middle between two hypotheses."""
+        """Return the age of each pull hypothesis, s, ``(B, N)``; onsets lie midway between hypotheses."""
         return self.interval * (self.since_onset(number) + 0.5 * (self.spacing + 1))
 
     def change(self, free: Hypotheses, pulled: Hypotheses, number: Array) -> tuple[Hypotheses, Hypotheses]:
-        """End pulls and let others begin."""
+        """Return the hypotheses after pulls have ended and new ones have begun at a measurement."""
         xp, prior, T = self.xp, self.prior, self.interval
         since, age = self.since_onset(number), self.age(number)
         born = (since == 0.0) & (number >= self.onsets)
@@ -204,7 +206,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         share = prior.onset_rate * self.spacing * T
         # At most one of the onsets is born at a measurement.
         given = xp.where(born & begins, share / (1.0 + share), 0.0)
-        begun = self.give_birth(free)
+        begun = self.start_pulls(free)
         merged = self.merge(begun, pulled, 1.0 - ordered_sum(given), hazard)
         replaced = [xp.where(born, new, old) for new, old in zip(_flat(begun), _flat(pulled), strict=True)]
         free = Hypotheses(
@@ -225,7 +227,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return free, pulled
 
     def merge(self, begun: Hypotheses, pulled: Hypotheses, staying: Array, hazard: Array) -> Hypotheses:
-        """Merge hypotheses without a pull and those that end, by their moments; S = 4, ``(J - 1, 1)``."""
+        """Return the hypotheses without a pull merged with the ended ones, by their moments; S = 4, ``(J - 1, 1)``."""
         xp = self.xp
         weights = xp.concat([begun.weights * staying, pulled.weights * hazard], axis=1)
         mean = xp.concat([begun.mean, pulled.mean], axis=3)[:4]
@@ -242,7 +244,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return Hypotheses(centre[:, :, :, None], faults.from_matrix(moments[:, :, :, None]), total[:, None])
 
     def predict(self, state: FaultState, measurement: Measurement) -> FaultState:
-        """Change hypotheses and predict them, and the receiver's levels, to the time of a measurement."""
+        """Return the state predicted to a measurement, after pulls have begun and ended."""
         memory = state.memory
         free, pulled = self.change(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
@@ -255,19 +257,23 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
         return state._replace(memory=memory)
 
-    def heeds(self, measurement: Measurement) -> Array:
-        """Return one where there is a fix."""
+    def has_effect(self, measurement: Measurement) -> Array:
+        """Return one where there is a fix, so that an action has an effect, zero elsewhere, ``(N,)``."""
         return measurement.available
 
     def examine(self, state: FaultState, measurement: Measurement) -> Weighing:
-        """Weigh the predicted hypotheses by a fix."""
+        """Return the predicted hypotheses weighted by a fix, without factors."""
         return self.weigh(state.memory, measurement)
 
     def apply_factors(
         self, predicted: Memory, measurement: Measurement, logarithms: Array
     ) -> tuple[Memory, Weighing]:
-        """Return the hypotheses with the noises of a step multiplied by factors of these logarithms, ``(6, N)``,
-        and how a fix weighs them with all factors.
+        """Return the predicted hypotheses with scaled process noise, and their weighting by a fix with all factors.
+
+        Args:
+            predicted: by :meth:`predict`.
+            measurement: that arrives.
+            logarithms: of the factors of the settings, ``(6, N)``.
         """
         xp = self.xp
         receiver, *noises = xp.exp(logarithms[3:])
@@ -282,17 +288,17 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
         return predicted, self.weigh(predicted, measurement, evidence, receiver, levels)
 
-    def update(self, state: FaultState, given: FilterInput) -> FaultState:
-        """Weigh the predicted hypotheses by a fix, update them, and report the moments of all."""
-        predicted, measurement = state.memory, given.measurement
-        if given.action is None:
+    def update(self, state: FaultState, inputs: FilterInput) -> FaultState:
+        """Return the state with the predicted hypotheses weighted and updated by a fix, and the bank's moments."""
+        predicted, measurement = state.memory, inputs.measurement
+        if inputs.action is None:
             weighing = self.weigh(predicted, measurement)
         else:
-            predicted, weighing = self.apply_factors(predicted, measurement, given.action)
+            predicted, weighing = self.apply_factors(predicted, measurement, inputs.action)
         return self.take(predicted, measurement, weighing)
 
     def likelihood(self, weighing: Weighing, measurement: Measurement) -> Likelihood:
-        """Return the likelihood of a fix; NaN where there is none."""
+        """Return the likelihood of a fix under its prediction; NaN where there is none."""
         there = measurement.available > 0.0
         return Likelihood(
             self.xp.where(there, weighing.log_likelihood, math.nan),
@@ -301,7 +307,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
 
     def predict_part(self, h: Hypotheses, noises: Noises) -> Hypotheses:
-        """Predict some hypotheses of these noises by a step."""
+        """Return some hypotheses predicted by one step, with these noises."""
         xp, s = self.xp, self.parameters.sampling
         one, zero = 0.0 * noises.decay + 1.0, 0.0 * noises.decay
         pulls = h.mean.shape[0] - 4
@@ -320,7 +326,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         variance_factors: Array = 1.0,
         level_factors: Array = 1.0,
     ) -> Weighing:
-        """Weigh predicted hypotheses and levels by a measurement.
+        """Return the posterior weights of predicted hypotheses and levels given a measurement.
 
         Args:
             predicted: by :meth:`predict`.
@@ -376,7 +382,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
     def weigh_part(
         self, h: Hypotheses, shares: Array, fix: Array, there: Array, levels: Array, q: Array
     ) -> tuple[Array, Array, faults.Direction, faults.NoiseMixture]:
-        """Compare some predicted hypotheses with a fix.
+        """Return predicted difference, innovations, update directions and noise of some hypotheses at a fix.
 
         Args:
             h: hypotheses.
@@ -401,7 +407,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return expected, innovation, along, noise
 
     def take(self, predicted: Memory, measurement: Measurement, weighing: Weighing) -> FaultState:
-        """Update predicted hypotheses as they are weighed, and report the moments of all."""
+        """Return the state after the update of predicted hypotheses with their posterior weights."""
         xp = self.xp
         there = measurement.available > 0.0
         split = predicted.free.weights.shape[0]
@@ -435,7 +441,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         noise: faults.NoiseMixture,
         there: Array,
     ) -> Hypotheses:
-        """Update some predicted hypotheses by what :meth:`weigh_part` found; their weights stay."""
+        """Return some predicted hypotheses updated with their innovations; their weights do not change."""
         xp = self.xp
         squares = ordered_sum(innovation * innovation)
         push = xp.where(there, noise.score, 0.0) * innovation
@@ -445,7 +451,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         return Hypotheses(mean, faults.update_fault(h.covariance, along, weight), h.weights)
 
     def join(self, values: Sequence[Array], before: int) -> Array:
-        """All hypotheses, of noises and onsets, in a row behind some axes."""
+        """Return an array ``(..., H, N)`` of values of both groups of hypotheses, with ``before`` leading axes."""
         return self.xp.concat(
             [self.xp.reshape(each, (*each.shape[:before], -1, each.shape[-1])) for each in values],
             axis=before,
@@ -453,23 +459,21 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
 
 
 def _exponential(power: Any) -> Any:
-    """Return the exponential of a number, or of each of an array."""
     return math.exp(power) if isinstance(power, int | float) else namespace(power).exp(power)
 
 
 def _flat(h: Hypotheses) -> list[Array]:
-    """Return the arrays of a covariance in a row."""
+    """Return the arrays of some hypotheses' covariance as a flat list."""
     return [*h.covariance.ins, h.covariance.cross, h.covariance.faults]
 
 
 def _covariance(arrays: list[Array]) -> faults.FaultCovariance:
-    """Undo :func:`_flat`."""
+    """Return the covariance of a list of arrays: the inverse of :func:`_flat`."""
     return faults.FaultCovariance(AugmentedCovariance(*arrays[:6]), arrays[6], arrays[7])
 
 
 def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.FaultCovariance, ...]:
-    """Return the growth in a step of the covariance of hypotheses by the INS, Q, and by the receiver's coloured error,
-    W.
+    """Return the process noise covariances of one step: Q of the INS and W of the receiver's coloured error.
 
     Args:
         noises: of the hypotheses.
@@ -490,7 +494,7 @@ def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.Fau
 
 
 def add_noise(h: Hypotheses, steps: Sequence[faults.FaultCovariance], factors: Sequence[Array]) -> Hypotheses:
-    """Return the predicted hypotheses with the noises of a step multiplied, each by its factor, ``(N,)``."""
+    """Return the predicted hypotheses with each process noise covariance of a step multiplied by a factor, ``(N,)``."""
     inertial, wandering = steps
     more, further = (factor - 1.0 for factor in factors)
     ins = (P + more * Q for P, Q in zip(h.covariance.ins, inertial.ins, strict=True))

@@ -1,4 +1,4 @@
-"""Prior of the bank over faults of LooselyCoupledNavigation, and the noises that it tries."""
+"""Prior of the fault bank of LooselyCoupledNavigation, and the noise points of its hypotheses."""
 
 import math
 from typing import NamedTuple
@@ -9,45 +9,45 @@ from ..contract.observation import Array
 from .parameters import LooselyCoupledNavigationParameters
 
 LEVELS = tuple(100 ** (i / 3) for i in range(-2, 5))
-"""Variances of the receiver over the reported one that the bank distinguishes."""
+"""Ratios of true to reported receiver variance that the bank distinguishes."""
 
 
 class FaultPrior(NamedTuple):
-    """Prior of a bank; times in s."""
+    """Prior of the fault bank; times in s."""
 
     points: int = 6
-    """Points of noises beside the modelled one."""
+    """Number of noise points beside the modelled one."""
     modelled: float = 0.5
-    """Probability that all noises are as modelled and nothing is pulled off. Ours, as likely as not: in the training
-    distribution one of six, of which a bank is a percent better there, and pays for it where nothing is wrong."""
+    """Prior probability that all noises are as modelled and nothing is pulled off. Ours, one half: in the training
+    distribution it is one sixth. With that the bank is a percent better there, but worse where nothing is wrong."""
     drift: tuple[float, float] = (0.05, 10**0.5)
-    """Limits of the drift's standard deviation over the modelled one."""
+    """Limits of the ratio of the drift's standard deviation to the modelled one."""
     intensity: tuple[float, float] = (0.005, 10**0.5)
-    """Limits of the intensities of coloured and white noise over the modelled ones."""
+    """Limits of the ratios of the coloured and white noises' intensities to the modelled ones."""
     wandering: tuple[float, float] = (0.0, 0.5)
     """Limits of the standard deviation of the receiver's coloured error, m."""
     lasting: tuple[float, float] = (0.5, 5.0)
     """Limits of the correlation time of that error."""
     onset: tuple[float, float] = (0.5, 3.5)
-    """When a pull may begin."""
+    """Earliest and latest onset of a pull."""
     onset_rate: float = 0.07
-    """Pulls expected in a second of that time."""
+    """Expected number of pulls per second in that interval."""
     onsets: int = 6
-    """B, hypotheses of a pull that are kept."""
+    """B, number of onset hypotheses."""
     shortest: float = 0.5
     longest: float = 2.0
     rate: float = 3**0.5
     """Standard deviation of the rate of a pull, m/s."""
     levels: tuple[float, ...] = LEVELS
-    """Variances of the receiver over the reported one, ascending, one of them 1."""
+    """Ratios of true to reported receiver variance, ascending, one of them 1."""
     level_rate: float = 0.3
-    """Changes of the level expected in a second."""
+    """Expected number of level changes per second."""
     distrust: float = 0.05
-    """Probability that a report is wrong from the start."""
+    """Probability that the report is wrong from the start."""
     outlier: float = 0.0
     """Probability of an outlier."""
     outlier_factor: float = 100.0
-    """Its variance over that of the others."""
+    """Ratio of an outlier's variance to that of the others."""
 
 
 TRAINING = FaultPrior()
@@ -78,9 +78,10 @@ a few percent less, and errs by nearly twice the variance that it states (ANEES 
 
 
 def spread_points(points: int, dimensions: int) -> numpy.ndarray:
-    """Return the points that fill the unit cube evenly, ``(points, dimensions)``: the Kronecker sequence of the
-    powers of the root of ``x^(d + 1) = x + 1`` (Roberts, "The unreasonable effectiveness of quasirandom
-    sequences", 2018).
+    """Return low-discrepancy points in the unit cube, ``(points, dimensions)``.
+
+    Kronecker sequence of the powers of the root of ``x^(d + 1) = x + 1`` (Roberts, "The unreasonable effectiveness of
+    quasirandom sequences", 2018).
     """
     root = 2.0
     for _ in range(60):
@@ -90,24 +91,24 @@ def spread_points(points: int, dimensions: int) -> numpy.ndarray:
 
 
 class Noises(NamedTuple):
-    """Noises of the hypotheses, as NumPy arrays ``(J,)``, in the bank ``(J, 1, 1)`` each."""
+    """Noises of J hypotheses, as NumPy arrays ``(J,)``, in the bank ``(J, 1, 1)`` each."""
 
     drift: Array
-    """Standard deviation, m/s."""
+    """Standard deviation of the constant rate error, m/s."""
     coloured: Array
     """Stationary standard deviation of the coloured rate error, m/s."""
     coloured_growth: Array
-    """Variance that it gains in a step, m^2/s^2."""
+    """Variance that the coloured rate error gains in a step, m^2/s^2."""
     white_growth: Array
     """Variance of the displacement in a step that this gain does not explain, m^2."""
     wandering: Array
     """Stationary standard deviation of the receiver's coloured error, m."""
     decay: Array
-    """What is left of that error after a step."""
+    """Factor on that error in a step."""
 
 
 def draw_noises(prior: FaultPrior, p: LooselyCoupledNavigationParameters) -> Noises:
-    """Return the points of noises, the modelled one first, ``(J,)`` each."""
+    """Return the noise points of the hypotheses, the modelled one first, ``(J,)`` each."""
     interval = p.sampling_interval
     unit = spread_points(prior.points, 5).T
 

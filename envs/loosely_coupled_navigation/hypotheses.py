@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the estimator ``fault-bank`` with settings that an action multiplies."""
+"""Bank of the control ``hypotheses``: the estimator ``fault-bank``, whose settings the action multiplies."""
 
 import math
 from collections.abc import Sequence
@@ -26,31 +26,31 @@ from .world import Measurement
 
 
 class HypothesesState(NamedTuple):
-    """The bank over faults at one moment."""
+    """State of the fault bank with the values that the agent observes."""
 
     own: FaultState
-    """Predicted between :meth:`HypothesesBank.predict` and the action."""
+    """State of the fault bank, predicted between :meth:`HypothesesBank.predict` and the action."""
     likelihood: Likelihood
-    seen: Innovations
-    """Of all hypotheses together, over the deviation that goes with the reported noise."""
+    innovations: Innovations
+    """Innovations of the whole bank, over the deviation by the reported noise."""
     prior: Array
-    """Logarithm of the sigma of the predicted position over the reported one, ``(N,)``."""
+    """Logarithm of the predicted standard deviation of the position over the reported one, ``(N,)``."""
     predicted: Array
     """Probabilities of groups of hypotheses before the fix, ``(G, N)``."""
     probabilities: Array
-    """Probabilities of the groups after it, if the action is zero, ``(G, N)``."""
+    """Probabilities of the groups after the fix under action zero, ``(G, N)``."""
     levels: Array
-    """Of the receiver's levels then, ``(L, N)``."""
+    """Probabilities of the receiver's levels after the fix under action zero, ``(L, N)``."""
     entropy: Array
-    """Of the hypotheses then, over the largest possible, ``(N,)``."""
+    """Entropy of the hypotheses after the fix under action zero, over the largest possible, ``(N,)``."""
     action: Array
     """Last action, ``(6, N)``."""
 
 
 class HypothesesBank(SettingsBank, KalmanBucyBank):
-    """The bank over faults, steered by factors of its weights, of its levels and of its noises."""
+    """Bank of the control ``hypotheses``: the fault bank with factors on its weights, levels and noises."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultBank
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultBank
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
@@ -58,12 +58,12 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         points = (f"point_{j}" for j in range(1, prior.points + 1))
         self.noise_names: tuple[str, ...] = ("modelled", *points)
         self.groups: tuple[str, ...] = (*self.noise_names, "young_pull", "old_pull")
-        """Of hypotheses whose probabilities are shown: by their noises, and those of pulls too young to end, or not."""
+        """Names of the observed groups of hypotheses: by their noises, and pulls too young to end or older."""
         self.level_names: tuple[str, ...] = tuple(str(i) for i in range(1, len(prior.levels) + 1))
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation of every filter, likelihood of the fix, and probabilities of the hypotheses."""
+        """Observation blocks of every filter, the likelihood of the fix, and probabilities of the hypotheses."""
         xp = self.xp
         nominal = 0.5 * self.parameters.axes * math.log(2.0 * math.pi * self.parameters.receiver_variance)
         return (
@@ -95,11 +95,11 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         )
 
     def last_action(self) -> Block:
-        """Block of the action applied before."""
+        """Return the observation block of the previous action."""
         return last_action_block(tuple(self.own.settings))
 
     def start(self, initial: Initial) -> HypothesesState:
-        """Start where the estimator starts."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         own, zero = self.own.start(initial), 0.0 * initial.mean
         memory, none = own.memory, zero[0]
         weights = self.own.join([memory.free.weights, memory.pulled.weights], 0)
@@ -107,7 +107,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         return HypothesesState(
             own=own,
             likelihood=own.likelihood,
-            seen=self.no_innovations(zero),
+            innovations=self.no_innovations(zero),
             prior=none,
             predicted=groups,
             probabilities=groups,
@@ -117,8 +117,11 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         )
 
     def group(self, weights: Array, age: Array) -> Array:
-        """Return the probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``, and of the age of
-        pulls, s.
+        """Return the probabilities of groups of hypotheses, ``(G, N)``, from those of all hypotheses, ``(H, N)``.
+
+        Args:
+            weights: probabilities of the hypotheses, ``(H, N)``.
+            age: of the pulls, s, ``(B, N)``.
         """
         xp, points, onsets = self.xp, self.own.prior.points, self.own.prior.onsets
         free = weights[: 1 + points]
@@ -128,18 +131,20 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         young = xp.where(age <= self.own.prior.shortest, by_onset, 0.0)
         return xp.stack([free[0], *noises, ordered_sum(young), ordered_sum(by_onset - young)])
 
-    def look(self, state: HypothesesState, found: Weighing, measurement: Measurement) -> HypothesesState:
-        """Show the innovations, and probabilities before and after the fix."""
-        bank, predicted, p = self.own, state.own.memory, found.weights
+    def add_observed(
+        self, state: HypothesesState, result: Weighing, measurement: Measurement
+    ) -> HypothesesState:
+        """Return the state with the innovations, and the probabilities before and after the fix, filled in."""
+        bank, predicted, p = self.own, state.own.memory, result.weights
         age = bank.age(measurement.number)
         weights = bank.join([predicted.free.weights, predicted.pulled.weights], 0)
-        expected = measurement.ins - found.expected
+        expected = measurement.ins - result.expected
         return state._replace(
-            likelihood=bank.likelihood(found, measurement),
-            seen=self.update_innovations(state.seen, measurement, expected, found.own),
-            prior=0.5 * self.xp.log(found.own / predicted.reported),
+            likelihood=bank.likelihood(result, measurement),
+            innovations=self.update_innovations(state.innovations, measurement, expected, result.own),
+            prior=0.5 * self.xp.log(result.own / predicted.reported),
             predicted=self.group(weights, age),
             probabilities=self.group(p, age),
-            levels=found.levels,
+            levels=result.levels,
             entropy=-ordered_sum(p * imm.log_probabilities(p)) / math.log(p.shape[0]),
         )

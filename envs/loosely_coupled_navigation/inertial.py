@@ -1,12 +1,12 @@
-"""Recordings of LooselyCoupledNavigation from a log of a raw IMU and one of fixes.
+"""Recordings of LooselyCoupledNavigation made from a log of a raw IMU and a log of position fixes.
 
-The INS is aligned at a standstill, aided by the fixes, and let loose in windows one after the other (see
-``envs/logs/strapdown.py``): at the start of each it has the velocity, attitude and biases that fixes have led it to
-until then, and runs free from there. A window is an episode; its measurements are the positions of the INS, east and
-north, beside the fixes with the deviations that the receiver reports.
+The INS is aligned at a standstill and aided by the fixes. It then runs free in successive windows (see
+``envs/logs/strapdown.py``), each from the velocity, attitude and biases that the aided INS has at its start. A window
+is an episode; its measurements are the positions of the INS, east and north, beside the fixes with the deviations that
+the receiver reports.
 
-The environment takes the position at the start for the true one. So the INS begins where the truth is, if there is one,
-and otherwise at the position by the aided INS, whose error stays in the window.
+The environment takes the position at the start for the true one. So the INS begins at the true position if it is known,
+and otherwise at that of the aided INS, whose error stays in the window.
 """
 
 from collections.abc import Sequence
@@ -40,19 +40,19 @@ ACCELERATION_UNITS = {"m/s^2": 1.0, "g": GRAVITY}
 GEODETIC, LOCAL = ("latitude", "longitude", "height"), ("x", "y", "z")
 VELOCITIES = ("velocity_east", "velocity_north", "velocity_up")
 LONGEST_IMU_GAP = 0.5
-"""Between two measurements of the IMU, s: what it turns and accelerates in a longer one is not known."""
+"""Longest gap between two measurements of the IMU, s; the motion in a longer one is unknown."""
 LARGEST_IMU_INTERVAL = 0.1
-"""Median interval of the IMU, s."""
+"""Largest median interval of the IMU, s."""
 UNEVEN = 0.1
-"""Of the interval of fixes, by which they may come early or late: the filters count measurements."""
+"""Largest deviation of a fix from regular times, as a share of their interval: the filters count measurements."""
 LONGEST_TRUTH_GAP = 1.5
-"""Between two rows of the truth within which it is interpolated, s."""
+"""Longest gap between two rows of the truth that is interpolated, s."""
 DIFFERENCED_SIGMA = 0.3
-"""Of a velocity made of positions, m/s: they are so far apart that it is this."""
+"""Standard deviation of a velocity computed from positions, m/s; their distance in time is chosen for it."""
 COMPARED = 2.0
-"""Between fixes whose turns and changes of speed are compared with those of the IMU, s."""
+"""Interval over which turns and changes of speed of fixes and IMU are compared, s."""
 LARGEST_INNOVATION = 10.0
-"""Root mean square of the aided INS's innovations over their deviation; about 1 where everything is right."""
+"""Largest root mean square of the aided INS's normalised innovations; about 1 where everything is right."""
 
 
 def inertial_recording(
@@ -75,7 +75,7 @@ def inertial_recording(
     source: str = "",
     licence: str = "",
 ) -> Recording:
-    """Make a recording of LooselyCoupledNavigation of a log of an IMU and a log of fixes.
+    """Return a recording of LooselyCoupledNavigation made from a log of an IMU and a log of fixes.
 
     Files are CSV, NetCDF, Parquet or JSON, tables those of pandas. Both have ``time``, seconds or dates of one clock.
 
@@ -152,7 +152,7 @@ def inertial_recording(
 def measurements_beside(
     ins: numpy.ndarray, fixes: numpy.ndarray, deviations: numpy.ndarray, rows: numpy.ndarray
 ) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a ``Measurement`` by their names, ``(E, K, ...)``.
+    """Return the arrays of a ``Measurement`` from INS positions and the fixes at the same times, by name.
 
     Args:
         ins: positions of the INS from the start on, m, ``(E, 1 + K, 2)``.
@@ -177,7 +177,7 @@ def measurements_beside(
 def read_columns(
     data: Any, what: str, needed: Sequence[str], optional: Sequence[str] = ()
 ) -> tuple["pandas.DataFrame", str]:
-    """Return columns as numbers by time, s, and the clock that this is by.
+    """Return columns of a file or table as numbers, indexed by time, s, and the kind of clock of its times.
 
     Args:
         data: a file or a table.
@@ -218,7 +218,7 @@ def read_columns(
 def read_inertial(
     data: Any, rate_unit: str, acceleration_unit: str, mounting: Sequence[float], delay: float
 ) -> tuple["pandas.DataFrame", str]:
-    """Return rates and specific forces forward, right and down, as ``envs/logs/strapdown.py`` has them, and the clock.
+    """Return the table of body rates and specific forces forward, right and down, and the clock of its times.
 
     Raises:
         ValueError: for unknown units, empty cells, or measurements too far apart.
@@ -253,7 +253,7 @@ def read_inertial(
 
 
 def read_positions(data: Any, what: str, site: Sequence[float] | None) -> tuple["pandas.DataFrame", str]:
-    """Return latitude, longitude (degrees), altitude (m) and what else stands beside them, and the clock.
+    """Return the table of latitude, longitude (degrees), altitude (m) and further columns, and its clock.
 
     Raises:
         ValueError: if positions are not whole, of neither kind, or metres without a site.
@@ -292,7 +292,7 @@ def read_positions(data: Any, what: str, site: Sequence[float] | None) -> tuple[
 
 
 def geodetic_of_local(coordinates: numpy.ndarray, site: Sequence[float]) -> numpy.ndarray:
-    """Return the latitude, longitude (degrees) and height (m) of metres east, north and up of a site, ``(3, n)``.
+    """Return the latitude, longitude (degrees) and height (m), ``(3, n)``, of points east, north and up of a site.
 
     Args:
         coordinates: ``(3, n)``, m.
@@ -305,10 +305,10 @@ def geodetic_of_local(coordinates: numpy.ndarray, site: Sequence[float]) -> nump
 
 
 def check_clocks(inertial: Any, clock: str, other: Any, its_clock: str, what: str) -> None:
-    """Raise ValueError unless the IMU and another log are of one clock and overlap."""
+    """Raise ValueError if the IMU and another log have different clocks or do not overlap in time."""
     if clock != its_clock:
         raise ValueError(
-            f"times of the IMU are {clock} and those of the {what} {its_clock}: write both alike"
+            f"times of the IMU are {clock} and those of the {what} {its_clock}: use the same form in both"
         )
     if other.index[0] > inertial.index[-1] or other.index[-1] < inertial.index[0]:
         raise ValueError(
@@ -317,11 +317,11 @@ def check_clocks(inertial: Any, clock: str, other: Any, its_clock: str, what: st
         )
 
 
-# --- what stands beside each other
+# --- alignment of times
 
 
 def fix_deviations(fixes: Any, sigma: float | None) -> numpy.ndarray:
-    """Return the standard deviations of fixes, m, ``(n,)``, as they state them, else ``sigma``.
+    """Return the standard deviations of fixes, m, ``(n,)``, from their column, else ``sigma``.
 
     Raises:
         ValueError: if neither is a positive number.
@@ -336,8 +336,9 @@ def fix_deviations(fixes: Any, sigma: float | None) -> numpy.ndarray:
 
 
 def differenced_velocities(fixes: Any, deviations: numpy.ndarray) -> Any:
-    """Return the fixes with velocities made of positions so far apart that their deviation is
-    ``DIFFERENCED_SIGMA``.
+    """Return the fixes with velocities computed from position differences.
+
+    The positions are so far apart in time that the velocities have the deviation ``DIFFERENCED_SIGMA``.
     """
     time = fixes.index.to_numpy()
     half = difference_half(deviations)
@@ -352,7 +353,7 @@ def differenced_velocities(fixes: Any, deviations: numpy.ndarray) -> Any:
 
 
 def difference_half(deviations: numpy.ndarray) -> float:
-    """Half of the time between positions whose difference is a velocity of ``DIFFERENCED_SIGMA``, s."""
+    """Return half of the time between positions whose difference is a velocity of ``DIFFERENCED_SIGMA``, s."""
     return float(numpy.median(deviations)) / DIFFERENCED_SIGMA / 2.0**0.5
 
 
@@ -364,7 +365,7 @@ def aided_inertial(
     lever: Sequence[float],
     errors: InertialErrors | None,
 ) -> AidedInertial:
-    """Return the INS aligned at the standstill and aided by fixes.
+    """Return the INS solution aligned at the standstill and aided by fixes.
 
     Raises:
         ValueError: if it cannot be aligned, or does not follow the fixes.
@@ -387,7 +388,7 @@ def aided_inertial(
 
 
 def regular_times(time: numpy.ndarray, end: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the times of measurements, s, and the fix at each, -1 where there is none.
+    """Return the regular times of measurements, s, and the index of the fix at each, -1 where there is none.
 
     Args:
         time: of the fixes, s.
@@ -415,7 +416,7 @@ def regular_times(time: numpy.ndarray, end: float) -> tuple[numpy.ndarray, numpy
 
 
 def interpolate(values: numpy.ndarray, time: numpy.ndarray, times: numpy.ndarray) -> numpy.ndarray:
-    """Values ``(n, A)`` at other times, NaN between two that are far apart and beyond the ends."""
+    """Return the values ``(n, A)`` interpolated at other times; NaN in long gaps and beyond the ends."""
     found = numpy.stack(
         [numpy.interp(times, time, column, numpy.nan, numpy.nan) for column in values.T], axis=1
     )

@@ -1,15 +1,14 @@
-r"""The filter of LooselyCoupledNavigation that a recurrent network steers from inside: the learned estimator
-``kalman-net``.
+r"""The filter of LooselyCoupledNavigation inside the learned estimator ``kalman-net``, steered by a recurrent network.
 
-The augmented filter of the position with the rate errors beta and eta. At every measurement the network answers with
+The augmented filter of the position with the rate errors beta and eta. At every measurement the network outputs
 six numbers a in [-1, 1]:
 
     noise    the receiver's, the coloured and the white one, scaled by a1, a2, a3 as under control ``noise`` at its
-             whole reach
+             full range
     gain     K = diag(1, rate_range^a5, rate_range^a6) P' H^T / (H P' H^T + caution^a4 R)
     update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
 
-All zero is the augmented filter. Without a fix K is zero. References and reading stand in
+All zero is the augmented filter. Without a fix K is zero. References and reading are in
 ``maneuvering_target/kalman_net.py``.
 """
 
@@ -34,16 +33,16 @@ GAINS = ("caution", "drift_gain", "coloured_gain")
 
 
 class KalmanNetBank(NoiseBank):
-    """The augmented filter, whose noises and gain the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the augmented filter, whose noises and gain the action sets."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(
         -1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32
     )
-    reach: float = 1.0  # it learns through the filter, and does not explore
+    reach: float = 1.0  # trained through the filter, without exploration
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation of control ``noise``, and the estimated rate errors."""
+        """Observation blocks of control ``noise``, and the estimated rate errors."""
         p = self.parameters
         unit = 1.0 / math.hypot(p.drift, p.coloured)
         return (
@@ -65,22 +64,22 @@ class KalmanNetBank(NoiseBank):
         )
 
     def last_action(self) -> Block:
-        """Block of the action applied before."""
+        """Return the observation block of the previous action."""
         return Block("last_action", lambda f, _: f.action, "action applied before", (*NOISES, *GAINS))
 
     def start(self, initial: Initial) -> Augmented:
-        """Start where INS and reference agree, with the modelled prior of the rate errors."""
+        """Return the bank's state at the start of the track, with the modelled prior of the rate errors."""
         state = super().start(initial)
         return state._replace(action=self.xp.concat([state.action, state.action]))
 
     def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
-        """Predict as under control ``noise``, whose action is the first part of this one."""
+        """Return the state predicted with the noises of the last action's first part, as under control ``noise``."""
         predicted = super().predict(state._replace(action=state.action[: len(NOISES)]), measurement)
         return predicted._replace(action=state.action)
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
-        """Update by the gain that was answered."""
-        xp, innovation = self.xp, state.seen.innovation
+        """Return the state updated with the noises and the gain that the action sets."""
+        xp, innovation = self.xp, state.innovations.innovation
         a = xp.clip(action, -1.0, 1.0)
         P = self.predict_covariance(state, a[: len(NOISES)])
         R = self.receiver_variance(measurement, a)

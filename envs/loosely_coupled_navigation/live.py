@@ -1,4 +1,4 @@
-"""Positions by INS and receiver as they come, as measurements of LooselyCoupledNavigation."""
+"""Live measurements of LooselyCoupledNavigation: positions by INS and receiver, one at a time."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,21 +11,21 @@ from .world import Measurement
 
 
 class PositionInput(LiveInput):
-    """The position by the INS at every measurement, and a fix where there is one."""
+    """Converter of an INS position at every measurement, and of a fix where there is one, into measurements."""
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return the values in metres."""
+        """Return the names and descriptions of the values of a measurement, and of those at the start."""
         values = {name: COLUMNS[name].live_text for name in ("ins", "fix", "sigma")}
         return values, {"ins": "m, position by the INS at the start; default: the mean"}
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Start where INS and track are."""
-        initial, memory = super().start(time, {n: v for n, v in given.items() if n != "ins"})
-        ins = self.read({"ins": initial.mean, **given}, "ins", (self.parameters.axes,))
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Return the initial estimate, and a memory with the initial position of the INS."""
+        initial, memory = super().start(time, {n: v for n, v in initial_values.items() if n != "ins"})
+        ins = self.read({"ins": initial.mean, **initial_values}, "ins", (self.parameters.axes,))
         return initial, {**memory, "ins": ins}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Take increment and fix; a fix of some axes is none."""
+        """Return the measurement with INS increment and fix, and the memory; an incomplete fix is ignored."""
         p = self.parameters
         values = {
             **values,

@@ -1,7 +1,7 @@
-"""Positions by an INS and by a receiver as measurements of LooselyCoupledNavigation.
+"""Tables of positions by an INS and by a receiver, read as measurements of LooselyCoupledNavigation.
 
-The first row is the start of the track: there the position of the INS is taken for the true one, as the environment has
-it. Every further row is a measurement.
+The first row is the start of the track: there the position of the INS is taken for the true one, as in the environment.
+Every further row is a measurement.
 """
 
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy
 
-from ..contract.log_format import Column, LogFormat, Predicted, TrackLog, TrackStart
+from ..contract.log_format import Column, LogFormat, PredictedCoordinate, TrackLog, TrackStart
 from ..logs.plausibility import check_extents
 from ..logs.recorded_tables import Columns
 from .parameters import AXES, LooselyCoupledNavigationParameters
@@ -38,7 +38,9 @@ def measure(
     sigma: numpy.ndarray,
     p: Any,
 ) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a measurement, of n rows of a table or of n tracks; a fix of some axes is none.
+    """Return the arrays of a ``Measurement`` from n rows of a table or from n tracks, by name.
+
+    A fix without all axes counts as missing.
 
     Args:
         number: of the measurement, ``(n,)``.
@@ -62,17 +64,17 @@ def measure(
 def start_track(
     measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
 ) -> TrackStart:
-    """Start every episode where its INS was before the first increment."""
+    """Return the start of every episode, at the INS position before the first increment."""
     mean = measurements["ins"][:, 0] - measurements["increment"][:, 0]
     covariance = numpy.zeros((*mean.shape, mean.shape[-1]))
     return TrackStart(measurements, {"mean": mean, "covariance": covariance}, 0)
 
 
 def read_log(columns: Columns) -> TrackLog:
-    """Make measurements of one track.
+    """Return the measurements of one track from the columns of a table.
 
     Raises:
-        ValueError: for what lacks or cannot be.
+        ValueError: for missing or impossible values.
     """
     ends = [f"_{axis}" for axis in AXES if columns.has(f"ins_{axis}") or columns.has(f"fix_{axis}")]
     if columns.has("ins") or not ends:
@@ -89,7 +91,9 @@ def read_log(columns: Columns) -> TrackLog:
     if not numpy.isfinite(fix[1:]).all(axis=1).any():
         raise ValueError("no row has a fix on every axis")
     check_extents(("ins", "fix"), ins, fix)
-    given = {name: value for name, value in columns.given.items() if name not in ("axes", "horizon")}
+    given = {
+        name: value for name, value in columns.user_parameters.items() if name not in ("axes", "horizon")
+    }
     p = LooselyCoupledNavigationParameters(**{**parameters, **given})
     count = len(ins) - 1
     sigma = columns.sigmas("sigma")[1:, 0] if columns.has("sigma") else numpy.full(count, numpy.nan)
@@ -99,14 +103,14 @@ def read_log(columns: Columns) -> TrackLog:
         measurements,
         {"mean": ins[0], "covariance": numpy.zeros((len(ends), len(ends)))},
         numpy.arange(1, count + 1),
-        {n: v for n, v in parameters.items() if n not in columns.given},
+        {n: v for n, v in parameters.items() if n not in columns.user_parameters},
         float(columns.time[0]),
         columns.time[1:],
     )
 
 
 def predict_fix(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Fix that an estimate predicts by the increment of the INS, and the fix, m, ``(axes, N)`` each."""
+    """Return the position that an estimate and the INS increment predict, and the fix, m, ``(axes, N)`` each."""
     return mean + measurement.increment, numpy.where(measurement.available > 0.0, measurement.fix, numpy.nan)
 
 
@@ -115,7 +119,7 @@ LOG_FORMAT = LogFormat(
     read_log,
     start_track,
     predict=predict_fix,
-    predicted=tuple(Predicted(axis, "m", "position") for axis in AXES),
+    predicted=tuple(PredictedCoordinate(axis, "m", "position") for axis in AXES),
     longest_interval=5.0,
     decision_interval=1,
     regular_rows=lambda p: {"usual_sigma": p.receiver_variance**0.5},

@@ -1,4 +1,4 @@
-"""Every constant of LooselyCoupledNavigation, with its limits, and what follows from them."""
+"""Constants of LooselyCoupledNavigation with their limits, and derived constants."""
 
 import functools
 from dataclasses import dataclass
@@ -10,8 +10,9 @@ from ..contract.parameters import TaskParameters, check, field_limits, parameter
 AXES = ("x", "y", "z")
 
 MOST_RATIO = 1e15
-"""Of the variance that is gained from one measurement to the next and that of the receiver: a covariance after the
-update holds both. With 1e16 none came out indefinite, with 1e18 some."""
+"""Largest ratio of the variance gained between measurements to that of the receiver.
+
+A covariance after the update contains both. With 1e16 none was indefinite, with 1e18 some."""
 
 
 @dataclass(frozen=True)
@@ -25,15 +26,17 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     duration: float | None = parameter(None, above=0.0)
     """Length of the episode, s; where given it sets the horizon to the nearest number of measurements."""
     decision_interval: int = parameter(10, at_least=1)
-    """Measurements for which one action holds; ours: 0.1 s. What a single measurement owes to its gain is lost in the
-    noise: plain PPO found nothing in 200,000 decisions of one measurement. A gain that varies with every measurement
+    """Measurements for which one action holds; ours: 0.1 s. The effect of the gain at a single measurement is lost in
+    the
+    noise: PPO found no improvement in 200,000 decisions of one measurement. A gain that varies with every measurement
     needs 1."""
     sampling_interval: float = parameter(0.01, above=0.0, at_most=1e3)
-    """From one measurement to the next, s; ours: K times it stays below 0.05 for every tuning, so sampling
-    costs little. From 1e5 on the filter of the augmented state overflows."""
+    """Time between measurements, s; ours: K times it stays below 0.05 for every tuning, so sampling costs little. From
+    1e5
+    on the filter of the augmented state overflows."""
 
     reference_amplitude: float = parameter(2.0, at_least=0.0)
-    """Of the reference motion without manoeuvres, a sine, m; ours, as in Figs. 4 and 5."""
+    """Amplitude of the reference motion without manoeuvres, a sine, m; ours, as in Figs. 4 and 5."""
     reference_rate: float = parameter(0.8, at_least=0.0)
     """Angular rate of the reference motion without manoeuvres, rad/s; ours, as in Figs. 4 and 5."""
     manoeuvres: int = parameter(0, at_least=0, at_most=16)
@@ -44,15 +47,15 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     longer than the episode, to ten times it, beyond the bandwidth of every sensible gain."""
     manoeuvre_acceleration: tuple[float, float] = parameter((2.0, 10.0), at_least=0.0, ascending=True)
     """Interval of the peak acceleration of each, m/s^2, drawn uniformly, so that no axis accelerates more than
-    ``manoeuvres`` times the upper limit; ours: 4 g at most with four, an agile aircraft. Of weaker motion a filter that
-    models its acceleration would know more than INS and receiver say, and the problem would be another one."""
+    ``manoeuvres`` times the upper limit; ours: 4 g at most with four, an agile aircraft. With weaker motion a filter
+    could gain information from a model of the acceleration, and the problem would be another one."""
 
     drift: float = parameter(0.6, at_least=0.0)
-    """Modelled standard deviation of the constant rate error beta, m/s; ours: the INS leaves the picture."""
+    """Modelled standard deviation of the constant rate error beta, m/s; ours: the INS error grows large."""
     coloured: float = parameter(0.4, at_least=0.0)
     """Modelled stationary standard deviation of the coloured rate error eta, m/s; ours, as beta."""
     correlation_time: float = parameter(1.0, above=0.0)
-    """Of the coloured rate error, s; ours: between the sampling interval and the episode."""
+    """Correlation time of the coloured rate error, s; ours: between the sampling interval and the episode."""
     white_intensity: float = parameter(0.04, at_least=0.0)
     """Modelled intensity G of the white rate error, m^2/s; ours: a tenth of the reduced coloured one."""
     receiver_intensity: float = parameter(0.02, above=0.0)
@@ -74,38 +77,38 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     change_start: tuple[float, float] = parameter((0.5, 4.5), at_least=0.0, ascending=True)
     """Interval of the times of change, s; ours: both sides of a change are seen."""
     unreported: float = parameter(0.5, at_least=0.0, at_most=1.0)
-    """Probability that the receiver goes on reporting the former noise after a change."""
+    """Probability that the receiver reports the former noise after a change."""
 
     outage_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That the measurement fails once in the episode."""
+    """Probability that the receiver fails once in the episode."""
     outage_start: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
     """Interval of the start of the outage, s."""
     outage_duration: tuple[float, float] = parameter((1.5, 1.5), at_least=0.0, ascending=True)
-    """Interval of its length, s."""
+    """Interval of the outage's length, s."""
 
     jamming_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That the receiver noise rises once in the episode, unreported."""
+    """Probability that the receiver noise rises once in the episode, unreported."""
     jamming_start: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
     """Interval of the start of the jamming, s."""
     jamming_duration: tuple[float, float] = parameter((1.0, 1.0), at_least=0.0, ascending=True)
-    """Interval of its length, s."""
+    """Interval of the jamming's length, s."""
     jamming_factor: tuple[float, float] = parameter((100.0, 100.0), above=0.0, ascending=True)
     """Intensity under jamming over intensity without, drawn log-uniformly in this interval; ours: ten times the
     noise."""
 
     spoofing_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That the measurement is pulled off once in the episode."""
+    """Probability that the fix is pulled off once in the episode."""
     spoofing_start: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
     """Interval of the start of the spoofing, s."""
     spoofing_duration: tuple[float, float] = parameter((1.5, 1.5), at_least=0.0, ascending=True)
-    """Interval of its length, s; after it the measurement is true again."""
+    """Interval of the spoofing's length, s; after it the fix is true again."""
     spoofing_rate: tuple[float, float] = parameter((2.0, 2.0), ascending=True)
     """Interval of the rate at which every axis is pulled off, m/s; ours: twice the noise of a sample at the end."""
 
     outlier_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability that a measurement is an outlier, each one on its own, without a report."""
+    """Probability that a measurement is an outlier, independent of the others and not reported."""
     outlier_factor: float = parameter(100.0, above=0.0)
-    """Intensity of the noise of an outlier over that of the others; ours: ten times the noise."""
+    """Ratio of the noise intensity of an outlier to that of the others; ours: ten times the noise."""
 
     receiver_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Interval of the stationary standard deviation of the receiver's coloured error (first-order Gauss-Markov), beside
@@ -119,26 +122,28 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     spoofs it, and the INS is as modelled. Outages and reported changes of the noise have the law of other episodes."""
 
     averaging_measurements: float = parameter(25.0, above=0.0)
-    """Time constant of the averages of innovations shown, measurements; ours: 0.25 s, the time constant of the
-    reduced tuning."""
+    """Time constant of the observed averages of innovations, measurements; ours: 0.25 s, the time constant of the
+    reduced
+    tuning."""
     smallest_gain: float = parameter(1e-5, above=0.0, below=1.0)
-    """Lowest gain but zero that an action can set; ours: K = 0.001 1/s."""
+    """Smallest gain above zero that an action can set; ours: K = 0.001 1/s."""
 
     receiver_scale: float = parameter(100.0, above=1.0, at_most=1e6)
     """Largest factor of the variance of a measurement under control ``noise``; ours: that of the jamming."""
     receiver_reduction: float = parameter(10**0.5, above=1.0, at_most=1e6)
-    """Largest divisor of it; ours: the best receiver of ``random``. One that is trusted far more than it deserves for
-    a moment takes the filter with it."""
+    """Largest divisor of it; ours: the best receiver of ``random``. A measurement that is trusted far too much for a
+    moment
+    spoils the filter."""
     process_scale: float = parameter(10.0, above=1.0, at_most=1e6)
     """Largest factor and divisor of the coloured and the white rate error's intensities under control ``noise``;
     ours."""
     noise_reach: float = parameter(0.1, above=0.0, at_most=1.0)
-    """Share of the logarithms of these three that an action of one has. Ours: a policy that has just been made explores
-    with a standard deviation of about one, and at the whole reach that costs half as much again as doing nothing, so
-    that it learns to survive its own noise. Who explores less may ask for more."""
+    """Share of the logarithms of these three factors that an action of one applies. Ours: a new policy explores with a
+    standard deviation of about one, which at the full range costs half as much again as action zero, so that it learns
+    to survive its own noise. A policy that explores less may use more."""
 
     def __post_init__(self) -> None:
-        """Turn the duration into a horizon, and check every field."""
+        """Compute the horizon from the duration, and check every field."""
         if self.duration is not None:
             for name in ("duration", "sampling_interval"):
                 check(name, getattr(self, name), *field_limits(LooselyCoupledNavigationParameters)[name])
@@ -151,7 +156,7 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         super().__post_init__()
 
     def check(self) -> None:
-        """Check what concerns several fields together."""
+        """Raise ValueError for fields that contradict each other."""
         if not (self.coloured or self.white_intensity):
             raise ValueError(
                 "coloured and white_intensity must not both be 0: the plain scheme needs a noise"
@@ -177,7 +182,9 @@ class LooselyCoupledNavigationParameters(TaskParameters):
 
     @property
     def equivalent_intensities(self) -> tuple[float, float]:
-        """Ge of the two tunings, m^2/s: the white part, and with the coloured part reduced to white noise."""
+        """Equivalent white intensity Ge of the two tunings, m^2/s: white part alone, and with the coloured part reduced
+        to white.
+        """
         return (
             self.white_intensity,
             self.white_intensity + 2.0 * self.coloured**2 * self.correlation_time,
@@ -185,25 +192,25 @@ class LooselyCoupledNavigationParameters(TaskParameters):
 
     @property
     def plain_growth(self) -> tuple[float, float]:
-        """Variance that the error gains from one measurement to the next, by the two tunings, m^2."""
+        """Variance that the position error gains between measurements, for each of the two tunings, m^2."""
         white, reduced = self.equivalent_intensities
         return white * self.sampling_interval, reduced * self.sampling_interval
 
     @property
     def steady_state_gains(self) -> tuple[float, float]:
-        """Gains at which the plain scheme settles, by the two tunings."""
+        """Steady-state gains of the plain scheme for each of the two tunings."""
         white, reduced = (ins_gnss.steady_state_gain(q, self.receiver_variance) for q in self.plain_growth)
         return white, reduced
 
     @functools.cached_property
     def sampling(self) -> ins_gnss.Sampling:
-        """Exact sampling of the INS error."""
+        """Exact discretisation of the INS error."""
         return ins_gnss.sampling(self.correlation_time, self.sampling_interval)
 
     @functools.cached_property
     def variance_growth(self) -> tuple[float, float]:
-        """Variances that the modelled coloured rate error (m^2/s^2) and the displacement (m^2) gain from one
-        measurement to the next.
+        """Variances that the modelled coloured rate error (m^2/s^2) and the displacement (m^2) gain between
+        measurements.
         """
         return (
             (self.coloured * self.sampling.coloured) ** 2,
@@ -211,6 +218,6 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         )
 
     def prior_covariance(self, none: Array) -> ins_gnss.AugmentedCovariance:
-        """Return the covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
+        """Return the initial covariance of position and rate errors from zeros ``none``, ``(N,)``."""
         drift, coloured = none + self.drift**2, none + self.coloured**2
         return ins_gnss.AugmentedCovariance(none, none, none, drift, none, coloured)

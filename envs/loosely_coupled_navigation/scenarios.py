@@ -1,9 +1,9 @@
 """Scenarios of loosely coupled navigation. Measurement k is taken at k times 0.01 s.
 
-The motion is drawn anew for every episode, but for ``paper``, whose sine is the one that is printed.
+Every episode has a random motion, except in ``paper``, which has the sine of the paper.
 
-When something befalls the receiver is drawn for each episode, so that it cannot be learned by heart: the window
-"during" holds the measurements that are surely in it, "after" those surely past it.
+The times of disturbances are drawn for each episode, so that a policy cannot memorise them: the window "during"
+contains the measurements that certainly lie in the disturbance, "after" those certainly past it.
 """
 
 from collections.abc import Mapping
@@ -11,15 +11,15 @@ from collections.abc import Mapping
 from ..contract.task import Scenario
 
 DECADE = (10**-0.5, 10**0.5)
-"""A decade around the modelled value."""
+"""Limits of a factor: a decade around the modelled value."""
 DOWN_TO_QUIET = (0.05, 10**0.5)
-"""The same, and on to half of the least drift of ``quiet``."""
+"""Limits of a factor: a decade, extended down to half of the smallest drift of ``quiet``."""
 DOWN_TO_SILENT = (0.005, 10**0.5)
-"""The same for its intensities."""
+"""Limits of a factor: a decade, extended down to half of the smallest intensities of ``quiet``."""
 
 _LATE = {"late": (250, 500)}
 _DRAWN = {"manoeuvres": 4}
-"""A motion of the episode's own."""
+"""Parameters of a random motion."""
 
 SCENARIOS: Mapping[str, Scenario] = {
     scenario.name: scenario

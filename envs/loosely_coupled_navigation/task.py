@@ -28,57 +28,57 @@ from .world import InsGnssWorld
 
 
 class LooselyCoupledNavigation(Task):
-    """An inertial system drifts away, a noisy satellite receiver holds it back, one gain decides how much.
+    """Loosely coupled INS/GNSS navigation: steer the gain that weights a drifting INS against a noisy receiver.
 
     ### Description
 
     The inertial navigation system (INS) gives smooth increments of position whose rate error is a random
     constant, a coloured and a white noise; its error grows without limit. The satellite receiver (GNSS)
-    measures the position with strong white noise and no memory. The Kalman-Bucy filter of the paper lets the
-    increments drive the estimate and pulls it to the measurement by a gain. A high gain follows the receiver
-    noise, a low one follows the drift, and which is better depends on noise levels that no one announces.
+    measures the position with strong white noise and no memory. The Kalman-Bucy filter of the paper adds the
+    increments to the estimate and corrects it towards the measurement by a gain. A high gain follows the receiver
+    noise, a low one follows the drift, and the better one depends on unknown noise levels.
 
     With ``control="noise"`` (default) the augmented filter, which also estimates the rate errors, computes its
     gain from noises that the action scales. With ``gain`` the action sets the gain of the plain scheme itself.
     Both act on the estimate and so on all later ones. With ``mode`` and ``weights`` a bank of three filters runs
     beside the agent without mixing: the plain scheme tuned to the white noise, the plain scheme with the
     coloured noise reduced to white, both with the gain (4) of the Riccati equation, and the augmented filter.
-    The action then chooses only what is reported *now*: the problem is myopic, a discount factor of zero
+    The action then selects only the reported estimate *now*: the problem is myopic, a discount factor of zero
     suffices.
 
     Axes are independent: one gain for each, one set of noises or weights for all.
 
     ### Action Space
 
-    What each control means stands in ``Actions``. Values outside the box are taken at its edge. An action holds for
+    ``Actions`` describes each control. Values outside the box are clipped to it. An action holds for
     ``decision_interval`` measurements, ten by default.
 
-    Without a measurement the gain is zero, whatever the action; under ``noise`` the covariance still grows by
-    the rate errors' noises that the action states.
+    Without a measurement the gain is zero, for any action; under ``noise`` the covariance still grows by
+    the rate errors' noises that the action sets.
 
     ### Observation Space
 
     A flat ``Box``; for each filter (three under mode and weights, one otherwise) and axis, in this order:
     innovation over its standard deviation; innovation over the receiver's *reported* noise; short averages of
-    the normalised innovation, of its square and of its product with the one before. All are shown as signed
+    the normalised innovation, of its square and of its product with the previous one. All are observed as signed
     logarithms ``sign(x) log(1 + |x|)``. Then the logarithm of the reported over the nominal noise (the report may
-    be wrong), whether there is a measurement, the last action (under mode and weights: the weights in force), and
+    be wrong), whether there is a measurement, the last action (under mode and weights: the last weights), and
     the time t as ``t / (t + tau)``; under noise also the logarithm of the predicted standard deviation of the
-    position. A filter without a measurement has the innovation zero, and its averages stand still. What is
-    predicted under noise, for these as well, is predicted with the noises of the last action.
+    position. A filter without a measurement has the innovation zero, and its averages do not change. Under noise,
+    predictions use the noises of the last action.
 
-    The increments of the INS are not shown: in ``paper`` the reference motion is always the same, so an agent that
-    knows it by heart could read the rate errors off them. All that is shown depends on the errors alone, so that an
-    agent does the same whatever the motion. An estimator sees the increments; in every scenario but ``paper`` the
-    motion is drawn anew for every episode, and one that answers from the clock alone costs far more than the paper's
-    filter.
+    The observation does not contain the increments of the INS: in ``paper`` the reference motion is always the same, so
+    an agent that memorised it could compute the rate errors from them. The observation depends on the errors alone, so
+    that an agent acts independently of the motion. An estimator receives the increments; in every scenario but
+    ``paper`` the motion is drawn anew for every episode, and an estimator that uses only the time costs far more than
+    the paper's filter.
 
     ### Rewards
 
     By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the squared error of position, summed over the axes,
     over the nominal variance of a measurement (``N / sampling_interval``), in units of 0.02, its median under the
-    action zero, and x0 that of the action zero on the same noise. Outages and jamming dominate the mean of x,
-    whatever a filter does. "cost" is ``-30 log(1 + x / 30)`` in units of 0.16, the mean cost of the paper's plain scheme.
+    action zero, and x0 that of the action zero on the same noise. Outages and jamming dominate the mean of x
+    for any filter. "cost" is ``-30 log(1 + x / 30)`` in units of 0.16, the mean cost of the paper's plain scheme.
 
     ### Starting State
 
@@ -128,7 +128,7 @@ class LooselyCoupledNavigation(Task):
         ),
         Actions(
             {
-                "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "
+                "noise": "assumed variances of the augmented filter's noises over the modelled ones: "
                 "`receiver_scale` to the power of r times a positive, `receiver_reduction` to that of a negative action for the "
                 "receiver, `process_scale` for the coloured and the white rate error, r = 0.1 (`noise_reach`); **0 is the paper's "
                 "augmented filter**",
@@ -139,7 +139,7 @@ class LooselyCoupledNavigation(Task):
                 "that all noises are as modelled (1.05), probability of the receiver's highest level (1.5); variance of the fix "
                 "(1.25), process noise of the INS and of the receiver's coloured error (2 each); **0 is the estimator "
                 "`fault-bank`**",
-                "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
+                "mode": "the selected filter: plain-white, plain-reduced, augmented",
                 "weights": "weights of the three estimates, normalised; all zero is uniform",
             },
             {
@@ -164,7 +164,7 @@ class LooselyCoupledNavigation(Task):
     parameters: LooselyCoupledNavigationParameters
 
     def set_up(self) -> None:
-        """Name the axes, and find the action of the settled gain."""
+        """Name the components of the axes, and compute the action of the paper's steady-state gain."""
         p = self.parameters
         names = ("position",) if p.axes == 1 else tuple(f"position_{axis}" for axis in AXES[: p.axes])
         group = "position" if p.axes > 1 else ""

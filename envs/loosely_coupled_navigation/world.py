@@ -1,4 +1,4 @@
-"""The motion of LooselyCoupledNavigation, its INS, and the receiver; equations in ``filters/loosely_coupled.py``."""
+"""World of LooselyCoupledNavigation: motion, INS and receiver; equations in ``filters/loosely_coupled.py``."""
 
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -7,7 +7,7 @@ import numpy
 
 from ...filters.ordered_sums import ordered_sum
 from ..contract.draws import Draws
-from ..contract.faults import Disturbances, undisturbed
+from ..contract.faults import Disturbances, draw_undisturbed
 from ..contract.filter import Initial
 from ..contract.observation import Array
 from ..contract.task import Task
@@ -17,18 +17,18 @@ from .parameters import LooselyCoupledNavigationParameters
 
 
 class Truth(NamedTuple):
-    """The motion, the errors of the INS, and what befalls the receiver; A axes."""
+    """The true motion, the errors of the INS, and the disturbances of the receiver; A axes."""
 
     number: Array
-    """Measurements so far, ``(N,)``."""
+    """Number of measurements so far, ``(N,)``."""
     reference: Array
     """Position Xr, m, ``(A, N)``."""
     harmonics: Array
-    """Motions that it is the sum of, m, and the same a quarter of a period ahead, ``(2, M, A, N)``."""
+    """Harmonics whose sum is the motion, m, and the same a quarter of a period ahead, ``(2, M, A, N)``."""
     turn: Array
-    """Sine and cosine of what their phases gain from one measurement to the next, ``(2, M, A, N)``."""
+    """Sine and cosine of the phase that they gain between measurements, ``(2, M, A, N)``."""
     ins: Array
-    """Position X that the INS has come to, m, ``(A, N)``."""
+    """Position X by the INS alone, m, ``(A, N)``."""
     drift: Array
     """Constant rate error beta, m/s, ``(A, N)``."""
     coloured: Array
@@ -36,38 +36,40 @@ class Truth(NamedTuple):
     drift_deviation: Array
     """True standard deviation of beta, m/s, ``(N,)``."""
     coloured_step: Array
-    """Standard deviation of what eta gains from one measurement to the next, m/s, ``(N,)``."""
+    """Standard deviation of the gain of eta between measurements, m/s, ``(N,)``."""
     white_step: Array
     """Standard deviation of the displacement that this gain does not explain, m, ``(N,)``."""
     deviation: Array
-    """True standard deviation of this measurement, m, ``(N,)``."""
+    """True standard deviation of this fix, m, ``(N,)``."""
     available: Array
-    """One where the receiver has a measurement, otherwise zero, ``(N,)``."""
+    """One where the receiver has a fix, otherwise zero, ``(N,)``."""
     disturbances: dict[str, Any]
-    """State of each by its name, see :mod:`.disturbances`."""
+    """State of each disturbance by its name, see :mod:`.disturbances`."""
 
 
 class Measurement(NamedTuple):
     """Readings of INS and receiver; A axes."""
 
     number: Array
-    """Number of the measurement, from 1 on, ``(N,)``; it is taken ``sampling_interval`` seconds after the one
-    before, the first one that long after the start of the track."""
+    """Number of the measurement, from 1 on, ``(N,)``. Measurements are ``sampling_interval`` seconds apart, the first
+    one
+    that long after the start of the track."""
     ins: Array
     """Position X by the INS alone, m, ``(A, N)``; at the start of the track it is the reference."""
     increment: Array
-    """X minus X at the measurement before, m, ``(A, N)``."""
+    """Change of X since the previous measurement, m, ``(A, N)``."""
     fix: Array
-    """Position Z by the receiver, m, zero where there is none, where an estimator gets NaN, ``(A, N)``."""
+    """Position Z by the receiver, m, ``(A, N)``; where there is none zero, and NaN for an estimator."""
     available: Array
-    """One where the receiver has a fix, otherwise zero, ``(N,)``; the INS always speaks."""
+    """One where the receiver has a fix, otherwise zero, ``(N,)``; the INS always has a position."""
     reported_deviation: Array
-    """Standard deviation of each axis of the fix as the receiver reports it, m, ``(N,)``; it may be wrong, and it
-    goes on where there is no fix."""
+    """Standard deviation of each axis of the fix as the receiver reports it, m, ``(N,)``; it may be wrong. It is
+    reported
+    without a fix, too."""
 
 
 class InsGnssWorld(World[Task, Truth, Measurement]):
-    """A motion of harmonics, an inertial system with three rate errors, and a satellite receiver."""
+    """World of harmonic motion, an inertial system with three rate errors, and a satellite receiver."""
 
     own_parameters: ClassVar[tuple[str, ...]] = ("duration",)
     parameters: LooselyCoupledNavigationParameters
@@ -85,13 +87,15 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         self.no_covariance: Array = task.constant(numpy.zeros((axes, axes)))[:, :, None]
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Return the deviation that the receiver reports."""
+        """Return the reported standard deviation of the fix, m, ``(A, N)``."""
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Draw noise levels, disturbances and rate errors; at the start INS and reference agree."""
+        """Return the drawn truth (noise levels, disturbances, rate errors) and the initial estimate, equal in
+        position.
+        """
         xp, p = self.xp, self.parameters
-        calm = undisturbed(draws, p)
+        calm = draw_undisturbed(draws, p)
 
         def factor(name: str, limits: tuple[float, float]) -> Array:
             drawn = draws.log_uniform(name, limits)
@@ -105,7 +109,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         states = self.disturbances.begin(draws, normals[2 * p.axes :], zeros[0])
         harmonics, turn = self._motion(draws, zeros)
         reference = ordered_sum(harmonics[0])
-        states = self.disturbances.quiet(self.disturbances.complete(states, draws), calm)
+        states = self.disturbances.switch_off(self.disturbances.complete(states, draws), calm)
         truth = Truth(
             number=zeros[0],
             reference=reference,
@@ -126,7 +130,9 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return truth, Initial(reference, self.no_covariance + zeros[0])
 
     def _motion(self, draws: Draws, zeros: Array) -> tuple[Array, Array]:
-        """Return the harmonics at the start, m, and how they turn; each ``(2, M, A, N)``."""
+        """Return the initial harmonics of the motion, m, and the sines and cosines of their step, ``(2, M, A, N)``
+        each.
+        """
         xp, p = self.xp, self.parameters
         count, many = max(p.manoeuvres, 1), zeros[None] + xp.zeros((max(p.manoeuvres, 1), 1, 1))
         if p.manoeuvres:
@@ -148,8 +154,9 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         )
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver's white, that of
-        disturbances.
+        """Return the truth after one sampling interval, and the readings of INS and receiver.
+
+        The rows of ``noise`` are: coloured, white, the receiver's white, and those of the disturbances.
         """
         xp, p, s, n = self.xp, self.parameters, self.parameters.sampling, self.parameters.axes
         number = truth.number + 1.0
@@ -163,7 +170,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         ins = truth.ins + increment
 
         further = noise[3 * n : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(number, p.sampling_interval, *further, feedback)
+        steps = self.disturbances.split_noise(number, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         deviation = self.disturbances.change_deviations(states, xp.ones_like(number))
         reading = reference + deviation * noise[2 * n : 3 * n]
@@ -183,23 +190,25 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return truth, measurement
 
     def state(self, truth: Truth) -> Array:
-        """Return the position, ``(A, N)``."""
+        """Return the true position of the vehicle, m, ``(A, N)``."""
         return truth.reference
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """Return the position of the receiver."""
+        """Return the fix of the receiver, m, ``(A, N)``; NaN where there is none."""
         return self.mask_missing(measurement).fix
 
     def component_deviations(self, measurement: Measurement) -> Array:
-        """Return the deviation that the receiver reports."""
+        """Return the reported standard deviation of the fix, m, ``(A, N)``."""
         return measurement.reported_deviation + 0.0 * measurement.fix
 
     def error_cost(self, error: Array) -> Array:
-        """Return the squared error of position, summed over the axes, over the nominal variance of a measurement."""
+        """Return the squared position error, summed over the axes, over the nominal variance of a fix, ``(N,)``."""
         return ordered_sum(error * error) / self.parameters.receiver_variance
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return whether there is a measurement, its noise, and the reported noise."""
+        """Return the values to record at a measurement, by name: whether there is a fix, its true and reported
+        noise.
+        """
         return {
             "available": truth.available,
             "receiver_deviation": truth.deviation,
@@ -207,8 +216,9 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the noise levels of INS and receiver, their changes and disturbances as numbers of measurements
-        (the first in a window and the first one after it), and what the receiver is like now.
+        """Return the context by name: noise levels, disturbances and the receiver's current state.
+
+        Times are numbers of measurements: the first in a window and the first one after it.
         """
         return {
             "drift_deviation": truth.drift_deviation,

@@ -1,4 +1,4 @@
-"""ManeuveringTarget: everything of one environment; ``task.py`` names it all."""
+"""The environment ManeuveringTarget; ``task.py`` declares its parts."""
 
 ID = "filtergym/ManeuveringTarget-v0"
-"""Known before anything else is imported."""
+"""Gymnasium id, readable without importing the task."""

@@ -1,8 +1,8 @@
-"""The filters of ManeuveringTarget that are steered: one alpha-beta filter, or a bank of them.
+"""Filters of ManeuveringTarget that an action steers: one alpha-beta filter, or a bank of them.
 
-Equations and their numbers stand in ``filters/alpha_beta.py`` and ``filters/imm.py``. A scan that missed the target is
-prediction only, whatever the action: means and covariances stay as predicted, the weights become the predicted mode
-probabilities (13), averages and gains hold.
+The equations are in ``filters/alpha_beta.py`` and ``filters/imm.py``. In a scan that missed the target there is only a
+prediction, whatever the action: means and covariances remain as predicted, the weights become the predicted mode
+probabilities (13), averages and gains do not change.
 """
 
 import math
@@ -18,8 +18,8 @@ from ...filters.ordered_sums import weighted_sum
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
-    KEPT_AS_LOG,
     SHARE,
+    STORED_AS_LOG,
     Array,
     Block,
     Quantity,
@@ -37,79 +37,80 @@ from .problem import TargetProblem
 from .world import Measurement
 
 SCANS_SHOWN = 20
-"""The clock in the observation saturates here: a filter has settled after about ten scans."""
+"""Number of scans at which the observed time saturates: a filter has settled after about ten scans."""
 PERIODS_SHOWN = (0.01, 100.0)
-"""Limits of the time since the last measurement, scan periods."""
+"""Limits of the observed time since the last measurement, scan periods."""
 
 LARGEST_SHARE = 1e8
-"""Of what an acceleration leaves over the covariance that the gains give."""
+"""Largest covariance due to an unmodelled acceleration, over that which follows from the gains."""
 
 
 LEAST_INTERVAL = 0.1
-"""Of the sampling interval: beta over the time is what turns position noise into speed, ten times too large here."""
+"""Smallest interval between measurements, as a share of the sampling interval, for which the gains are valid.
+
+The speed is beta over the interval times the position noise, which is ten times too large here."""
 SHORTEST = 0.05
-"""Of the sampling interval: measurements that are closer are taken for so far apart, where beta is divided by the time.
-No simulated scans are closer."""
+"""Smallest interval by which beta is divided, as a share of the sampling interval; simulated scans are never closer."""
 
 
 class AlphaBeta(NamedTuple):
-    """One alpha-beta filter with the covariance that belongs to the gains it used."""
+    """State of one alpha-beta filter, with the covariance that follows from the gains used."""
 
     mean: Array
-    """x, y (m), vx, vy (m/s) estimated, ``(4, N)``."""
+    """Estimate of x, y (m), vx, vy (m/s), ``(4, N)``."""
     predicted: Array
     """Position predicted to the measurement, m, ``(2, N)``."""
     covariance: alpha_beta.Covariance
-    """Of each coordinate, ``(2, N)`` each; x and y are uncorrelated."""
+    """Covariance of position and velocity for each coordinate, ``(2, N)`` each; x and y are uncorrelated."""
     innovation: Array
-    """m, ``(2, N)``."""
+    """Innovation, m, ``(2, N)``."""
     innovation_variance: Array
-    """m^2, ``(2, N)``."""
+    """Variance of the innovation, m^2, ``(2, N)``."""
     average_excess: Array
-    """Exponential average of what the squared innovations have beyond their variance, m^2, ``(2, N)``."""
+    """Exponential average of the squared innovations minus their variance, m^2, ``(2, N)``."""
     average_innovation: Array
     """Exponential average of the normalised innovations, ``(2, N)``."""
     log_squared: Array
     """log(1 + normalised innovation squared), ``(N,)``."""
     average_log_squared: Array
-    """Its exponential average, ``(N,)``."""
+    """Exponential average of ``log_squared``, ``(N,)``."""
     alpha: Array
-    """Gain used last, ``(N,)``."""
+    """Position gain of the last update, ``(N,)``."""
     grown: Array = None
-    """s for which the innovation of the last update had grown, ``(N,)``; None where that is the scan period."""
+    """Time over which the innovation of the last update had grown, s, ``(N,)``; None if that is the scan period."""
     since: Array = None
-    """s since that update, ``(N,)``; None for zero."""
+    """Time since that update, s, ``(N,)``; None for zero."""
 
 
 class Filters(NamedTuple):
-    """M alpha-beta filters of fixed gains, mixed on their weights before every prediction."""
+    """State of M alpha-beta filters with fixed gains, which are mixed before every prediction (IMM)."""
 
     mean: Array
-    """x, y, vx, vy of each filter, ``(4, M, N)``."""
+    """Estimates of x, y (m), vx, vy (m/s) by each filter, ``(4, M, N)``."""
     covariance: Array
-    """``(4, 4, M, N)``."""
+    """Covariance of each filter, ``(4, 4, M, N)``."""
     probabilities: Array
-    """Weights in force, ``(M, N)``."""
+    """Weights of the filters, ``(M, N)``."""
     log_predicted: Array
     """Logarithm of the predicted mode probabilities (13), ``(M, N)``."""
     innovation: Array
-    """m, ``(2, M, N)``."""
+    """Innovation of each filter, m, ``(2, M, N)``."""
     innovation_covariance: Array
-    """m^2, ``(2, 2, M, N)``."""
+    """Innovation covariance of each filter, m^2, ``(2, 2, M, N)``."""
     log_likelihood: Array
-    """Logarithm of (11), ``(M, N)``."""
+    """Log-likelihood of each filter, equation (11), ``(M, N)``."""
     average_innovation: Array
-    """``(2, M, N)``."""
+    """Exponential average of the normalised innovations, ``(2, M, N)``."""
     log_squared: Array
-    """``(M, N)``."""
+    """log(1 + normalised innovation squared) of each filter, ``(M, N)``."""
     average_log_squared: Array
-    """``(M, N)``."""
+    """Exponential average of ``log_squared``, ``(M, N)``."""
     alpha: Array
-    """Position gains used last, ``(M, N)``."""
+    """Position gains of the last update, ``(M, N)``."""
 
 
 class RadarBank(Bank[TargetProblem, Measurement, Any]):
-    """Common base of both banks: the averages in the observation, and its end."""
+    """Base class of the banks: averages, intervals, and the observation blocks of the measurement."""
 
     parameters: ManeuveringTargetParameters
 
@@ -121,16 +122,17 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         self.average: str = f"exponential average over {self.parameters.averaging_measurements:g} scans"
 
     def exponential_average(self, measurement: Measurement, old: Array, new: Array) -> Array:
-        """Return the exponential average with a new value taken in, if there is one."""
+        """Return the exponential average updated with a new value, where the scan saw the target."""
         return self.where_detected(measurement, self.forgetting * old + (1.0 - self.forgetting) * new, old)
 
     def interval(self, measurement: Measurement) -> float | Array:
-        """Return the seconds since the scan before."""
+        """Return the time since the previous scan, s; one number where scans are regular."""
         return self.T if self.regular else measurement.interval
 
     def time_since_last(self, measurement: Measurement) -> float | Array:
-        """Return the seconds since the last measurement, no fewer than :data:`SHORTEST`; a late one comes after
-        negative ones.
+        """Return the time since the last scan that saw the target, s, its magnitude at least :data:`SHORTEST`.
+
+        It is negative for a delayed measurement.
         """
         if self.regular:
             return self.T
@@ -138,7 +140,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         return self.xp.where(self.xp.abs(measurement.elapsed) < least, least, measurement.elapsed)
 
     def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """Return one of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
+        """Return ``then`` where the scan saw the target and ``otherwise`` elsewhere: arrays, or tuples of them."""
         if self.regular or then is otherwise:
             return then
         if isinstance(then, tuple):
@@ -147,7 +149,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
         return self.xp.where(measurement.available > 0.0, then, otherwise)
 
     def surroundings(self) -> tuple[Block, ...]:
-        """Return the blocks of the measurement itself."""
+        """Return the observation blocks of the measurement: its variance, detection and times."""
         xp, unit = self.xp, self.parameters.range_sigma**2
 
         def log_elapsed(state: Any, measurement: Measurement) -> Array:
@@ -161,7 +163,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
                 lambda state, measurement: 0.5 * xp.log(measurement.variance / unit),
                 "the measurement's sigma over range_sigma",
                 "xy",
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
             Block(
                 "scan",
@@ -176,20 +178,20 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
                 "the time since the last measurement over sampling_interval, within {:g} and {:g}".format(
                     *PERIODS_SHOWN
                 ),
-                compression=KEPT_AS_LOG,
+                compression=STORED_AS_LOG,
             ),
         )
 
 
 class GainBank(RadarBank):
-    """Control ``gain``: one filter, whose position gain the action sets."""
+    """Bank of the control ``gain``: one alpha-beta filter, whose position gain the action sets."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
     least_interval = LEAST_INTERVAL
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Innovations, their averages, gain, and clock."""
+        """Observation blocks: innovations, their averages, the gain, and the time."""
         xp = self.xp
         return (
             innovation_block("xy", value=lambda f, _: f.innovation / xp.sqrt(f.innovation_variance)),
@@ -211,7 +213,7 @@ class GainBank(RadarBank):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """The innovation as it is."""
+        """Innovation in m, computed from the observation."""
         sigma = self.parameters.range_sigma
         return (
             Quantity(
@@ -229,7 +231,7 @@ class GainBank(RadarBank):
         )
 
     def start(self, initial: Initial) -> AlphaBeta:
-        """Start from the track's start, equation (24)."""
+        """Return the bank's state at the start of the track, equation (24)."""
         xp, P = self.xp, initial.covariance
         variance, velocity_variance = xp.stack([P[0, 0], P[1, 1]]), xp.stack([P[2, 2], P[3, 3]])
         zero = 0.0 * variance
@@ -250,7 +252,7 @@ class GainBank(RadarBank):
         )
 
     def predict(self, state: AlphaBeta, measurement: Measurement) -> AlphaBeta:
-        """Predict to the scan."""
+        """Return the filter's state predicted to the scan, with innovation statistics."""
         xp, f, interval = self.xp, state, self.interval(measurement)
         predicted = alpha_beta.predict(f.mean[:2], f.mean[2:], interval)
         covariance = alpha_beta.predict_covariance(f.covariance, interval)
@@ -273,17 +275,17 @@ class GainBank(RadarBank):
         )
 
     def alpha(self, action: Array) -> Array:
-        """Return the position gain that an action sets, linear over ``alpha_range``, ``(N,)``."""
+        """Return the position gain that an action in [-1, 1] sets, linear over ``alpha_range``, ``(N,)``."""
         low, high = self.parameters.alpha_range
         return 0.5 * (low + high) + (0.5 * (high - low)) * self.xp.clip(action[0], -1.0, 1.0)
 
     def action_for_alpha(self, alpha: Any) -> Any:
-        """Return the action that sets a position gain; the gain must lie within ``alpha_range``."""
+        """Return the action that sets a position gain within ``alpha_range``."""
         low, high = self.parameters.alpha_range
         return (alpha - 0.5 * (low + high)) / (0.5 * (high - low))
 
     def act(self, state: AlphaBeta, measurement: Measurement, action: Array) -> AlphaBeta:
-        """Update with the gain of the action and the beta that belongs to it."""
+        """Return the state updated with the position gain of the action and the velocity gain beta that follows."""
         xp, f, alpha, elapsed = self.xp, state, self.alpha(action), self.time_since_last(measurement)
         beta = alpha_beta.benedict_bordner_beta(alpha)
         updated = alpha_beta.update(f.predicted, f.mean[2:], f.innovation, alpha, beta, elapsed)
@@ -296,9 +298,11 @@ class GainBank(RadarBank):
         return self.where_detected(measurement, after, missed)
 
     def covariance(self, state: AlphaBeta) -> Array:
-        """Return the covariance that belongs to the gains used, and what an acceleration since the measurement
-        before the last would leave of which these know nothing: one as large as usual, and as the last
-        innovations say.
+        """Return the covariance by the gains used plus the effect of an unmodelled acceleration, ``(4, 4, N)``.
+
+        The acceleration is the usual one, or the one that the last innovations indicate, since the measurement
+        before the
+        last.
         """
         xp, f = self.xp, state
         T, since = (self.T, 0.0) if self.regular else (f.grown, f.since)
@@ -308,7 +312,7 @@ class GainBank(RadarBank):
         # Of one direction; beyond this the sum would be singular to rounding.
         largest = LARGEST_SHARE * xp.minimum(f.covariance.position, T**2 * f.covariance.velocity)
         extra_variance = xp.minimum(extra_variance, largest / (1.0 + since / T) ** 4)
-        P = alpha_beta.left_by_acceleration(f.covariance, extra_variance, f.alpha, beta, T, since)
+        P = alpha_beta.add_acceleration_error(f.covariance, extra_variance, f.alpha, beta, T, since)
         zero = 0.0 * P.cross[0]
         entries = ((P.position, P.cross), (P.cross, P.velocity))
         return xp.stack(
@@ -319,9 +323,7 @@ class GainBank(RadarBank):
         )
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
-        """Return the normalised innovation squared and log-density of the measurement as predicted (NaN where there
-        is none), and the gain.
-        """
+        """Return the values to record at a scan, by name: NIS, log-likelihood (NaN without a measurement), gain."""
         nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
         density = -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi)
         return {
@@ -333,7 +335,7 @@ class GainBank(RadarBank):
 
 
 class FilterBank(RadarBank):
-    """Controls ``mode``, ``weights`` and ``evidence``: filters of fixed gains that mix on their weights."""
+    """Bank of the controls ``mode``, ``weights`` and ``evidence``: fixed-gain filters that are mixed by weights."""
 
     least_interval = LEAST_INTERVAL
 
@@ -347,12 +349,12 @@ class FilterBank(RadarBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """One hypothesis, or a number for each."""
+        """Gymnasium space of the selected hypothesis, or of a number for each."""
         return bank_action_space(self.control, self.count)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """The same for each filter, likelihoods, probabilities, and clock."""
+        """Observation blocks: those of each filter, likelihoods, probabilities, and the time."""
         xp = self.xp
         each = tuple(str(j + 1) for j in range(self.count))
 
@@ -384,7 +386,7 @@ class FilterBank(RadarBank):
         )
 
     def start(self, initial: Initial) -> Filters:
-        """Start all filters from the track's start, equation (24)."""
+        """Return the bank's state at the start of the track, equation (24)."""
         xp, m = self.xp, self.count
         zeros = xp.stack([0.0 * initial.mean[:2]] * m, axis=1)
         probabilities = self.task.constant(self.parameters.initial_probabilities)[:, None] + zeros[0]
@@ -403,7 +405,7 @@ class FilterBank(RadarBank):
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Mix, predict to the scan, and ask how likely the measurement is."""
+        """Return the filters mixed, predicted to the scan, with the likelihood of the measurement in each."""
         xp, bank, interval = self.xp, state, self.interval(measurement)
         prediction = imm.predict_mode_probabilities(self.transition, bank.probabilities)
         mean, covariance = imm.mix(bank.mean, bank.covariance, prediction.mixing)
@@ -433,7 +435,7 @@ class FilterBank(RadarBank):
         )
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Update every filter and put the weights of the action in force."""
+        """Return the filters updated with their fixed gains, and the weights that follow from the action."""
         probabilities = bank_probabilities(
             self.control,
             action,
@@ -446,7 +448,7 @@ class FilterBank(RadarBank):
         return self._in_force(state, measurement, after._replace(probabilities=probabilities))
 
     def _update_filters(self, state: Filters, measurement: Measurement, alpha: Array, beta: Array) -> Filters:
-        """Update every filter by its gains."""
+        """Return the filters updated with position gains alpha and velocity gains beta."""
         elapsed = self.time_since_last(measurement)
         updated = alpha_beta.update(state.mean[:2], state.mean[2:], state.innovation, alpha, beta, elapsed)
         covariance = alpha_beta.update_joint_covariance(
@@ -455,8 +457,8 @@ class FilterBank(RadarBank):
         return state._replace(mean=self.xp.concat(updated), covariance=covariance)
 
     def _in_force(self, state: Filters, measurement: Measurement, after: Filters) -> Filters:
-        """Return the filters after an update, or where the scan missed the target as predicted, with the
-        probabilities (13).
+        """Return the updated filters, or the predicted ones with probabilities (13) where the scan missed the
+        target.
         """
         if self.regular:
             return after
@@ -464,17 +466,15 @@ class FilterBank(RadarBank):
         return self.where_detected(measurement, after, state._replace(probabilities=predicted))
 
     def mean(self, state: Filters) -> Array:
-        """Return the combination of the filters (15), ``(4, N)``."""
+        """Return the combined mean of the filters, equation (15), ``(4, N)``."""
         return weighted_sum(state.probabilities, state.mean)
 
     def covariance(self, state: Filters) -> Array:
-        """Return the covariance of the combination (16)."""
+        """Return the covariance of the combined mean, equation (16), ``(4, 4, N)``."""
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the NIS of the combined prediction, log-density of the measurement as the filters predict it (NaN
-        where there is none), and the weights.
-        """
+        """Return the values to record at a scan, by name: NIS, log-likelihood (NaN without a measurement), weights."""
         predicted = self.xp.exp(state.log_predicted)
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
         density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
@@ -487,7 +487,7 @@ class FilterBank(RadarBank):
 
 
 class GainsBank(FilterBank):
-    """Control ``gains``: the paper's IMM, whose filters have the gains that the action asks for."""
+    """Bank of the control ``gains``: the paper's IMM, with position gains that the action sets."""
 
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
@@ -495,12 +495,12 @@ class GainsBank(FilterBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """A number for each filter."""
+        """Gymnasium box with one number for each filter, which moves its position gain."""
         return gymnasium.spaces.Box(-1.0, 1.0, (self.count,), numpy.float32)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation of every bank, and the gains."""
+        """Observation blocks of every bank, and the gains."""
         each = tuple(str(j + 1) for j in range(self.count))
         return (
             *super().blocks,
@@ -508,7 +508,9 @@ class GainsBank(FilterBank):
         )
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Update every filter with its gain, ``logit alpha = logit gain + gain_logits a``, and weigh by Bayes' rule."""
+        """Return the filters updated with gains ``logit alpha = logit gain + gain_logits a``, weighted by Bayes'
+        rule.
+        """
         xp = self.xp
         moved = self.logit + self.parameters.gain_logits * xp.clip(action, -1.0, 1.0)
         alpha = 1.0 / (1.0 + xp.exp(-moved))

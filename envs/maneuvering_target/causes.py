@@ -6,13 +6,13 @@ from ..contract.observation import Array
 from .disturbances import DISTURBANCES
 
 AFTERMATH = 5.0
-"""Scans in which a filter recovers from a manoeuvre."""
+"""Number of scans in which a filter recovers from a manoeuvre."""
 RANGE_EDGES = (30.0, 60.0, 120.0)
-"""km from the radar, whose error across the beam grows with the range."""
+"""Limits of range classes, km; the error across the beam grows with the range."""
 
 
 def _recovers(moment: Moment) -> Array | None:
-    if not moment.knows("maneuver_last"):
+    if not moment.has_context("maneuver_last"):
         return None
     since = moment.measurement.scan - moment.context["maneuver_last"]
     ended = (moment.context["maneuver_last"] >= 0.0) & (since > 0.0) & (since <= AFTERMATH)
@@ -21,7 +21,7 @@ def _recovers(moment: Moment) -> Array | None:
 
 
 def _flies_straight(moment: Moment) -> Array | None:
-    if not moment.knows("maneuvering"):
+    if not moment.has_context("maneuvering"):
         return None
     straight, recovering = moment.context["maneuvering"] <= 0.0, _recovers(moment)
     return straight if recovering is None else straight & ~recovering

@@ -1,12 +1,12 @@
-"""Clutter of ManeuveringTarget: false plots about a track, and the plot that a filter takes for the target's.
+"""Clutter of ManeuveringTarget: false plots around a track, and the association of one plot with the target.
 
-False plots are a Poisson field over the whole plane, new in every scan. A tracker looks at a window about where it
-expects the target, so the plots of a scan are those in the window of the filter that is run: uniform, whatever the
-target does, and their origin is unknown. That closes a loop: the filter gives its estimate, and the radar
-answers with the plots about it. The same random numbers make false plots at the same places of every filter's window.
+False plots are a Poisson field over the whole plane, new in every scan. A tracker processes a window around the
+predicted position, so the plots of a scan are those in the window of the filter in the loop: uniformly distributed,
+independent of the target, and of unknown origin. That closes a loop: the radar needs the filter's estimate for the
+plots around it. The same random numbers make false plots at the same places of every filter's window.
 
-Filters that take one plot are given the nearest to their prediction, as a front end of any tracker does it; the rule is
-the same for all: their own estimate and covariance, carried on at constant velocity.
+Filters that use one plot receive the nearest to their prediction, as a common front end does it. The rule is the same
+for all: their estimate and covariance, predicted at constant velocity.
 """
 
 import math
@@ -20,59 +20,60 @@ from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
 
 
 class ReportedTrack(NamedTuple):
-    """Estimate that a filter gives to the radar, which returns the plots around it."""
+    """Estimate around which the radar returns plots: the feedback of a filter in clutter."""
 
     mean: Array
-    """Position and velocity after the scan before, ``(4, N)``."""
+    """Position and velocity after the previous scan, ``(4, N)``."""
     covariance: Array
-    """``(4, 4, N)``."""
+    """Covariance of the mean, ``(4, 4, N)``."""
 
 
 class Echo(NamedTuple):
-    """Plot of the target itself, unknown to competitors."""
+    """Plot that originates from the target, unknown to competitors."""
 
     position: Array
-    """m, ``(2, N)``."""
+    """Position, m, ``(2, N)``."""
     available: Array
     """1 if the scan saw the target, ``(N,)``."""
 
 
 class ClutterState(NamedTuple):
-    """Truth of the plots."""
+    """State of the clutter."""
 
     density: Array
     """False plots per square metre, ``(N,)``."""
     unseen: Array
-    """s since the last scan with a plot in the gate, zero if that is the current one, ``(N,)``."""
+    """Time since the last scan with a plot in the gate, s, zero if that is the current one, ``(N,)``."""
     echo: Echo
     false_association: Array
     """1 if the plot in the gate is not the target's, ``(N,)``."""
 
 
 class Clutter(Disturbance):
-    """False plots, uniform in a window about the track.
+    """False plots, uniformly distributed in a window around the track.
 
-    The uniform numbers of a scan: how many there are, which is the target's, and the place of each.
+    The uniform numbers of a scan draw the number of plots, which of them is the target's, and the position of each.
     """
 
     name = "clutter"
     row_uniforms = 2 * PLOT_SLOTS + 2
 
     @classmethod
-    def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
-        """Return whether there are false plots."""
+    def is_enabled(cls, parameters: ManeuveringTargetParameters) -> bool:
+        """Return whether the parameters give a density of false plots above zero."""
         return parameters.cluttered
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> ClutterState:
-        """Draw the density, which the parameters give per square kilometre."""
+        """Return the state with the drawn density of false plots, per square metre."""
         density = 1e-6 * draws.uniform("clutter_density", self.parameters.clutter_density)
         return ClutterState(
             density, 0.0 * density, Echo(self.xp.stack([zero, zero]), 0.0 * density), 0.0 * density
         )
 
     def count(self, uniform: Array, density: Array) -> Array:
-        """Return the Poisson number of false plots in the window, one less than slots at most, by the inverse of
-        its cumulative distribution, ``(N,)``.
+        """Return the Poisson-distributed number of false plots in the window, ``(N,)``, below the number of slots.
+
+        It is computed by the inverse of the cumulative distribution.
         """
         mean = density * self.parameters.window_area
         term = self.xp.exp(-mean)
@@ -86,7 +87,7 @@ class Clutter(Disturbance):
     def change_measurement(
         self, state: ClutterState, measurement: Any, step: DisturbanceInput
     ) -> tuple[ClutterState, Any]:
-        """Put false plots beside that of the target, and associate one with the track of the filter."""
+        """Return the state, and the measurement with false plots added and one of all plots taken for the target."""
         xp, p, uniforms = self.xp, self.parameters, step.uniforms
         track, interval, echo = (
             step.feedback,
@@ -128,8 +129,9 @@ class Clutter(Disturbance):
         )
 
     def predict(self, track: ReportedTrack, interval: Array, elapsed: Array) -> tuple[Array, Array]:
-        """Return the position that is expected, ``(2, N)``, and its covariance, ``(2, 2, N)``: at constant
-        velocity, but for an acceleration of ``gate_acceleration`` since the last plot.
+        """Return the predicted position at the scan, ``(2, N)``, and its covariance, ``(2, 2, N)``, for the gate.
+
+        The prediction is at constant velocity with an acceleration of ``gate_acceleration`` since the last plot.
         """
         P, T = track.covariance, interval
         centre = track.mean[:2] + T * track.mean[2:]
@@ -139,9 +141,9 @@ class Clutter(Disturbance):
         return centre, carried + left * identity
 
     def context(self, state: ClutterState) -> dict[str, Array]:
-        """Return the false plots per square kilometre."""
+        """Return the context: the density of false plots per square kilometre, by name."""
         return {"clutter_density": 1e6 * state.density}
 
     def records(self, state: ClutterState) -> dict[str, Array]:
-        """Return whether the plot of the filter is false."""
+        """Return the values to record at a scan, by name: whether the plot taken for the target is false."""
         return {"false_association": state.false_association}

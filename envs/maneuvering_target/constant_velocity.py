@@ -6,7 +6,7 @@ from typing import Any
 
 from ...filters import kalman
 from ...filters.small_matrices import outer
-from ..contract.filter import Likelihood
+from ..contract.filter import EstimateState, Filter, Initial, Likelihood
 from ..contract.observation import Array
 from .parameters import ManeuveringTargetParameters
 from .problem import TargetProblem
@@ -62,3 +62,27 @@ class ConstantVelocityModel:
         H = self.H if H is None else H
         result = kalman.update(*predicted, measurement.position, H, self.identity * measurement.variance)
         return self.where_detected(measurement, result, kalman.Update(*predicted, 0.0, 0.0))
+
+
+class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
+    """Base of the estimators with the constant-velocity model."""
+
+    def start(self, initial: Initial) -> Any:
+        """Start from the initial estimate."""
+        return self.first_track(initial)
+
+    def first_track(self, initial: Initial) -> EstimateState:
+        """Return the estimate before the first scan."""
+        return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
+
+    def mean(self, state: Any) -> Array:
+        """Return the position and velocity, without further states."""
+        return state.mean[:4]
+
+    def covariance(self, state: Any) -> Array:
+        """Return the covariance of position and velocity, without further states."""
+        return state.covariance[:4, :4]
+
+    def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
+        """Return the state after an update."""
+        return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))

@@ -1,4 +1,4 @@
-"""Courses of the target of ManeuveringTarget: one class for each kind of flight.
+"""Courses (flight paths) of the target of ManeuveringTarget: one class for each kind of flight.
 
 A course draws its flight, moves the target from scan to scan, interpolates between two, and describes itself in
 the context. ``scan`` is the number of a scan, ``(N,)``; a motion is a position (m) and a velocity (m/s), ``(2, N)``
@@ -24,7 +24,7 @@ CIRCLE = (0.0, 2.0 * math.pi)
 
 
 class Course(ABC):
-    """Course of the target.
+    """Base class of the target's courses (flight paths).
 
     Args:
         task: with the parameters of the flight.
@@ -39,22 +39,23 @@ class Course(ABC):
 
     @abstractmethod
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
-        """Draw the flight of each episode: what holds for all of it, and the motion at the start.
+        """Return the drawn constants of each episode's flight, and the motion at the start.
 
         Args:
-            draws: what fixes the scenario of each episode.
+            draws: random quantities of each episode.
             ones: ``(N,)``.
         """
 
     @abstractmethod
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
-        """Return the motion at a scan from that at the one before, both on time."""
+        """Return the motion at a scan from that at the previous scan, both scans on time."""
 
     def motion_at_early_scan(
         self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Return the motion at a scan that comes early by a share of the scan period; here :meth:`advance` knows every
-        time.
+        """Return the motion at a scan that comes early by a share of the scan period.
+
+        By default that of :meth:`advance`, for a course defined at any time.
 
         Args:
             flight: of :meth:`begin`.
@@ -66,17 +67,19 @@ class Course(ABC):
         return self.advance(flight, scan - early, before)
 
     def carry(self, flight: Any, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
-        """Carry a deviation of the velocity from the scan before to a scan: what it has become, and where it has led.
+        """Return deviations of position and velocity at a scan, propagated from a velocity deviation at the previous
+        one.
 
-        Turns are at a rate and thrust is an acceleration, so that a turn turns the deviation, too, and thrust does not.
-        Here, where no turn rates are known, the target is as if thrust moved it.
+        A coordinated turn rotates the deviation, thrust does not. By default, without known turn rates, it is not
+        rotated.
 
         Args:
             flight: of :meth:`begin`.
-            scan: its number.
-            early: shares of the scan period by which the scan before and this one come early, ``(N,)`` each; None where
-                none does.
-            velocity: the deviation at the scan before, m/s, ``(2, N)``.
+            scan: number of the scan.
+            early: shares of the scan period by which the previous scan and this one come early, ``(N,)`` each; None
+                where none
+                does.
+            velocity: the deviation at the previous scan, m/s, ``(2, N)``.
 
         Returns:
             Deviations of position and velocity.
@@ -85,7 +88,7 @@ class Course(ABC):
         return (self.parameters.sampling_interval * (1.0 + (before - now))) * velocity, velocity
 
     def context(self, flight: Any, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the context of the flight.
+        """Return the context of the flight by name: times and sizes of manoeuvres, and the current one.
 
         Args:
             flight: of :meth:`begin`.
@@ -96,7 +99,9 @@ class Course(ABC):
 
 
 def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
-    """Return the motion after a time (s) on a circle, or a straight line, at constant speed; ``turn`` in rad/s."""
+    """Return the motion after a time (s) of a coordinated turn at constant speed; ``turn`` in rad/s, zero is
+    straight.
+    """
     state = coordinated_turn.propagate(task.xp.concat([*motion, turn[None]]), time)
     return state[:2], state[2:4]
 
@@ -105,33 +110,34 @@ def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
 
 
 class Maneuvers(NamedTuple):
-    """Manoeuvres of a flight: what each adds in every scan from its first to its last."""
+    """Manoeuvres of a flight: the change of the motion in each scan from the first to the last."""
 
     first: Array
     """Scan number, ``(manoeuvres, N)``."""
     last: Array
-    """Scan number, included, ``(manoeuvres, N)``."""
+    """Number of the last scan, included, ``(manoeuvres, N)``."""
     effect: Array
-    """``(6, manoeuvres, N)``; one array, because the truth picks from all of it in every scan. Of a turn by theta what
-    velocity gains along itself, per velocity, cos(theta) - 1, and across, sin(theta), then the position in the same
-    form, s; of thrust the acceleration along x and y, m/s^2."""
+    """Effect of a manoeuvre in a scan, ``(6, manoeuvres, N)``; one array, since the truth selects from all of it. Of a
+    turn by theta: the change of velocity along itself, per velocity, cos(theta) - 1, and across, sin(theta), then
+    that of
+    the position in the same form, s; of thrust: the acceleration along x and y, m/s^2."""
     turn: Array = None
-    """Angle turned in a scan, rad, ``(manoeuvres, N)``; None where no scan comes early: the effect is all then."""
+    """Turn angle in a scan, rad, ``(manoeuvres, N)``; None where no scan comes early and ``effect`` suffices."""
 
     @property
     def acceleration(self) -> Array:
-        """Acceleration of thrust, m/s^2, ``(2, manoeuvres, N)``."""
+        """Acceleration of each manoeuvre's thrust along x and y, m/s^2, ``(2, manoeuvres, N)``."""
         return self.effect[4:]
 
 
 class Maneuvered(Course):
-    """A straight flight with manoeuvres that do not overlap."""
+    """Base class of straight flights with manoeuvres that do not overlap."""
 
     turns: bool
-    """Whether one may be a coordinated turn; otherwise all are thrust."""
+    """Whether manoeuvres may be coordinated turns; otherwise all are thrust."""
 
     def advance(self, flight: Maneuvers, scan: Array, motion: Motion) -> Motion:
-        """Fly straight, and add the manoeuvre of the scan period."""
+        """Return the motion at a scan: straight flight plus the effect of the manoeuvre in this scan period."""
         T, (position, before) = self.parameters.sampling_interval, motion
         effect = self._pick(flight, flight.effect, scan)
         acceleration = effect[4:]
@@ -146,7 +152,7 @@ class Maneuvered(Course):
     def motion_at_early_scan(
         self, flight: Maneuvers, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Return the thrust is constant within a period, and so is the turn rate."""
+        """Return the motion at an early scan; thrust or turn rate is constant within the scan period."""
         T = self.parameters.sampling_interval
         time = T * (1.0 - early)
         turn, acceleration = (
@@ -159,7 +165,9 @@ class Maneuvered(Course):
     def carry(
         self, flight: Maneuvers, scan: Array, early: tuple[Array, Array] | None, velocity: Array
     ) -> Motion:
-        """Turn it at the rates of the two scan periods in which the interval lies."""
+        """Return deviations at a scan: a velocity deviation, rotated at the turn rates of the scan periods in
+        between.
+        """
         if not self.turns:
             return super().carry(flight, scan, early, velocity)
         nowhere = 0.0 * velocity
@@ -175,15 +183,18 @@ class Maneuvered(Course):
         return self.xp.concat([effect[:4], 0.0 * effect[4:]])
 
     def _pick(self, flight: Maneuvers, values: Array, scan: Array) -> Array:
-        """Values ``(..., manoeuvres, N)`` of the manoeuvre that is flown in the scan period that ends with a scan."""
+        """Return the entries of values ``(..., manoeuvres, N)`` for the manoeuvre of the scan period that ends with a
+        scan.
+        """
         active = self.xp.astype((scan >= flight.first) & (scan <= flight.last), values.dtype)
         # Manoeuvres do not overlap, so at most one term of the sum differs from zero.
         values = active * values
         return ordered_sum(values[..., slot, :] for slot in range(values.shape[-2]))
 
     def context(self, flight: Maneuvers, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the first and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre; whether one is
-        flown now.
+        """Return the context by name: first and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre.
+
+        It also contains whether one is flown at present.
         """
         xp = self.xp
         # A manoeuvre that is not flown lies beyond the end.
@@ -200,12 +211,12 @@ class Maneuvered(Course):
 
 
 class StatedManeuver(Maneuvered):
-    """One stretch of thrust at stated scans (paper)."""
+    """The paper's flight: one period of thrust at stated scans."""
 
     turns = False
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
-        """Draw nothing: the flight is always the same."""
+        """Return the constant manoeuvre of the flight and the motion at its start, without a random number."""
         p, constant, once = self.parameters, self.task.constant, ones[None]
         first, last = p.maneuver_steps
         effect = constant((0.0, 0.0, 0.0, 0.0, *p.acceleration))[:, None, None] * once
@@ -215,7 +226,7 @@ class StatedManeuver(Maneuvered):
 
 
 def _draw_start(draws: Draws, p: ManeuveringTargetParameters) -> Motion:
-    """Draw where a random flight begins, and with which velocity."""
+    """Return the drawn position and velocity at the start of a random flight."""
     xp = draws.xp
     start_range, azimuth = draws.uniform("start_range", p.start_range), draws.uniform("azimuth", CIRCLE)
     speed, course = draws.uniform("speed", p.speed), draws.uniform("course", CIRCLE)
@@ -224,12 +235,12 @@ def _draw_start(draws: Draws, p: ManeuveringTargetParameters) -> Motion:
 
 
 class RandomManeuvers(Maneuvered):
-    """Any start, speed and course, and manoeuvres, each of them thrust or a coordinated turn."""
+    """Random flights: start, speed, direction, and manoeuvres that are thrust or coordinated turns."""
 
     turns = True
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
-        """Draw a start and manoeuvres."""
+        """Return the drawn manoeuvres of each flight, and the motion at its start."""
         xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
         slots = p.maneuver_count[1]
         position, velocity = _draw_start(draws, p)
@@ -274,23 +285,23 @@ class RandomManeuvers(Maneuvered):
 
 
 class RandomStraight(Course):
-    """Any start, speed and course, and no manoeuvre."""
+    """Random straight flights: start, speed and direction, no manoeuvre."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[None, Motion]:
-        """Draw a start; the number of manoeuvres takes a number though it is zero."""
+        """Return None, since the flight has no constants, and the drawn motion at its start."""
         motion = _draw_start(draws, self.parameters)
         draws.unit("maneuver_count")
         return None, motion
 
     def advance(self, flight: None, scan: Array, motion: Motion) -> Motion:
-        """Fly straight."""
+        """Return the motion at the next scan in straight flight."""
         position, velocity = motion
         return position + self.parameters.sampling_interval * velocity, velocity
 
     def motion_at_early_scan(
         self, flight: None, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Fly straight for a part of the scan period."""
+        """Return the motion in straight flight after a part of the scan period."""
         position, velocity = before
         return position + (self.parameters.sampling_interval * (1.0 - early)) * velocity, velocity
 
@@ -299,38 +310,38 @@ class RandomStraight(Course):
 
 
 class Legs(NamedTuple):
-    """A flight of straight legs and exact turns, each with what it begins with.
+    """A flight of straight legs and exact coordinated turns: the state at the start of each.
 
     The last one is straight and never ends.
     """
 
     begins: Array
-    """``(legs + 1, 6, N)``: time since the start of the track, s; turn rate, rad/s, anticlockwise positive; position,
-    m; velocity, m/s. One array, because the truth picks all of it in every scan."""
+    """Start of each leg, ``(legs + 1, 6, N)``: time since the start of the track, s; turn rate, rad/s, anticlockwise
+    positive; position, m; velocity, m/s. One array, since the truth selects from all of it in every scan."""
 
     @property
     def time(self) -> Array:
-        """Time since the start of the track, s, ``(legs + 1, N)``."""
+        """Start time of each leg since the start of the track, s, ``(legs + 1, N)``."""
         return self.begins[:, 0]
 
     @property
     def turn(self) -> Array:
-        """Turn rate, rad/s, ``(legs + 1, N)``."""
+        """Turn rate of each leg, rad/s, ``(legs + 1, N)``."""
         return self.begins[:, 1]
 
 
 def _times(one: Array, other: Array) -> Array:
-    """Return the product of vectors ``(2, N)`` taken for complex numbers."""
+    """Return the complex product of vectors ``(2, N)``, whose rows are real and imaginary part."""
     return namespace(one).stack(
         [one[0] * other[0] - one[1] * other[1], one[0] * other[1] + one[1] * other[0]]
     )
 
 
 class LegCourse(Course):
-    """Stated legs, with start, course, side and times drawn around the stated ones."""
+    """Flights of stated legs, with start, direction, side and durations drawn around the stated ones."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Legs, Motion]:
-        """Draw start, course, side and times of a flight."""
+        """Return the legs of each flight, with drawn start, direction, side and durations, and the initial motion."""
         xp, p = self.xp, self.parameters
         spread, course = p.start_spread, math.radians(p.course_spread)
         position = xp.stack(
@@ -357,15 +368,13 @@ class LegCourse(Course):
         return Legs(xp.stack(begins)), start
 
     def advance(self, flight: Legs, scan: Array, motion: Motion) -> Motion:
-        """Return the motion at a scan, or between two: any number. The legs say where it is then, whatever was
-        before.
-        """
+        """Return the motion at a scan, also a fractional one, from the legs alone."""
         now = self.parameters.sampling_interval * scan
         leg = StepSignal(flight.begins, flight.time[1:]).at(now, self.xp)
         return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
 
     def carry(self, flight: Legs, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
-        """Turn and stretch it as the target's velocity and way: on straight legs and turns both are proportional."""
+        """Return deviations at a scan: a velocity deviation, rotated and scaled as the target's velocity is."""
         before, now = early or (0.0, 0.0)
         (position, flown), (there, afterwards) = (
             self.advance(flight, time, (velocity, velocity)) for time in (scan - 1.0 - before, scan - now)
@@ -376,7 +385,7 @@ class LegCourse(Course):
         return _times(there - position, deviation), _times(afterwards, deviation)
 
     def context(self, flight: Legs, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the starts of the legs (s), their turn rates (rad/s), and whether the target turns now."""
+        """Return the context by name: starts of legs (s), turn rates (rad/s), and whether the target turns now."""
         now = self.parameters.sampling_interval * time
         turn = StepSignal(flight.turn, flight.time[1:]).at(now, self.xp)
         return {"leg_time": flight.time, "leg_turn_rate": flight.turn, "maneuvering": turn != 0.0}
@@ -386,29 +395,29 @@ class LegCourse(Course):
 
 
 class Table(Course):
-    """A table of states at every scan."""
+    """A flight given as a table of states at every scan."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         self.table: Array = task.constant(self.parameters.track)
-        """Rows x, y, vx, vy, ``(4, horizon + 2)``; of several flights one after another."""
+        """Rows x, y, vx, vy, ``(4, horizon + 2)``; several flights are concatenated."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
-        """Draw nothing: the flight is always the same."""
+        """Return the constants of the flight and the motion at its start, without a random number."""
         return None, (self.table[:2, 0, None] * ones, self.table[2:, 0, None] * ones)
 
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
-        """Look it up; beyond the end the target stays at the last state."""
+        """Return the motion at a scan from the table; beyond its end the last state."""
         return self._states(self.xp.clip(scan, None, float(self.table.shape[1]) - 1.0))
 
     def motion_at_early_scan(
         self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Return the motion on time: a table has no states between its scans."""
+        """Return the motion on time, since a table has no states between its scans."""
         return on_time
 
     def _states(self, column: Array) -> Motion:
-        """Return the states in a column of the table, a float, ``(2, N)`` each."""
+        """Return the positions and velocities in columns of the table, ``(2, N)`` each."""
         row = self.xp.astype(column, self.xp.int64)
         return self.table[:2, row], self.table[2:, row]
 
@@ -417,13 +426,13 @@ class Tracks(NamedTuple):
     """Choice of a flight in a table."""
 
     number: Array
-    """``(N,)``, as a float, like the columns of its first and last state."""
+    """Index of the flight, ``(N,)``, a float, as are the columns of its first and last state."""
     first: Array
     last: Array
 
 
 class TableOfSeveral(Table):
-    """A table of several flights, of which every episode flies one."""
+    """Flights given as one table of states, of which every episode flies one."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
@@ -431,7 +440,7 @@ class TableOfSeveral(Table):
         """Columns of the table at which flights begin, and its width."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Tracks, Motion]:
-        """Draw which flight is flown."""
+        """Return the drawn choice of a flight for each episode, and the motion at its start."""
         constant = self.task.constant
         number = draws.integer("flight", (0, len(self.ends) - 2))
         row = self.xp.astype(number, self.xp.int64)
@@ -439,16 +448,16 @@ class TableOfSeveral(Table):
         return Tracks(number, first, last), self._states(first)
 
     def advance(self, flight: Tracks, scan: Array, motion: Motion) -> Motion:
-        """Look it up; beyond the end the target stays at the last state."""
+        """Return the motion at a scan from the table; beyond the flight's end its last state."""
         return self._states(self.xp.minimum(flight.first + scan, flight.last))
 
     def context(self, flight: Tracks, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the number of the flight."""
+        """Return the context: the index of the flight, by name."""
         return {"flight": flight.number}
 
 
 def course_of(task: Task) -> Course:
-    """Return the course that the parameters name."""
+    """Return the course (flight path) that the task's parameters select."""
     p: ManeuveringTargetParameters = task.parameters
     random = RandomManeuvers if p.maneuver_count[1] else RandomStraight
     table = TableOfSeveral if p.track_scans else Table

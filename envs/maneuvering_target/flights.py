@@ -15,11 +15,11 @@ from .logs import FARTHEST_RANGE
 from .parameters import ManeuveringTargetParameters
 
 MOST_SCANS = 100_000
-"""Of all flights of a set together: a week of flying at 6 s."""
+"""Largest number of scans of a set of flights: a week at 6 s."""
 
 
 def _scenario_of_trajectory(trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
-    """Fly a user's trajectory, sampled once a scan and straight on beyond its end."""
+    """Return a scenario that flies a user's trajectory, sampled once a scan and straight beyond its end."""
     interval, _, horizon = _sampling(keywords)
     farthest = float(numpy.hypot(*trajectory.position.T).max())
     if farthest > FARTHEST_RANGE:
@@ -43,7 +43,7 @@ def _scenario_of_trajectory(trajectory: Trajectory, keywords: Mapping[str, Any])
 
 
 def _sampling(keywords: Mapping[str, Any]) -> tuple[float, int, int | None]:
-    """Return the sampling interval (s), scans for which an action holds, and the horizon if it is among the
+    """Return the sampling interval (s), the scans for which one action holds, and the horizon or None, from
     keywords.
     """
     found: dict[str, Any] = {}
@@ -56,7 +56,7 @@ def _sampling(keywords: Mapping[str, Any]) -> tuple[float, int, int | None]:
 
 
 def scenario_of_flights(flights: Trajectory | Flights, keywords: Mapping[str, Any]) -> Scenario:
-    """Fly a user's flights, one in every episode, each to its end or for the horizon that is asked for."""
+    """Return a scenario in which every episode flies one of a user's flights, to its end or for the horizon."""
     if isinstance(flights, Trajectory):
         return _scenario_of_trajectory(flights, keywords)
     interval, held, horizon = _sampling(keywords)

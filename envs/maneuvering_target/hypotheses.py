@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the estimator ``semi-markov`` with settings that an action multiplies."""
+"""Bank of the control ``hypotheses``: the estimator ``semi-markov``, whose settings the action multiplies."""
 
 import math
 from collections.abc import Sequence
@@ -28,34 +28,34 @@ from .semi_markov import SemiMarkov, SemiMarkovState
 from .world import Measurement
 
 GROUPS = ("straight", "ended", "begun", "thrust", "left", "right", "old_thrust", "old_left", "old_right")
-"""Of hypotheses whose probabilities are shown: straight flight older than the first age and of the first age,
+"""Groups of hypotheses whose probabilities are observed: straight flight older than the first age and of the first age,
 manoeuvres of the first age, kinds of manoeuvres of the ages between, and of the last age."""
 
 
 class HypothesesState(NamedTuple):
-    """The filter at one moment."""
+    """State of the semi-Markov filter with the values that the agent observes."""
 
     own: SemiMarkovState
-    """Predicted between :meth:`HypothesesBank.predict` and the action."""
+    """State of the filter, predicted between :meth:`HypothesesBank.predict` and the action."""
     likelihood: Likelihood
     action: Array
     """Last action, ``(6, N)``."""
     innovation: Array
-    """Of all hypotheses together over its sigma, along and across the predicted velocity, ``(2, N)``."""
+    """Innovation of all hypotheses together over its sigma, along and across the predicted velocity, ``(2, N)``."""
     prior: Array
-    """Logarithm of the sigma of the predicted position over that of the measurement, ``(2, N)``."""
+    """Logarithm of the predicted sigma of the position over that of the measurement, ``(2, N)``."""
     predicted: Array
     """Probabilities of groups of hypotheses before the measurement, ``(G, N)``."""
     probabilities: Array
-    """Probabilities of the groups after it, if the action is zero, ``(G, N)``."""
+    """Probabilities of the groups after the measurement under action zero, ``(G, N)``."""
     entropy: Array
-    """Of the hypotheses then, over the largest possible, ``(N,)``."""
+    """Entropy of the hypotheses under action zero, over the largest possible, ``(N,)``."""
 
 
 class HypothesesBank(SettingsBank, RadarBank):
-    """The semi-Markov Gaussian sum, steered by factors of its weights, covariances and measurement noise."""
+    """Bank of the control ``hypotheses``: the semi-Markov Gaussian sum with factors on weights, covariances and R."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = SemiMarkov
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = SemiMarkov
 
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
@@ -74,7 +74,7 @@ class HypothesesBank(SettingsBank, RadarBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """The innovation, how well the filter has predicted it, and what it believes."""
+        """Observation blocks: innovation, predicted deviation, and probabilities of groups of hypotheses."""
         xp = self.xp
         area = 2.0 * math.pi * self.parameters.range_sigma**2
         return (
@@ -98,22 +98,22 @@ class HypothesesBank(SettingsBank, RadarBank):
         )
 
     def start(self, initial: Initial) -> HypothesesState:
-        """Start where the estimator starts."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         own, none = self.own.start(initial), 0.0 * initial.mean[:2]
         groups = self.group(self.xp.concat([table.probability for table in own.track]))
         action = self.xp.stack([none[0]] * len(self.own.settings))
         return HypothesesState(own, own.likelihood, action, none, none, groups, groups, none[0])
 
     def group(self, probabilities: Array) -> Array:
-        """Return the probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``."""
+        """Return the probabilities of groups of hypotheses, ``(G, N)``, from those of all hypotheses, ``(H, N)``."""
         return self.xp.stack(
             [ordered_sum(probabilities[h] for h in members) for members in self.groups.values()]
         )
 
-    def look(
-        self, state: HypothesesState, found: SemiMarkovState, measurement: Measurement
+    def add_observed(
+        self, state: HypothesesState, result: SemiMarkovState, measurement: Measurement
     ) -> HypothesesState:
-        """Show the innovation of all hypotheses together, and probabilities before and after it."""
+        """Return the state with the innovation, and the probabilities before and after it, filled in."""
         xp, tables = self.xp, [table.unpack() for table in state.own.track]
         weights = xp.concat([table.probability for table in tables])
         weights = weights / ordered_sum(weights)
@@ -128,10 +128,10 @@ class HypothesesBank(SettingsBank, RadarBank):
         rotated = [product(product(frame, P), transpose(frame)) for P in (covariance[:2, :2], R)]
         own, sensor = (xp.stack([P[0, 0], P[1, 1]]) for P in rotated)
         innovation = measurement.available * (measurement.position - mean[:2])
-        p = xp.concat([table.probability for table in found.track])
+        p = xp.concat([table.probability for table in result.track])
         surprise = ordered_sum(p * xp.log(xp.clip(p, 1e-300, None)))
         return state._replace(
-            likelihood=found.likelihood,
+            likelihood=result.likelihood,
             innovation=apply(frame, innovation) / xp.sqrt(own + sensor),
             prior=0.5 * xp.log(own / sensor),
             predicted=self.group(weights),

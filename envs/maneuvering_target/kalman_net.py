@@ -1,6 +1,6 @@
-r"""The filter of ManeuveringTarget that a recurrent network steers from inside: the learned estimator ``kalman-net``.
+r"""The filter of ManeuveringTarget inside the learned estimator ``kalman-net``, which a recurrent network steers.
 
-An extended Kalman filter of position and velocity. At every scan the network answers with nine numbers a in [-1, 1], in
+An extended Kalman filter of position and velocity. At every scan the network outputs nine numbers a in [-1, 1], in
 the frame of the predicted velocity (along it, and across it to the left, a rotation U):
 
     motion   over the next interval T a turn at the rate a_across / v, and speed times 1 + a_along T / v,
@@ -16,11 +16,11 @@ All zero is the Kalman filter of constant velocity under white acceleration. Wit
 The gain of a network on innovations is that of Revach and others, "KalmanNet: Neural Network Aided Kalman Filtering for
 Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547; the covariance by Joseph's form with that
 gain and learned noises is that of Mortada and others, "Recursive KalmanNet: Deep Learning-Augmented Kalman Filtering
-for State Estimation with Consistent Uncertainty Quantification" (2025). Reading: their networks answer with the gain
-itself; here with the noises of a Kalman gain, so that a network that knows nothing is a filter that works. They are not
-those of the covariance: what is good for one need not be for the other. (Factors of the gain's rows were as good, but
-could make the filter diverge.) Their dynamics are given; here the network also answers with the acceleration, the part
-of them that are unknown.
+for State Estimation with Consistent Uncertainty Quantification" (2025). Reading: their networks output the gain itself,
+here the network outputs the noises of a Kalman gain, so that an untrained network is a working filter. These differ
+from the noises of the covariance: the best values for one need not be the best for the other. (Factors of the gain's
+rows were as good, but could make the filter diverge.) Their dynamics are given; here the network also outputs the
+acceleration, the unknown part of the dynamics.
 """
 
 import math
@@ -34,14 +34,14 @@ from ...filters import coordinated_turn
 from ...filters.array_namespace import namespace
 from ...filters.small_matrices import apply, outer, product, transpose
 from ..contract.filter import Bank, Initial
-from ..contract.observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block, innovation_block, prior_block
+from ..contract.observation import SIGNED_LOG, STORED_AS_LOG, Array, Block, innovation_block, prior_block
 from .banks import SCANS_SHOWN
 from .parameters import ManeuveringTargetParameters
 from .problem import TargetProblem
 from .world import Measurement
 
 NOMINAL_ACCELERATION = 1.0
-"""Standard deviation of the acceleration without the network, m/s^2, about that of all flights of ``random``."""
+"""Standard deviation of the acceleration at action zero, m/s^2, about that of all flights of ``random``."""
 NOISE_RANGE = 20.0
 """Largest factor and divisor of the standard deviation of the acceleration, and of the variance of a measurement."""
 CAUTION = 5.0
@@ -49,34 +49,35 @@ CAUTION = 5.0
 AGILITY = 5.0
 """Largest factor and divisor of the deviation of the acceleration."""
 LARGEST_ACCELERATION = 8.0
-"""Of what the network predicts along and across, m/s^2: one third more than any flight of ``random`` has."""
+"""Largest acceleration that the network predicts along and across, m/s^2: a third above any flight of ``random``."""
 LEAST_SPEED = 20.0
-"""What a turn is divided by at least, m/s: a target that stands still has no direction."""
+"""Smallest speed by which a turn is divided, m/s: a target at rest has no direction."""
 ANSWERS = 9
 FRAME = ("along", "across")
 
 
 class KalmanNetState(NamedTuple):
-    """The filter at one moment."""
+    """State of the extended Kalman filter, with the values that the network observes."""
 
     mean: Array
-    """x, y (m), vx, vy (m/s), ``(4, N)``; predicted between :meth:`KalmanNetBank.predict` and the action."""
+    """Estimate of x, y (m), vx, vy (m/s), ``(4, N)``; predicted between :meth:`KalmanNetBank.predict` and the
+    action."""
     covariance: Array
-    """``(4, 4, N)``; between ``predict`` and the action without process noise."""
+    """Covariance, ``(4, 4, N)``; between ``predict`` and the action without process noise."""
     acceleration: Array
-    """Predicted for the time to the next scan, along and across, m/s^2, ``(2, N)``."""
+    """Predicted acceleration until the next scan, along and across, m/s^2, ``(2, N)``."""
     deviation: Array
     """Standard deviation of the acceleration in the last scan, ``(N,)``."""
     correction: Array
     """Correction of the velocity in the last scan, m/s."""
     innovation: Array
-    """m, along and across the predicted velocity, ``(2, N)``."""
+    """Innovation, m, along and across the predicted velocity, ``(2, N)``."""
     prior: Array
     """Variance of the predicted position with the noise of the last scan, m^2."""
     sensor: Array
     """Variance of the measurement, m^2."""
     coupling: Array
-    """Its correlation between along and across, ``(N,)``."""
+    """Correlation of the measurement errors along and across, ``(N,)``."""
 
 
 STANDING = 1e-3
@@ -84,13 +85,14 @@ STANDING = 1e-3
 
 
 def speed_of(velocity: Array, least: float = STANDING) -> Array:
-    """Return the speed, ``(N,)``, smoothly never below the least, m/s."""
+    """Return the speed, ``(N,)``, m/s, smoothly limited from below by ``least``."""
     return (velocity[0] * velocity[0] + velocity[1] * velocity[1] + least**2) ** 0.5
 
 
 def frame_of(velocity: Array) -> Array:
-    """Return the rows of U^T: the direction of a velocity, and the one to its left, ``(2, 2, N)``; of what stands,
-    the axes.
+    """Return the rotation U^T, ``(2, 2, N)``, whose rows are the direction of a velocity and that to its left.
+
+    For a velocity of zero the rows are the axes.
     """
     xp = namespace(velocity)
     moves = velocity[0] * velocity[0] + velocity[1] * velocity[1] > STANDING**2
@@ -102,10 +104,10 @@ def frame_of(velocity: Array) -> Array:
 def sensor_blocks(
     bank: Any, variances: Callable[..., Array], coupling: Callable[..., Array]
 ) -> Sequence[Block]:
-    """Return the blocks of the covariance of a measurement in the frame.
+    """Return the observation blocks of a measurement's covariance in the frame of the velocity.
 
     Args:
-        bank: that shows them.
+        bank: with these blocks.
         variances: along and across, ``(2, N)``, m^2, of the bank's state and the measurement.
         coupling: the correlation, ``(N,)``.
     """
@@ -116,21 +118,23 @@ def sensor_blocks(
             lambda f, z: 0.5 * xp.log(variances(f, z) * (1.0 / p.range_sigma**2)),
             "the measurement's sigma over range_sigma",
             FRAME,
-            KEPT_AS_LOG,
+            STORED_AS_LOG,
         ),
         Block("measurement_correlation", coupling, "correlation of the measurement's errors"),
     )
 
 
 def clock_blocks(bank: Any) -> Sequence[Block]:
-    """Return the blocks of the predicted speed, of the scan and of what it saw, for a bank with a ``mean``."""
+    """Return the observation blocks of predicted speed, scan number, detection and interval, for a bank with a
+    ``mean``.
+    """
     xp, p = bank.xp, bank.parameters
     return (
         Block(
             "speed",
             lambda f, _: xp.log(speed_of(f.mean[2:], LEAST_SPEED) * 0.01),
             "the predicted speed over 100 m/s",
-            compression=KEPT_AS_LOG,
+            compression=STORED_AS_LOG,
         ),
         Block(
             "scan",
@@ -142,19 +146,19 @@ def clock_blocks(bank: Any) -> Sequence[Block]:
             "interval",
             lambda _, measurement: xp.log(measurement.interval * (1.0 / p.sampling_interval)),
             "the time since the scan before over sampling_interval",
-            compression=KEPT_AS_LOG,
+            compression=STORED_AS_LOG,
         ),
     )
 
 
 def sensor_covariance(measurement: Measurement, xp: Any) -> Array:
-    """Return the covariance of a measurement, ``(2, 2, N)``, m^2."""
+    """Return the covariance of a measured position, m^2, ``(2, 2, N)``."""
     none = 0.0 * measurement.variance[0]
     return xp.stack([xp.stack([measurement.variance[0], none]), xp.stack([none, measurement.variance[1]])])
 
 
 def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
-    """Predict by an acceleration that is held along and across: a turn, and a change of speed.
+    """Return the mean predicted with a constant acceleration along and across: a turn, and a change of speed.
 
     Args:
         mean: x, y (m), vx, vy (m/s), ``(4, N)``.
@@ -174,7 +178,7 @@ def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
 
 
 class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
-    """An extended Kalman filter whose noises, gain and motion the action sets."""
+    """Bank of ``kalman-net``: an extended Kalman filter, whose noises, gain and motion the action sets."""
 
     parameters: ManeuveringTargetParameters
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
@@ -188,7 +192,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Innovations and what the filter and the radar say of them, what was answered last, and the clock."""
+        """Observation blocks: innovations, their predicted and measured deviations, the last action, and the time."""
         xp, p = self.xp, self.parameters
         return (
             innovation_block(FRAME, value=lambda f, _: f.innovation / xp.sqrt(f.prior + f.sensor)),
@@ -212,13 +216,13 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
                 lambda f, _: xp.log(f.deviation * (1.0 / NOMINAL_ACCELERATION)),
                 "the sigma of the acceleration in the last scan over the nominal one",
                 FRAME,
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
             *clock_blocks(self),
         )
 
     def start(self, initial: Initial) -> KalmanNetState:
-        """Start at the initial estimate."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         none = 0.0 * initial.mean[:2]
         sensor = self.xp.stack([initial.covariance[0, 0], initial.covariance[1, 1]])
         deviation = NOMINAL_ACCELERATION + none
@@ -227,7 +231,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         )
 
     def predict(self, state: KalmanNetState, measurement: Measurement) -> KalmanNetState:
-        """Predict to the scan by the acceleration that was answered, and compare."""
+        """Return the state predicted to the scan with the last action's acceleration, with innovation statistics."""
         xp, T = self.xp, measurement.interval
         mean, turning = advance(state.mean, state.acceleration, T)
         F = coordinated_turn.jacobian(turning, T)[:4, :4]
@@ -249,7 +253,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         )
 
     def noise(self, frame: Array, deviation: Array, T: Array) -> Array:
-        """Process noise over intervals of accelerations along and across, ``(4, 4, N)``.
+        """Return the process noise covariance of accelerations along and across over intervals, ``(4, 4, N)``.
 
         Args:
             frame: rows along and across, ``(2, 2, N)``.
@@ -264,7 +268,9 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         return xp.concat([xp.concat([corner, middle], axis=1), xp.concat([middle, velocity], axis=1)])
 
     def act(self, state: KalmanNetState, measurement: Measurement, action: Array) -> KalmanNetState:
-        """Update by the gain that was answered, and keep the acceleration for the next prediction."""
+        """Return the state updated with the gain that the action sets, with its acceleration for the next
+        prediction.
+        """
         xp, available = self.xp, measurement.available
         a = xp.clip(action, -1.0, 1.0)
         frame = frame_of(state.mean[2:])

@@ -1,4 +1,4 @@
-"""Radar plots as they come, as measurements of ManeuveringTarget; columns as of :mod:`.logs`."""
+"""Live measurements of ManeuveringTarget: radar plots, one at a time; columns as of :mod:`.logs`."""
 
 import math
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ VALUES = ("x", "y", "range", "azimuth", "sigma_x", "sigma_y", "range_sigma", "az
 
 
 def choose(condition: Any, first: Any, second: Any) -> Any:
-    """Return one of two numbers where a condition is a bool, else one of two in every place, as NumPy's ``where``."""
+    """Return ``numpy.where(condition, first, second)``; for a bool one of two numbers."""
     if condition.__class__ is bool:
         return first if condition else second
     return numpy.where(condition, first, second)
@@ -30,7 +30,9 @@ def is_finite(number: Any) -> Any:
 
 
 class PlotInput(LiveInput):
-    """A plot, ``x`` and ``y`` or ``range`` and ``azimuth``, or none where the scan missed the target.
+    """Converter of plots, ``x`` and ``y`` or ``range`` and ``azimuth``, or none, into measurements.
+
+    With the setup of a log of ``latitude`` and ``longitude`` it accepts these instead.
 
     A filter whose file was advised for a log of ``latitude`` and ``longitude`` takes these in their place.
     """
@@ -39,23 +41,23 @@ class PlotInput(LiveInput):
     fuses = True
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return columns of a log; of a second sensor speed and heading at the start, too."""
+        """Return the names and descriptions of the values of a measurement, and of those at the start."""
         names = VALUES if self.task.recording.origin is None else (*VALUES, *PLACE)
         if self.measurement.odometry is None:
             return {name: COLUMNS[name].live_text for name in names}, {}
         at_start = {name: COLUMNS[name].live_text for name in SECOND_SENSOR[2:]}
         return {name: COLUMNS[name].live_text for name in (*names, *SECOND_SENSOR)}, at_start
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Start as if a scan had just seen the target."""
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Return the initial estimate, and a memory as if a scan had just seen the target."""
         initial, memory = super().start(
-            time, {name: given[name] for name in ("mean", "covariance") if name in given}
+            time, {name: initial_values[name] for name in ("mean", "covariance") if name in initial_values}
         )
-        velocity = {} if self.measurement.odometry is None else {"velocity": self._velocity(given)}
+        velocity = {} if self.measurement.odometry is None else {"velocity": self._velocity(initial_values)}
         return initial, {**memory, "last_plot": time, **velocity}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Take a plot for what it is, and its variances at the measured position."""
+        """Return the measurement of a plot, with its variances at the measured position, and the memory."""
         x, y = self._position(values)
         there, position, scan = is_finite(x) & is_finite(y), numpy.array((x, y)), memory["count"] + 1.0
         measurement = Measurement(
@@ -78,12 +80,12 @@ class PlotInput(LiveInput):
         return measurement._replace(odometry=odometry), {**after, "velocity": velocity}
 
     def _velocity(self, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Return the velocity by the second sensor, ``(2, N)``, of one track ``(2,)``, m/s; NaN where it has none."""
+        """Return the velocity by the second sensor, m/s, ``(2, N)``, of one track ``(2,)``; NaN where it has none."""
         heading = numpy.radians(self.read(values, "odometry_heading"))
         return east_north(self.read(values, "odometry_speed"), heading)
 
     def _position(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return the position of a plot, x and y; NaN where there is none."""
+        """Return x and y of a plot from its Cartesian or polar values, m; NaN where there is none."""
         if "latitude" in values or "longitude" in values:
             return self._project(values)
         if "range" not in values:
@@ -93,9 +95,7 @@ class PlotInput(LiveInput):
         return (x, y) if self.lanes else (float(x), float(y))
 
     def _project(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return the position of latitude and longitude, around the origin of the log that the filter was advised
-        for.
-        """
+        """Return x and y of a latitude and longitude, m, around the origin of the log in the filter's setup."""
         twice = [name for name in VALUES[:4] if name in values]
         if twice:
             raise ValueError(f"a plot has {twice[0]} and latitude or longitude: leave one of them out")
@@ -114,7 +114,7 @@ class PlotInput(LiveInput):
         return tuple(position) if self.lanes else tuple(position[:, 0].tolist())
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
-        """Start a track as a log's starts: the second plot, and the difference of both over the time between them."""
+        """Return the initial mean and covariance by name: the second plot, and the velocity between the two plots."""
         plots = [{name: value for name, value in plot.items() if name != "time"} for plot in (first, second)]
         position = numpy.reshape([self._position(plot) for plot in plots], (2, 2, self.tracks))
         lasted = second["time"] - first["time"]
@@ -134,7 +134,7 @@ class PlotInput(LiveInput):
         return {name: numpy.moveaxis(values, 0, -1) for name, values in begun.items()}
 
     def _variance(self, position: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Return the variances of a plot: those stated with it, else those of the file of the filter, else the
+        """Return the variances of a plot, m^2: those stated with it, else those of the filter's setup, else the
         radar's.
         """
         p, usual = self.parameters, dict(self.task.recording.deviations)

@@ -1,9 +1,8 @@
-"""Radar plots of a user's own as measurements of ManeuveringTarget.
+"""Tables of a user's radar plots, read as measurements of ManeuveringTarget.
 
 x is east and y is north of the radar; an azimuth is counted clockwise from north. Latitude and longitude, of a
-receiver, become x and y around the first of them. The track starts from the first two
-plots, equation (24): the position of the second, and the difference of both over the time between them, with the
-covariance that belongs to it.
+receiver, become x and y around the first of them. The track starts from the first two plots, equation (24): the
+position of the second, and the difference of both over the time between them, with the covariance that follows.
 """
 
 from collections.abc import Mapping
@@ -17,7 +16,7 @@ from ..contract.log_format import (
     Column,
     LogFormat,
     PlotRows,
-    Predicted,
+    PredictedCoordinate,
     TrackLog,
     TrackStart,
     deviation_words,
@@ -49,7 +48,7 @@ COLUMNS = {
     "odometry_heading": Column("degrees clockwise from north"),
 }
 FINER = 10.0
-"""Times that a stated deviation exceeds the resolution of positions where noise does not repeat one by chance."""
+"""Ratio of a stated deviation to the resolution of positions above which noise does not repeat a position by chance."""
 PAIRS = (
     ("x", "y"),
     ("range", "azimuth"),
@@ -59,16 +58,16 @@ PAIRS = (
     ("odometry_speed", "odometry_heading"),
 )
 FARTHEST_RANGE = 500e3
-"""m; what lies beyond this is taken for a mistake of units."""
+"""Largest range, m; a larger one is taken for a wrong unit."""
 LARGEST_GAP = 1000
-"""Scans that may be missing between two rows; more is a mistake of units."""
+"""Largest number of scans missing between two rows; a larger one is taken for a wrong unit."""
 
 
 def read_log(columns: Columns) -> TrackLog:
-    """Make measurements of the plots of one track.
+    """Return the measurements of one track from the columns of a table of plots.
 
     Raises:
-        ValueError: for what lacks or cannot be. Scans without a plot are missing measurements.
+        ValueError: for missing or impossible values. Scans without a plot are missing measurements.
     """
     for pair in PAIRS:
         if sum(columns.has(name) for name in pair) == 1:
@@ -93,17 +92,19 @@ def read_log(columns: Columns) -> TrackLog:
     plots = numpy.flatnonzero(there)
     if len(plots) < 3:
         raise ValueError(
-            f"it has {len(plots)} plot{'s' * (len(plots) != 1)}: the track starts from the first two, and goes on"
+            f"it has {len(plots)} plot{'s' * (len(plots) != 1)}: the track starts from the first two and needs a third"
         )
     first = plots[1]
     initial = two_plot_start(position[plots[:2]], variance[plots[:2]], numpy.diff(columns.time[plots[:2]]))
     parameters: dict[str, Any] = {}
     interval = columns.interval()
     rows, time = _scans(columns, int(first), interval)
-    if "sampling_interval" not in columns.given:
+    if "sampling_interval" not in columns.user_parameters:
         parameters["sampling_interval"] = interval
     seen = (rows >= 0) & there[rows]
-    nominal = (assumed or columns.given.get("range_sigma", ManeuveringTargetParameters.range_sigma)) ** 2
+    nominal = (
+        assumed or columns.user_parameters.get("range_sigma", ManeuveringTargetParameters.range_sigma)
+    ) ** 2
     found = {
         "scan": numpy.arange(1.0, len(rows) + 1.0),
         "position": numpy.where(seen[:, None], position[rows], 0.0),
@@ -131,10 +132,10 @@ def read_log(columns: Columns) -> TrackLog:
 
 
 def _typical_sigma(columns: Columns, there: numpy.ndarray) -> dict[str, float]:
-    """Return the median of the deviations that a table states, in place of the radar's; empty where it is that, or
-    none is stated.
+    """Return the median stated deviation as parameter ``range_sigma``; empty if none is stated or it equals the
+    radar's.
 
-    Agents are shown deviations over this one, and errors cost in its square.
+    Agents observe deviations relative to it, and errors cost in units of its square.
     """
     names = ["sigma_x", "sigma_y"] if columns.has("sigma_x", "sigma_y") else ["range_sigma"]
     if not columns.has(*names):
@@ -144,15 +145,15 @@ def _typical_sigma(columns: Columns, there: numpy.ndarray) -> dict[str, float]:
 
 
 def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray) -> numpy.ndarray:
-    """Find positions that are those of the row before: no new measurement, ``(rows,)``.
+    """Return booleans ``(rows,)``: positions that repeat those of the previous row and are no new measurement.
 
-    A receiver that stands still may give the same numbers again. So they are stale only where noise of the stated size,
-    in the resolution of the numbers, would hardly ever give both again.
+    A receiver at rest may report the same numbers again. So they are stale only where noise of the stated size, in the
+    resolution of the numbers, would hardly ever repeat both.
 
     Args:
         columns: of one track.
         position: m, ``(rows, 2)``; NaN where there is none.
-        sigma: of their errors, m, same shape.
+        sigma: standard deviations of their errors, m, ``(rows, 2)``.
     """
     measured = position
     if columns.origin is not None:  # x and y change with altitude, too
@@ -193,7 +194,7 @@ def _gap_notes(rows: numpy.ndarray) -> tuple[str, ...]:
 def two_plot_start(
     position: numpy.ndarray, variance: numpy.ndarray, lasted: numpy.ndarray
 ) -> dict[str, numpy.ndarray]:
-    """Start of a track from two plots: the second, and their difference over the time between them.
+    """Return the initial mean and covariance from two plots: the second, and their difference over the time, by name.
 
     Args:
         position: of the two, ``(..., 2, 2)``, m.
@@ -214,7 +215,7 @@ def two_plot_start(
 def start_track(
     measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
 ) -> TrackStart:
-    """Start every episode from its first two plots.
+    """Return the start of every episode from its first two plots.
 
     Raises:
         ValueError: if there are none.
@@ -234,7 +235,7 @@ def start_track(
 
 
 def _positions(columns: Columns) -> numpy.ndarray:
-    """Return the X and y, ``(rows, 2)``, m; NaN where there is no plot."""
+    """Return x and y of the plots, ``(rows, 2)``, m; NaN where there is no plot."""
     if columns.has("x", "y"):
         return numpy.stack([columns["x"], columns["y"]], axis=1)
     if not columns.has("range", "azimuth"):
@@ -246,7 +247,7 @@ def _positions(columns: Columns) -> numpy.ndarray:
     if (distance < 0.0).any():
         row = int(numpy.argmax(distance < 0.0))
         raise ValueError(f"range is a distance, and row {row} has {distance[row]:g} m")
-    stated = columns.given.get("bearing_sigma", ManeuveringTargetParameters.bearing_sigma)
+    stated = columns.user_parameters.get("bearing_sigma", ManeuveringTargetParameters.bearing_sigma)
     sigma = (
         float(numpy.nanmedian(columns["azimuth_sigma"])) if columns.has("azimuth_sigma") else float(stated)
     )
@@ -255,53 +256,50 @@ def _positions(columns: Columns) -> numpy.ndarray:
 
 
 def east_north(length: numpy.ndarray, angle: numpy.ndarray) -> numpy.ndarray:
-    """Return the vector east and north, ``(2, n)``, of a length and an angle clockwise from north, rad, ``(n,)``
-    each.
-    """
+    """Return the vector east and north, ``(2, n)``, of lengths and angles clockwise from north, rad, ``(n,)`` each."""
     return numpy.stack([length * numpy.sin(angle), length * numpy.cos(angle)])
 
 
 def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.ndarray) -> float:
-    """Return the deviation of x and y where nothing states it, m; zero where something does, or a radar has measured
-    them.
+    """Return the assumed deviation of x and y, m; zero if a column states it or the plots are polar.
 
     It is that of ``--set range_sigma``, else the scatter of positions about the line through their neighbours, which
-    motion only makes larger: who fits a filter fits it, too.
+    motion can only increase.
 
     Args:
         columns: of one track.
         position: of its plots, m, ``(n, 2)``.
-        time: s, same shape.
+        time: s, ``(n,)``.
     """
     if not columns.has("x") or columns.has("sigma_x") or columns.has("range_sigma"):
         return 0.0
-    if "range_sigma" in columns.given:
-        return float(columns.given["range_sigma"])
+    if "range_sigma" in columns.user_parameters:
+        return float(columns.user_parameters["range_sigma"])
     return float(f"{scatter_of(time, position):.3g}") if len(time) >= 3 else 0.0
 
 
 def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
-    """Return the typical deviations, as columns would state them, and their source."""
+    """Return the typical deviations of the plots by column name, and the source of these numbers in words."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:
         if columns.has(*pair):
             medians = {name: float(f"{numpy.nanmedian(columns[name][there]):.6g}") for name in pair}
             return medians, f"columns {pair[0]} and {pair[1]}"
     if assumed:
-        named = "range_sigma" in columns.given
+        named = "range_sigma" in columns.user_parameters
         who = "as --set range_sigma states" if named else "as positions scatter about their neighbours"
         return dict.fromkeys(pairs[0], assumed), f"{NO_DEVIATIONS} of x and y, assumed {who}"
     names = {"range_sigma": "range_sigma", "azimuth_sigma": "bearing_sigma"}
     values = {
-        column: float(columns.given.get(name, getattr(ManeuveringTargetParameters, name)))
+        column: float(columns.user_parameters.get(name, getattr(ManeuveringTargetParameters, name)))
         for column, name in names.items()
     }
     return values, f"{NO_DEVIATIONS}, assumed as of the environment's radar"
 
 
 def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
-    """Return notes on the deviations that are assumed where neither a column nor the user states one."""
-    if not is_assumed(source) or "range_sigma" in columns.given:
+    """Return notes on the assumed deviations, where neither a column nor the user states one."""
+    if not is_assumed(source) or "range_sigma" in columns.user_parameters:
         return []
     return [f"{source}: {deviation_words(deviations)}"]
 
@@ -309,8 +307,8 @@ def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source:
 def _variances(
     columns: Columns, position: numpy.ndarray, there: numpy.ndarray, assumed: float = 0.0
 ) -> numpy.ndarray:
-    """Return the variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot. ``assumed`` is a deviation
-    of both, m.
+    """Return the variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot. ``assumed`` is a deviation,
+    m.
     """
     variance = numpy.full(position.shape, numpy.nan)
     if columns.has("sigma_x", "sigma_y"):
@@ -324,14 +322,17 @@ def _variances(
     else:
         names = ("range_sigma", "bearing_sigma")
         sigmas = numpy.array(
-            [float(columns.given.get(name, getattr(ManeuveringTargetParameters, name))) for name in names]
+            [
+                float(columns.user_parameters.get(name, getattr(ManeuveringTargetParameters, name)))
+                for name in names
+            ]
         )
     variance[there] = polar.cartesian_variances(position[there].T, sigmas[0], numpy.radians(sigmas[1])).T
     return variance
 
 
 def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the rows and times of all scans after the start; -1 for scans that have no row, put evenly into gaps."""
+    """Return the row and the time of every scan after the start; scans inserted evenly into gaps have row -1."""
     before, now = columns.time[first:-1], columns.time[first + 1 :]
     scans = numpy.maximum(numpy.rint((now - before) / interval).astype(int), 1)
     if scans.max() > LARGEST_GAP + 1:
@@ -348,7 +349,7 @@ def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray
 
 
 def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the seconds since the scan before, and since the last one that had a plot.
+    """Return the times since the previous scan and since the last scan with a plot, s, by name.
 
     Args:
         time: of the start, and of the scans, ``(1 + T,)``.
@@ -361,11 +362,11 @@ def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray
 
 
 def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the motion between scans by a second sensor; empty where there is none.
+    """Return the displacement between scans by a second sensor, by name; empty if there is none.
 
     Args:
         columns: of one track.
-        rows: of the scans, ``(T,)``, -1 for a scan that has no row: what was moved until the next row is divided
+        rows: of the scans, ``(T,)``, -1 for a scan that has no row: the displacement until the next row is divided
             evenly.
     """
     moved = _displacements(columns)
@@ -382,9 +383,7 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
 
 
 def _displacements(columns: Columns) -> numpy.ndarray | None:
-    """Return the displacement since the row before by the second sensor, ``(rows, 2)``, m; NaN where it has
-    nothing.
-    """
+    """Return the displacement since the previous row by the second sensor, m, ``(rows, 2)``; NaN where it has none."""
     if columns.has("odometry_x", "odometry_speed"):
         raise ValueError("it has odometry_x and odometry_speed: leave one of them out")
     if columns.has("odometry_x"):
@@ -399,14 +398,12 @@ def _displacements(columns: Columns) -> numpy.ndarray | None:
 
 
 def scale_noise(measurement: Any, factor: Any) -> Any:
-    """Multiply the deviations stated in a measurement by a factor."""
+    """Return a measurement with its stated deviations multiplied by a factor."""
     return measurement._replace(variance=measurement.variance * factor**2)
 
 
 def predict_position(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Return the position that an estimate predicts over the time to a measurement, and what was measured, m, ``(2,
-    N)`` each.
-    """
+    """Return the position that an estimate predicts for a measurement, and the measured one, m, ``(2, N)`` each."""
     predicted = mean[:2] + measurement.interval * mean[2:4]
     return predicted, numpy.where(measurement.available > 0.0, measurement.position, numpy.nan)
 
@@ -418,7 +415,7 @@ LOG_FORMAT = LogFormat(
     targets_move=True,
     scale_noise=scale_noise,
     predict=predict_position,
-    predicted=(Predicted("x", "m", "position"), Predicted("y", "m", "position")),
+    predicted=(PredictedCoordinate("x", "m", "position"), PredictedCoordinate("y", "m", "position")),
     plane=("x", "y", "truth_position_x", "truth_position_y"),
     plot_rows=PlotRows(FARTHEST_RANGE, LARGEST_GAP, FINER, ManeuveringTargetParameters.range_sigma),
     longest_interval=60.0,

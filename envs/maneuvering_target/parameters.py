@@ -1,21 +1,21 @@
-"""Every constant of ManeuveringTarget, with its limits."""
+"""Constants of ManeuveringTarget with their limits."""
 
 from dataclasses import dataclass
 
 from ..contract.parameters import TaskParameters, check_length, parameter, square_matrix
 
 PLOT_SLOTS = 12
-"""Plots of a scan at most, where there is clutter."""
+"""Largest number of plots of a scan, where there is clutter."""
 MOST_FALSE_PLOTS = 3.0
-"""In the window on average: one more than there are slots for then comes in one scan of 14,000."""
+"""Largest mean number of false plots in the window: with it one scan of 14,000 needs one slot more."""
 LARGEST_ERROR = 1e3
-"""Standard deviations by which a measurement is wrong: filters that take it for an outlier keep covariances positive
-definite up to some 3000 (``filters/contaminated_normal.py``), and a normal number reaches three."""
+"""Largest error of a measurement, standard deviations. Filters that take it for an outlier have positive definite
+covariances up to some 3000 (``filters/contaminated_normal.py``), and a normal number reaches three."""
 
 
 @dataclass(frozen=True)
 class ManeuveringTargetParameters(TaskParameters):
-    """Every constant of the task; each is a keyword of ``gym.make``."""
+    """Constants of the task; each is a keyword of ``gym.make``."""
 
     sampling_interval: float = parameter(6.0, above=0.0, at_most=86400.0)
     """Scan period T, s (paper)."""
@@ -43,15 +43,18 @@ class ManeuveringTargetParameters(TaskParameters):
     )
     """Mode probabilities at the start (paper)."""
     alpha_range: tuple[float, float] = parameter((0.05, 0.95), above=0.0, below=1.0, ascending=True)
-    """Position gain at action -1 and +1 of control ``gain`` (ours: stable, and wide enough for the best
-    schedule that knows the manoeuvre, which uses 0.07 to 0.88)."""
+    """Position gain at action -1 and +1 of control ``gain`` (ours: stable, and wide enough for the best schedule with
+    known
+    manoeuvres, which uses 0.07 to 0.88)."""
     gain_logits: float = parameter(2.0, above=0.0, at_most=10.0)
     """Logits by which an action of one moves a filter's position gain under control ``gains`` (ours: from 0.3 to 0.05
-    or 0.76, from 0.7 to 0.24 or 0.95, what the best schedule that knows the manoeuvre uses)."""
+    or
+    0.76, from 0.7 to 0.24 or 0.95, as the best schedule with known manoeuvres uses)."""
     evidence_scale: float = parameter(2.0, above=0.0)
-    """Nats that an evidence of one adds to a mode's log-posterior (ours: a policy that has just been made explores with
-    a standard deviation of about one, and with 4 nats that costs 45 % more than doing nothing, so that it learns to
-    survive its own noise; of 1, 2 and 4 a short plain run won most with 2; who explores less may ask for more)."""
+    """Nats that an evidence of one adds to a mode's log-posterior. Ours: a new policy explores with a standard
+    deviation of
+    about one, which with 4 nats costs 45 % more than action zero, so that it learns to survive its own noise. Of 1, 2
+    and 4 a short training run gained most with 2. A policy that explores less may use more."""
     averaging_measurements: float = parameter(5.0, at_least=1.0)
     """Time constant of the exponential averages in the observation, scans (ours)."""
     detection_probability: tuple[float, float] = parameter((1.0, 1.0), above=0.0, at_most=1.0, ascending=True)
@@ -61,9 +64,9 @@ class ManeuveringTargetParameters(TaskParameters):
     at T (k - j u), u uniform on [0, 1), drawn for every scan: later than scan k - 1, whose u differs (ours; the paper:
     never)."""
     glint_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability that both errors of a scan are those of glint, each scan on its own, without a report (ours)."""
+    """Probability that both errors of a scan are those of glint, independent of other scans and unreported (ours)."""
     glint_factor: float = parameter(5.0, above=0.0, at_most=LARGEST_ERROR)
-    """Their standard deviation over that of the others (ours)."""
+    """Ratio of the standard deviation of glint errors to that of the others (ours)."""
     coloured_sigma: tuple[float, float] = parameter(
         (0.0, 0.0), at_least=0.0, at_most=LARGEST_ERROR, ascending=True
     )
@@ -71,7 +74,7 @@ class ManeuveringTargetParameters(TaskParameters):
     polar, first-order Gauss-Markov, beside the white ones and in units of theirs; each episode draws its own, and
     without a report (ours; the paper: none)."""
     coloured_time: tuple[float, float] = parameter((12.0, 60.0), above=0.0, ascending=True)
-    """Limits of their correlation time, s; each episode draws its own (ours)."""
+    """Limits of the correlation time of coloured errors, s; each episode draws its own (ours)."""
     bias: float = parameter(0.0, at_least=0.0, at_most=LARGEST_ERROR)
     """Constant errors along x and y, or of range and azimuth where measurements are polar, in units of the white ones'
     standard deviations, are drawn within this for each episode, and without a report (ours; the paper: none)."""
@@ -79,12 +82,14 @@ class ManeuveringTargetParameters(TaskParameters):
     """Limits of the density of false plots, per square kilometre; each episode draws its own. A Poisson number of them
     lies in the window (ours; the paper: none)."""
     clutter_window: float = parameter(3000.0, above=0.0)
-    """Where there is clutter, plots are reported within this of the position that the filter predicts, along x and y, m
+    """Half width of the window of plots around the filter's predicted position, along x and y, m, where there is
+    clutter
     (ours)."""
     gate: float = parameter(16.0, above=0.0)
-    """Where there is clutter, the plot that is taken for the target's is the nearest to the predicted position, if its
-    squared distance, normalised with the covariances of prediction and plot, is below this; otherwise the scan missed
-    the target (ours)."""
+    """Gate in clutter: the plot taken for the target's is the nearest to the predicted position, if its squared
+    distance,
+    normalised with the covariances of prediction and plot, is below this; otherwise the scan missed the target (ours).
+    """
     gate_acceleration: float = parameter(3.0, at_least=0.0)
     """Standard deviation of an acceleration that the prediction of the gate allows for, m/s^2 (ours)."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
@@ -96,64 +101,65 @@ class ManeuveringTargetParameters(TaskParameters):
     """"maneuver": one manoeuvre at stated scans (paper). "random": drawn for each episode. "legs": straight
     legs and exact turns. "track": a table of states."""
     initial_position: tuple[float, float] = (-10000.0, 5000.0)
-    """x and y at the start, m, of flights "maneuver" and "legs" (paper)."""
+    """Initial x and y, m, of flights "maneuver" and "legs" (paper)."""
     initial_velocity: tuple[float, float] = (100.0, 0.0)
-    """m/s (paper)."""
+    """Velocity at the start, m/s, of flights "maneuver" and "legs" (paper)."""
     acceleration: tuple[float, float] = (-2.775, -2.775)
     """Acceleration during the manoeuvre of flight "maneuver", m/s^2 (paper)."""
     maneuver_steps: tuple[int, int] = parameter((50, 55), at_least=1, ascending=True)
-    """First and last scan that carry it. Reading: x(k) = F x(k-1) + B w(k) with w at k = 50 to 55, six
-    steps, because five would not turn the velocity by 90 degrees."""
+    """First and last scan of that acceleration. Reading: x(k) = F x(k-1) + B w(k) with w at k = 50 to 55, six steps,
+    because five would not turn the velocity by 90 degrees."""
     legs: tuple[tuple[float, float], ...] = ()
     """Duration (s) and turn rate (deg/s, anticlockwise positive, 0 = straight) of each leg of flight "legs"; after the
     last one it goes straight on."""
     leg_spread: float = parameter(0.0, at_least=0.0, below=1.0)
-    """Each leg lasts from 1 minus this to 1 plus this times as long, drawn for each episode (ours)."""
+    """Largest relative deviation of a leg's duration, drawn for each episode (ours)."""
     start_spread: float = parameter(0.0, at_least=0.0)
     """Each coordinate of the start of flight "legs" is drawn within this of ``initial_position``, m (ours)."""
     course_spread: float = parameter(0.0, at_least=0.0, at_most=180.0)
-    """Its course is drawn within this of that of ``initial_velocity``, deg (ours)."""
+    """Largest deviation of the direction of flight "legs" from that of ``initial_velocity``, deg (ours)."""
     mirrored: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability that all of its turns go to the other side (ours)."""
+    """Probability that all turns of flight "legs" go to the other side (ours)."""
     track: tuple[tuple[float, ...], ...] = ()
     """Rows x, y, vx, vy, each with horizon + 2 values one scan apart, of flight "track"."""
     track_scans: tuple[int, ...] = parameter((), at_least=1)
-    """Scans of each of several flights, of which every episode flies one; ``track`` then holds them one after another,
-    each with two values more than scans. Empty: one flight."""
+    """Scans of each of several flights, of which every episode flies one; ``track`` then contains them concatenated,
+    each
+    with two values more than scans. Empty: one flight."""
     start_range: tuple[float, float] = parameter((5e3, 60e3), above=0.0, ascending=True)
     """Limits of the range at the start of a random flight, m (ours)."""
     speed: tuple[float, float] = parameter((60.0, 300.0), above=0.0, ascending=True)
-    """Limits of the speed at its start, m/s (ours)."""
+    """Limits of the speed at the start of a random flight, m/s (ours)."""
     maneuver_count: tuple[int, int] = parameter((0, 3), at_least=0, ascending=True)
-    """Limits of the number of its manoeuvres (ours)."""
+    """Limits of the number of manoeuvres of a random flight (ours)."""
     maneuver_duration: tuple[int, int] = parameter((3, 12), at_least=1, ascending=True)
-    """Limits of their duration, scans (ours)."""
+    """Limits of the duration of these manoeuvres, scans (ours)."""
     maneuver_acceleration: tuple[float, float] = parameter((0.5, 6.0), at_least=0.0, ascending=True)
-    """Limits of their acceleration, m/s^2 (ours)."""
+    """Limits of the acceleration of these manoeuvres, m/s^2 (ours)."""
 
     @property
     def regular(self) -> bool:
-        """Return whether every scan sees the target, and nothing else, and none comes early."""
+        """Return whether every scan comes on time and sees the target, without clutter."""
         on_time = self.detection_probability == (1.0, 1.0) and self.scan_jitter == (0.0, 0.0)
         return on_time and not self.cluttered
 
     @property
     def cluttered(self) -> bool:
-        """Return whether there are false plots."""
+        """Return whether the radar reports false plots (clutter)."""
         return self.clutter_density[1] > 0.0
 
     @property
     def coloured(self) -> bool:
-        """Return whether errors may be coloured."""
+        """Return whether measurement errors may be correlated from scan to scan."""
         return self.coloured_sigma[1] > 0.0
 
     @property
     def window_area(self) -> float:
-        """Area in which plots are reported, m^2."""
+        """Area of the window of plots, m^2."""
         return (2.0 * self.clutter_window) ** 2
 
     def check(self) -> None:
-        """Check what concerns several fields together."""
+        """Raise ValueError for fields that contradict each other."""
         modes = len(self.gains)
         if modes < 2:
             raise ValueError(f"gains must name at least two filters, got {self.gains!r}")

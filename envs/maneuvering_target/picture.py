@@ -1,4 +1,4 @@
-"""Picture of ManeuveringTarget: the track, a close-up of the estimate, and strips of what the filter does."""
+"""Picture of ManeuveringTarget: the track, a close-up of the estimate, and time series of the filter."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,19 +22,20 @@ from ..drawing.rendering import (
     History,
     Picture,
     Strip,
-    grown,
+    widen_limits,
 )
 from .banks import AlphaBeta, Filters
 from .hypotheses import GROUPS, HypothesesState
 from .kalman_net import FRAME
 from .problem import TargetProblem
+from .unscented_banks import UnscentedState
 
 ELLIPSE_SIGMAS = 2.0
 """Half axes of the covariance ellipse, standard deviations."""
 RECENT = 15
-"""Scans whose errors the close-up keeps."""
+"""Number of scans whose errors the close-up shows."""
 CLOSE_UP_SIGMAS = 4.0
-"""Half width of the close-up at the start, in the largest measurement sigma of the flight."""
+"""Half width of the close-up at the start, in multiples of the largest measurement sigma of the flight."""
 TRACK = (0.06, 0.475, 0.43, 0.425)
 CLOSE_UP = (0.06, 0.075, 0.19, 0.19 * FIGURE_SIZE[0] / FIGURE_SIZE[1])
 """Left, bottom, width, height of the panels as shares of the figure; the close-up is square."""
@@ -61,7 +62,7 @@ def ellipse_axes(covariance: numpy.ndarray) -> tuple[float, float, float]:
 
 
 class ManeuveringTargetPicture(Picture):
-    """Track, close-up, normalised innovation, gain or weights, position error."""
+    """Picture of the track, a close-up, normalised innovation, gain or weights, and position error."""
 
     clock = "scan"
     strips_left: float = 0.545
@@ -78,7 +79,7 @@ class ManeuveringTargetPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Return the positions in km, innovation, gain or weights, position error with its reported sigma."""
+        """Return the values that the time series and the track show at a scan, by name; positions in km."""
         estimator = state.filter
         true, measured = state.truth.position[:, 0], state.measurement.position[:, 0]
         if not state.measurement.available[0]:
@@ -106,6 +107,12 @@ class ManeuveringTargetPicture(Picture):
             innovation, variance = estimator.innovation[:, 0], numpy.ones(2)
             groups = dict(zip(GROUPS, estimator.probabilities[:, 0], strict=True))
             values |= {f"kind.{kind}": sum(groups[group] for group in those) for kind, those in KINDS.items()}
+        elif isinstance(estimator, UnscentedState):
+            innovation, variance = estimator.innovation[:, 0], numpy.ones(2)
+            ratio = numpy.exp(2.0 * estimator.prior[:, 0])
+            values |= {
+                f"share.{axis}": share for axis, share in zip("xy", ratio / (1.0 + ratio), strict=True)
+            }
         else:
             assert isinstance(estimator, Filters)
             predicted = numpy.exp(estimator.log_predicted)
@@ -117,7 +124,7 @@ class ManeuveringTargetPicture(Picture):
         return {**values, "innovation_x": normalised[0], "innovation_y": normalised[1]}
 
     def begin(self, state: Episode) -> None:
-        """Fly the whole episode ahead, for limits that need not move; the truth does not depend on noise."""
+        """Simulate the truth of the whole episode in advance, so that axis limits need not move."""
         world, truth, measurement = self.task.world, state.truth, state.measurement
         still = numpy.zeros((world.normals + world.row_uniforms, truth.position.shape[-1]))
         positions, velocities, sigmas = [], [], []
@@ -136,7 +143,7 @@ class ManeuveringTargetPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Return the innovation, what is steered, error."""
+        """Return the time series of innovation, gain or weights, and error."""
         axes: Sequence[str] = "xy"
         if self.model.control == "gain":
             steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
@@ -146,6 +153,9 @@ class ManeuveringTargetPicture(Picture):
         elif self.model.control == "hypotheses":
             axes = FRAME
             steered = Strip("probabilities", {kind: f"kind.{kind}" for kind in KINDS}, (-0.04, 1.04))
+        elif self.model.control in ("sigma-points", "unscented"):
+            shares = {axis: f"share.{axis}" for axis in "xy"}
+            steered = Strip("position gain before the action", shares, (0.0, 1.0))
         else:
             gains = self.task.parameters.gains
             named = {f"filter {j + 1}, alpha {gain:g}": f"weight.{j}" for j, gain in enumerate(gains)}
@@ -166,17 +176,17 @@ class ManeuveringTargetPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """No: the strips say it in the filter's terms."""
+        """Return False: the time series show the filter's quantities instead of the observation."""
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return the scans of the manoeuvres."""
+        """Return the first and last scan of each manoeuvre, which are shaded."""
         return self.maneuvers
 
     # --- panels
 
     def open(self, figure: Figure) -> None:
-        """Make the track, the close-up and one legend for both."""
+        """Create the panels of track and close-up, and one legend for both."""
         track = self.track = figure.add_axes(TRACK)
         close_up = self.close_up = figure.add_axes(CLOSE_UP)
         for axes in (track, close_up):
@@ -235,7 +245,7 @@ class ManeuveringTargetPicture(Picture):
         )  # fmt: skip
 
     def arrange(self) -> None:
-        """Limits that hold the flight of this episode, in the shape of the panel."""
+        """Set the axis limits of the track to the whole flight of the episode, in the shape of the panel."""
         low, high = self.flight.min(axis=1), self.flight.max(axis=1)
         width, height = FIGURE_SIZE[0] * TRACK[2], FIGURE_SIZE[1] * TRACK[3]
         middle, half = 0.5 * (low + high), 0.5 * (high - low) + CLOSE_UP_SIGMAS * self.largest_sigma
@@ -252,7 +262,7 @@ class ManeuveringTargetPicture(Picture):
         self.close_up.set_ylim(-reach, reach)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Move everything to where it is now."""
+        """Update the track, the close-up and their texts to the current scan."""
         seen = int(state.measurement.available[0])
         self.arrived.set_data(*(state.measurement.position[:, :seen] / 1e3))
         pairs = {name: _pair(history, name) for name in ("true", "measured", "estimated")}
@@ -278,7 +288,7 @@ class ManeuveringTargetPicture(Picture):
             ellipse.set_width(2.0 * ELLIPSE_SIGMAS * large)
             ellipse.set_height(2.0 * ELLIPSE_SIGMAS * small)
             ellipse.set_angle(direction)
-        self._set_reach(grown((0.0, self.reach), 0.0, float(numpy.abs(estimated - true).max()))[1])
+        self._set_reach(widen_limits((0.0, self.reach), 0.0, float(numpy.abs(estimated - true).max()))[1])
 
 
 def _pair(history: Mapping[str, Any], name: str) -> numpy.ndarray:

@@ -1,4 +1,4 @@
-"""Parts of the task that world, filters and picture of ManeuveringTarget use."""
+"""Base class of the task ManeuveringTarget, used by its world, filters and picture."""
 
 from ..contract.task import Task
 from .parameters import ManeuveringTargetParameters
@@ -6,17 +6,17 @@ from .scans import has_regular_scans
 
 
 class TargetProblem(Task):
-    """The radar's parameters, and whether its scans are regular."""
+    """Base class of the task: the radar's parameters, and whether its scans are regular."""
 
     parameters: ManeuveringTargetParameters
 
     def set_up(self) -> None:
-        """Find out whether the scans are regular."""
+        """Determine whether the scans are regular: on time, and all see the target."""
         self.regular: bool = self.parameters.regular and (
             self.recording is None or has_regular_scans(self.recording, self.parameters)
         )
         """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""
 
     def _sampling_interval(self) -> float | None:
-        """Return the time between scans, s; None where some miss the target, or come early."""
+        """Return the constant time between scans, s; None where scans may miss the target or come early."""
         return self.parameters.sampling_interval if self.regular else None

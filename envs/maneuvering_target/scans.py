@@ -1,4 +1,4 @@
-"""The scans of ManeuveringTarget's radar: when they come, and whether they see the target."""
+"""Scans of ManeuveringTarget's radar: their times, and whether they see the target."""
 
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..contract.draws import Draws
-from ..contract.faults import undisturbed
+from ..contract.faults import draw_undisturbed
 from ..contract.observation import Array
 from ..contract.task import Task
 from ..data.recorded_world import Feed
@@ -16,20 +16,20 @@ from .parameters import ManeuveringTargetParameters
 
 
 class Scan(NamedTuple):
-    """One scan."""
+    """A scan of the radar."""
 
     motion: Motion
-    """Of the target at its time."""
+    """Motion of the target at the time of the scan."""
     available: Array
     """1 if it saw the target, 0 if not, ``(N,)``."""
     interval: Array
-    """s since the scan before, ``(N,)``."""
+    """Time since the previous scan, s, ``(N,)``."""
     elapsed: Array
-    """s since the last scan before that saw the target, ``(N,)``."""
+    """Time since the last earlier scan that saw the target, s, ``(N,)``."""
 
 
 class RegularScans:
-    """Every scan comes on time and sees the target.
+    """Scans that all come on time and see the target.
 
     Args:
         task: with the scan period.
@@ -48,13 +48,13 @@ class RegularScans:
         self.course = course
 
     def begin(self, draws: Draws, motion: Motion) -> Any:
-        """Draw what holds for an episode, whose track begins with a measurement on time: here nothing."""
+        """Return the scan quantities of an episode, whose track begins with a measurement on time: here None."""
         return None
 
     def advance(
         self, scans: Any, flight: Any, number: Array, before: Motion, uniforms: Array
     ) -> tuple[Any, Scan]:
-        """Fly on to a scan.
+        """Return the state of the scans and the next :class:`Scan`, with the target moved along its course.
 
         Args:
             scans: of :meth:`begin`, or the scan before.
@@ -72,43 +72,43 @@ class RegularScans:
         return number
 
     def context(self, scans: Any) -> dict[str, Array]:
-        """Return the context of the scans: here empty."""
+        """Return the context of the scans by name: here empty."""
         return {}
 
 
 class Reliability(NamedTuple):
-    """Scans that may miss the target and come early."""
+    """State of scans that may miss the target and come early."""
 
     detection_probability: Array
-    """``(N,)``."""
+    """Probability that a scan sees the target, ``(N,)``."""
     jitter: Array
     """Share of the scan period by which scans come early at most, ``(N,)``."""
     early: Array
-    """That of the current scan, ``(N,)``."""
+    """Share of the scan period by which the current scan comes early, ``(N,)``."""
     unseen: Array
-    """s since the last scan that saw the target, zero if the current one does, ``(N,)``."""
+    """Time since the last scan that saw the target, s, zero if the current one does, ``(N,)``."""
     position: Array
-    """When the current scan would have come on time, m, ``(2, N)``, and the velocity, m/s."""
+    """Position when the current scan would have come on time, m, ``(2, N)``; below, the velocity, m/s."""
     velocity: Array
 
 
 class UnreliableScans(RegularScans):
-    """A scan may miss the target and come early, each one on its own."""
+    """Scans that may miss the target and come early, each independent of the others."""
 
     row_uniforms = 2
 
     def begin(self, draws: Draws, motion: Motion) -> Reliability:
-        """Draw the probability that scans see the target, and by how much they come early at most."""
+        """Return the drawn detection probability and the largest share of the period by which scans come early."""
         p, never = self.parameters, 0.0 * motion[0][0]
         seen = draws.uniform("detection_probability", p.detection_probability)
         jitter = draws.uniform("scan_jitter", p.scan_jitter)
-        undisturbed(draws, p)  # takes its random number here
+        draw_undisturbed(draws, p)  # takes its random number here
         return Reliability(seen, jitter, never, never, *motion)
 
     def advance(
         self, scans: Reliability, flight: Any, number: Array, before: Motion, uniforms: Array
     ) -> tuple[Reliability, Scan]:
-        """Fly on to a scan, from where the target would have been on time at the one before."""
+        """Return the state of the scans and the next :class:`Scan`, which may be early or miss the target."""
         before = scans.position, scans.velocity
         on_time = self.course.advance(flight, number, before)
         early = scans.jitter * uniforms[1]
@@ -127,14 +127,12 @@ class UnreliableScans(RegularScans):
         return number - scans.early
 
     def context(self, scans: Reliability) -> dict[str, Array]:
-        """Return the probability that scans see the target, and the share of the scan period by which they come
-        early at most.
-        """
+        """Return the context by name: detection probability, and the largest share of the period of early scans."""
         return {"detection_probability": scans.detection_probability, "scan_jitter": scans.jitter}
 
 
 def has_regular_scans(recording: Recording | Feed, p: ManeuveringTargetParameters) -> bool:
-    """Return whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
+    """Return whether every scan of a recording has a plot and all are exactly one sampling interval apart."""
     if isinstance(recording, Feed):
         return recording.regular
     there = numpy.isfinite(recording.seconds)

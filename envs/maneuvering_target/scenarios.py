@@ -1,11 +1,11 @@
 """Scenarios of ManeuveringTarget: the paper's flight, the training distribution, and held-out flights.
 
-Windows are scan numbers, first and last included. The flights of ``atc``, ``cruise`` and ``descent``
-are legs that no training episode contains: time straight or turning (s) and turn rate (deg/s, anticlockwise positive),
-flown exactly. Start, course, side and times are drawn for each episode around the stated ones, so that no flight can be
-learned by heart. ``paper`` is as printed, the same flight always: a policy could learn it by heart. In
-``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar has one fault at a stated
-strength, as are those of ``glint``, ``biased`` and ``clutter``, whose faults no training episode holds.
+Windows are scan numbers, first and last included. The flights of ``atc``, ``cruise`` and ``descent`` are legs that no
+training episode contains: duration straight or turning (s) and turn rate (deg/s, anticlockwise positive), flown
+exactly. Start, direction, side and durations are drawn for each episode around the stated ones, so that a policy cannot
+memorise a flight. ``paper`` is as printed, always the same flight, which a policy could memorise. In
+``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar has one fault of a stated
+strength. The same holds for ``glint``, ``biased`` and ``clutter``, whose faults no training episode contains.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "paper",
             "The paper's flight: straight at 100 m/s, one 90-degree turn at scans 50 to 55, straight again. It is "
-            "always the same and can be learned by heart.",
+            "always the same and can be memorised.",
             {"flight": "maneuver"},
             {
                 "pre": (30, 49),

@@ -1,18 +1,19 @@
-"""The semi-Markov Gaussian sum of ManeuveringTarget: straight flight, thrust and turns, each with its age.
+"""The semi-Markov Gaussian sum of ManeuveringTarget: hypotheses of straight flight, thrust and turns, each with its
+age.
 
-Equations: ``filters/semi_markov.py``. Constant thrust and coordinated turns are what the target flies in the training
+Equations: ``filters/semi_markov.py``. Constant thrust and coordinated turns are the manoeuvres of the training
 distribution; the filter's parameters are its prior of them. It is the estimator ``semi-markov`` of the baselines, and
-what the control ``hypotheses`` steers. H hypotheses of kind and age predict to the scan with weights p', means x' and
-covariances P'. Factors f of its settings change what the measurement is weighed with, this once:
+the filter that the control ``hypotheses`` steers. H hypotheses of kind and age predict to the scan with weights p',
+means x' and covariances P'. Factors f of its settings change the update with this measurement alone:
 
     p'(h) <- p'(h) f1^begun(h) f2^ended(h) f3^turning(h)                                    renormalised by Bayes' rule
     P'(h) <- P'(h) f4 in straight flight, P'(h) f5 in manoeuvres,    R <- R f6
 
 begun: a manoeuvre of the first age; ended: straight flight of the first age; turning: a turn of any age. So f1 and f2
 multiply the odds that a manoeuvre has just begun, or ended, as other hazards would; f3 those of a turn against all
-else; f4 and f5 say that the prediction is worse or better than the filter believes, as in a filter of fading memory (H.
-W. Sorenson and J. E. Sacks, Recursive fading memory filtering, Information Sciences 3, 1971, 101-119). A scan that
-missed the target is prediction only.
+else; f4 and f5 scale the predicted covariance, as in a filter of fading memory (H. W. Sorenson and J. E. Sacks,
+Recursive fading memory filtering, Information Sciences 3, 1971, 101-119). In a scan that missed the target there is
+only a prediction.
 """
 
 import functools
@@ -35,48 +36,50 @@ from .world import Measurement
 DURATIONS = (0.0, 0.0, *[1.0] * 10)
 """Relative probabilities of manoeuvres of 1, 2, ... scans in the training distribution."""
 SLOWEST = 30.0
-"""m/s: turns of what is slower are no sharper, as in the training distribution."""
+"""Smallest speed by which the acceleration of a turn is divided, m/s, as in the training distribution."""
 
 
 class SemiMarkovPrior(NamedTuple):
-    """Prior of a semi-Markov filter on flights."""
+    """Prior of a semi-Markov filter on the flights."""
 
     begin: float = 0.0157
     """Probability that a manoeuvre begins before a scan."""
     turning: float = 0.5
     """Share of turns among manoeuvres."""
     hazards: tuple[float, ...] = tuple(semi_markov.hazards(DURATIONS, 4))
-    """Probability that a manoeuvre ends after each age in scans; the last one for all ages beyond."""
+    """Probability that a manoeuvre ends after each age in scans; the last one for all later ages."""
     thrust: float = 2.56
     """Standard deviation of the acceleration of thrust along x and y, m/s^2."""
     turns: tuple[float, ...] = (1.875, 4.625)
-    """Mean acceleration in gentle, steep, ... turns, m/s^2; none: all manoeuvres are thrust."""
+    """Mean acceleration in gentle, steep, ... turns, m/s^2; empty: all manoeuvres are thrust."""
     turn_spread: float = 0.8
-    """Its standard deviation in each, m/s^2."""
+    """Standard deviation of the acceleration in each, m/s^2."""
     hard_turns: float = 0.0
-    """Share among turns of harder ones, which have hypotheses of their own; zero: there are none."""
+    """Share of harder turns among turns, with hypotheses of their own; zero: there are none."""
     hard_turn: tuple[float, float] = (11.0, 2.5)
     """Mean and standard deviation of the acceleration in these, m/s^2."""
     noise: float = 0.01
-    """Standard deviation of what disturbs all flight, an acceleration that changes from scan to scan, m/s^2."""
+    """Standard deviation of an acceleration that changes from scan to scan in all flight, m/s^2."""
     change: float = 0.01
-    """Of the change of a manoeuvre's acceleration in a scan period, m/s^2."""
+    """Standard deviation of the change of a manoeuvre's acceleration in a scan period, m/s^2."""
     outliers: float = 1e-4
-    """Probability that a measurement is one."""
+    """Probability that a measurement is an outlier."""
     outlier_factor: float = 5.0
-    """Standard deviation of its errors over the stated one."""
+    """Ratio of the standard deviation of an outlier's errors to the stated one."""
     straight_ages: int = 12
-    """Straight flights after different manoeuvres stay apart for so many scans; with one, what has hardly been a
-    manoeuvre spoils the long memory of straight flight in every scan."""
+    """Number of scans for which straight flights after different manoeuvres remain separate hypotheses. With one, a
+    false
+    manoeuvre spoils the estimate of long straight flight in every scan."""
 
 
 TRAINING = SemiMarkovPrior()
-"""Of the flights of ``random``: on average 1.5 manoeuvres of 3 to 12 scans, all durations alike, in 100 scans; half of
-them turns; accelerations uniform from 0.5 to 6 m/s^2, whose halves have these means and deviations, and whose mean
-square on each axis is that of the thrust. Nothing disturbs them, and there are no outliers: numbers for these are
-small, so that what is impossible there can still be survived."""
+"""Prior of the flights of ``random``: on average 1.5 manoeuvres of 3 to 12 scans, all durations equally probable, in
+100
+scans; half of them turns. Accelerations are uniform from 0.5 to 6 m/s^2, whose halves have these means and deviations,
+and whose mean square on each axis is that of the thrust. Nothing else disturbs them and there are no outliers; small
+numbers for these let the filter survive both."""
 WIDE = TRAINING._replace(thrust=4.0, hard_turns=0.03)
-"""For manoeuvres of any strength: most are those of training, some twice as hard. On the validation split of ``random``
+"""Prior of manoeuvres of any strength: most as in training, some twice as hard. On the validation split of ``random``
 it costs as much as ``TRAINING`` within chance."""
 VAGUE = SemiMarkovPrior(
     begin=0.03,
@@ -88,15 +91,16 @@ VAGUE = SemiMarkovPrior(
     change=0.1,
     outliers=0.02,
 )
-"""Ours, for flights of which little is known: a manoeuvre every few minutes, of any duration, ten scans on average."""
+"""Prior, ours, for little-known flights: a manoeuvre every few minutes, of any duration, ten scans on average."""
 
 
 def training_prior(hypotheses: int) -> SemiMarkovPrior:
-    """Return the prior of the training distribution with few hypotheses.
+    """Return the prior of the training distribution for a filter of few hypotheses.
 
     Manoeuvres have one age: thrust, and from nine hypotheses on a turn to either side. All others are ages of straight
-    flight, which matter most: as long as they last, what has hardly been a manoeuvre stays apart. Of the divisions of
-    3, 5, 9 and 15 that were tried on the validation split this costs least, or within chance of it.
+    flight, which matter most: they keep false manoeuvres apart. Of the divisions of 3, 5, 9 and 15 that were tried
+    on the
+    validation split this costs least, or within chance of it.
 
     Args:
         hypotheses: H, at least 2.
@@ -112,35 +116,36 @@ def training_prior(hypotheses: int) -> SemiMarkovPrior:
 
 Tables = tuple[AgedHypotheses, ...]
 """Hypotheses of straight flight by the time since the last manoeuvre, with position and velocity; of thrust by age,
-with the acceleration along x and y, too; and of turns, where the prior has any, by age, one kind of turn after another,
-with the turn rate."""
+with
+the acceleration along x and y; and of turns, if the prior has any, by age, one kind of turn after another, with the
+turn rate."""
 
 
 class Turn(NamedTuple):
-    """A kind of turn."""
+    """A kind of turn: its acceleration and share."""
 
     acceleration: float
-    """Its mean, to the left positive, m/s^2."""
+    """Mean acceleration, to the left positive, m/s^2."""
     spread: float
-    """Its standard deviation, m/s^2."""
+    """Standard deviation of the acceleration, m/s^2."""
     share: float
-    """Among turns."""
+    """Share of this kind among turns."""
 
 
 class SemiMarkovState(NamedTuple):
     """State of the semi-Markov filter."""
 
     mean: Array
-    """Of all hypotheses together, ``(4, N)``."""
+    """Mean of all hypotheses together, ``(4, N)``."""
     covariance: Array
-    """``(4, 4, N)``."""
+    """Covariance of all hypotheses together, ``(4, 4, N)``."""
     likelihood: Likelihood
     track: Tables
-    """With packed covariances."""
+    """Hypotheses, with packed covariances."""
 
 
 class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measurement, SemiMarkovState]):
-    """Gaussian sum over straight flight, constant thrust and coordinated turns with the time since each began.
+    """Gaussian sum over straight flight, constant thrust and coordinated turns, each with the time since it began.
 
     Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
     distribution, not geometrically. Turns to the left and to the right are kinds of their own, and so are gentle
@@ -148,7 +153,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
 
     Args:
         task: the problem.
-        prior: what it expects.
+        prior: of flights and measurements.
         **changed: fields of the prior.
     """
 
@@ -172,15 +177,15 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
             self.turns += [Turn(side * mean, spread, 0.5 * prior.hard_turns) for side in (1.0, -1.0)]
         kinds, first = 1 + len(self.turns), prior.straight_ages
         self.kinds = [range(first + i * self.ages, first + (i + 1) * self.ages) for i in range(kinds)]
-        """Numbers of the hypotheses of thrust, and of each kind of turn; before them are those of straight flight."""
+        """Indices of the hypotheses of thrust, and of each kind of turn; those before are straight flight."""
         every = range(self.kinds[-1][-1] + 1)
         begun, turning = [kind[0] for kind in self.kinds], range(self.kinds[0][-1] + 1, len(every))
         raised = [[float(h in those) for h in every] for those in (begun, [0], turning)]
         self.raised: Array = task.constant(raised)[:, :, None]
-        """Whose weights each of the first three settings multiplies, ``(3, H, 1)``."""
+        """Mask of the hypotheses whose weights each of the first three settings multiplies, ``(3, H, 1)``."""
 
     def start(self, initial: Initial) -> SemiMarkovState:
-        """Start at the initial estimate, long in straight flight."""
+        """Return the state at the start: the initial estimate, in straight flight for long."""
         xp, least = self.xp, semi_markov.LEAST_PROBABILITY
         none = 0.0 * initial.mean[0]
 
@@ -203,23 +208,25 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return SemiMarkovState(initial.mean, initial.covariance, Likelihood.unknown(none), packed)
 
     def begin_thrust(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Return the state with an acceleration that is not known, ``(6, N)`` and ``(6, 6, N)``."""
+        """Return the state extended by an unknown acceleration, mean ``(6, N)`` and covariance ``(6, 6, N)``."""
         none = 0.0 * mean[:2]
         variance = self.prior.thrust**2 + none[0]
         return self.xp.concat([mean, none]), self.augment(covariance, [variance, variance])
 
     def begin_turn(self, mean: Array, covariance: Array, turn: Turn) -> tuple[Array, Array]:
-        """Return the state with the turn rate of a kind of turn, ``(5, N)`` and ``(5, 5, N)``."""
+        """Return the state extended by the turn rate of a kind of turn, mean ``(5, N)`` and covariance ``(5, 5,
+        N)``.
+        """
         pace = self.xp.sqrt(self.squared_pace(mean))
         rate = turn.acceleration / pace
         return self.xp.concat([mean, rate[None]]), self.augment(covariance, [(turn.spread / pace) ** 2])
 
     def squared_pace(self, mean: Array) -> Array:
-        """Return the square of the speed that divides accelerations of turns, (m/s)^2."""
+        """Return the square of the speed by which accelerations of turns are divided, (m/s)^2."""
         return self.xp.clip(mean[2] ** 2 + mean[3] ** 2, SLOWEST**2, None)
 
     def augment(self, covariance: Array, variances: list[Array]) -> Array:
-        """Return the covariance of a state and further components that are independent of it and of each other."""
+        """Return the covariance of a state extended by further components, independent of it and of each other."""
         n, none = covariance.shape[0], 0.0 * variances[0]
         size = range(n + len(variances))
         return self.xp.stack(
@@ -235,7 +242,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         )
 
     def switch(self, straight: AgedHypotheses, thrust: AgedHypotheses, *turns: AgedHypotheses) -> Tables:
-        """End and begin manoeuvres."""
+        """Return the hypotheses after manoeuvres have begun and ended with their hazards."""
         ages, turning = self.ages, self.prior.turning if self.turns else 0.0
         modes = [semi_markov.Mode(thrust, self.hazard, (1.0 - turning) * self.prior.begin, self.begin_thrust)]
         for table in turns:
@@ -254,7 +261,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
     def fly(
         self, straight: AgedHypotheses, thrust: AgedHypotheses, *turns: AgedHypotheses, T: Array
     ) -> Tables:
-        """Fly on for an interval (s) in the mode of each hypothesis."""
+        """Return the hypotheses predicted over an interval (s), each by its kind of motion."""
         F, unit = (matrix[:, :, None] for matrix in self.motion(T))
         Q = self.prior.noise**2 * unit
         change = self.prior.change**2 * T[None] / self.task.parameters.sampling_interval
@@ -275,17 +282,22 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return tuple(moved)
 
     def predict(self, state: SemiMarkovState, measurement: Measurement) -> SemiMarkovState:
-        """End and begin manoeuvres, and predict to the scan."""
+        """Return the hypotheses predicted to the scan, after manoeuvres have begun and ended."""
         switched = self.switch(*(table.unpack() for table in state.track))
         tables = self.fly(*switched, T=measurement.interval)
         return state._replace(track=tuple(table.pack() for table in tables))
 
-    def heeds(self, measurement: Measurement) -> Array:
-        """Return one where the scan saw the target."""
+    def has_effect(self, measurement: Measurement) -> Array:
+        """Return one where the scan saw the target, so that an action has an effect, zero elsewhere, ``(N,)``."""
         return measurement.available
 
     def apply_factors(self, tables: Iterable[AgedHypotheses], logarithms: Array) -> list[AgedHypotheses]:
-        """Multiply weights and covariances by factors of these logarithms, ``(5, N)``."""
+        """Return the hypotheses with weights and covariances multiplied by factors.
+
+        Args:
+            tables: the hypotheses.
+            logarithms: of the factors, ``(5, N)``.
+        """
         factors = self.xp.exp(ordered_sum(self.raised * logarithms[:3, None]))
         straight, manoeuvre = self.xp.exp(logarithms[3:])
         scaled, first = [], 0
@@ -297,15 +309,16 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
             first = last
         return scaled
 
-    def update(self, state: SemiMarkovState, given: FilterInput) -> SemiMarkovState:
-        """Take in a measurement. Its normalised innovation squared is the mean of the filters' by their posterior
-        weights.
+    def update(self, state: SemiMarkovState, inputs: FilterInput) -> SemiMarkovState:
+        """Return the state with all hypotheses and their weights updated with a measurement.
+
+        Its normalised innovation squared is the mean of the filters', by their posterior weights.
         """
-        xp, measurement = self.xp, given.measurement
+        xp, measurement = self.xp, inputs.measurement
         tables = [table.unpack() for table in state.track]
-        if given.action is not None:
-            tables = self.apply_factors(tables, given.action[:5])
-            measurement = measurement._replace(variance=xp.exp(given.action[5]) * measurement.variance)
+        if inputs.action is not None:
+            tables = self.apply_factors(tables, inputs.action[:5])
+            measurement = measurement._replace(variance=xp.exp(inputs.action[5]) * measurement.variance)
         results = [self.update_table(table, measurement) for table in tables]
         logarithms = xp.concat(
             [xp.log(table.probability) + r.log_likelihood for table, r in zip(tables, results, strict=True)]
@@ -326,7 +339,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         return SemiMarkovState(mean, covariance, likelihood, track)
 
     def update_table(self, table: AgedHypotheses, measurement: Measurement) -> kalman.Update:
-        """Update every hypothesis with the measured position, or leave it as predicted."""
+        """Return every hypothesis updated with the measured position, or as predicted without one."""
         result = contaminated_normal.update_position(
             table.mean,
             table.covariance,
@@ -339,5 +352,5 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
 
 
 def _moved(table: AgedHypotheses, mean: Array, covariance: Array) -> AgedHypotheses:
-    """Return the hypotheses after the time update."""
+    """Return the hypotheses with the mean and covariance of the time update."""
     return table._replace(mean=mean, covariance=mirror_lower(covariance))

@@ -1,9 +1,9 @@
-"""The fully learned estimator of ManeuveringTarget: what :mod:`.student_bank` takes from it.
+"""The fully learned estimator of ManeuveringTarget: its frame, units and motion for :mod:`.student_bank`.
 
 The frame is that of the predicted velocity, along it and across it to the left, for positions and for velocities. The
-unit of a position is the measurement's sigma there, that of a velocity what such an error makes of it in a scan period.
-Of the motion the network answers with the acceleration until the next scan, along and across. Turning or moving the
-whole problem turns and moves the estimates.
+unit of a position is the measurement's sigma in the frame; that of a velocity is this sigma over the scan period. The
+network outputs the acceleration until the next scan, along and across. A rotation or shift of the whole problem rotates
+or shifts the estimates.
 """
 
 from collections.abc import Sequence
@@ -24,11 +24,11 @@ from .student_bank import StudentBank, StudentState, View
 from .world import Measurement
 
 ACCELERATION_REACH = 32.0
-"""Acceleration answered at a gain of the velocity of one, m/s^2: 8 at that of a network without training."""
+"""Acceleration for an output of one at a velocity gain of one, m/s^2: 8 at the gain of an untrained network."""
 
 
 class RadarStudentBank(StudentBank[object, Measurement]):
-    """Position and velocity of an aircraft, corrected in the frame of its velocity."""
+    """Bank of ``student``: position and velocity of an aircraft, corrected in the frame of its velocity."""
 
     parameters: ManeuveringTargetParameters
     # An alpha-beta filter without training: a half, and a quarter of the innovation over the scan period.
@@ -37,14 +37,14 @@ class RadarStudentBank(StudentBank[object, Measurement]):
     motions: ClassVar[Sequence[int]] = (2, 3)
 
     def rotate(self, mean: Array) -> Array:
-        """Turn positions and velocities alike, ``(4, 4, N)``."""
+        """Return the rotation of positions and velocities into the frame, ``(4, 4, N)``."""
         turn = frame_of(mean[2:])
         none = 0.0 * turn
         sides = [[turn, none], [none, turn]]
         return self.xp.concat([self.xp.concat(row, axis=1) for row in sides])
 
-    def look(self, mean: Array, motion: Array, measurement: Measurement) -> View:
-        """Predict by the acceleration that was answered."""
+    def predict_view(self, mean: Array, motion: Array, measurement: Measurement) -> View:
+        """Return the estimate predicted with the last output acceleration, with frame, units and innovation."""
         xp = self.xp
         mean, _ = advance(mean, ACCELERATION_REACH * motion, measurement.interval)
         frame = self.rotate(mean)
@@ -57,7 +57,7 @@ class RadarStudentBank(StudentBank[object, Measurement]):
 
     @property
     def features(self) -> Sequence[Block]:
-        """The sensor's covariance in the frame, the speed, and the clock."""
+        """Observation blocks of the sensor's covariance in the frame, the speed, and the time."""
 
         def covariance(track: StudentState, measurement: Measurement) -> Array:
             return self.turned_covariance(track.view.frame[:2, :2], measurement)
@@ -73,5 +73,5 @@ class RadarStudentBank(StudentBank[object, Measurement]):
         return (*sensor_blocks(self, variances, coupling), *clock_blocks(self))
 
     def turned_covariance(self, turn: Array, measurement: Measurement) -> Array:
-        """Return the covariance of a measurement in the frame, ``(2, 2, N)``, m^2."""
+        """Return the covariance of a measurement in the frame, m^2, ``(2, 2, N)``."""
         return product(product(turn, sensor_covariance(measurement, self.xp)), transpose(turn))

@@ -1,23 +1,23 @@
-r"""The fully learned estimator ``student``: a network answers with corrections and covariance at every measurement.
+r"""The fully learned estimator ``student``: a network outputs corrections and covariance at every measurement.
 
-No Kalman filter stands behind it. An environment declares its frame, its units and its motion (:class:`StudentBank`);
-the rest is the same everywhere. With U the rotation into the frame, s the unit of each component there, m what was
-answered of the motion and nu the innovation over the sensor's sigma, zero where nothing was received,
+It contains no Kalman filter. An environment declares its frame, its units and its motion (:class:`StudentBank`);
+the rest is the same everywhere. With U the rotation into the frame, s the unit of each component in it, m the last
+motion output and nu the innovation over the sensor's sigma, zero where nothing was received,
 
     predict   x' = f(x, m)
     update    x = x' + U^T diag(s) c,  c_i = G_i (nu_j + sum_k a_ik nu_k + offset_reach a_i),  k other than j
     motion    m_l = G_i a_l
     report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_ii,  L_ij = coupling_reach L_ii a_ij  (j < i)
 
-with a in [-1, 1] the network's answers, j the axis that corrects component i, G_i = logistic(logit G0_i + gain_reach a)
-and i in m_l the component that is moved. All zero is a filter with the fixed gain G0. Gains are answered as logits, and
-whatever else moves a component is in units of its gain: on straight flight the best gains are some thousandths, and
-what is not as small drives the estimate away. Because everything that is shown and answered is relative to the frame,
-the estimator is as symmetric as the frame is. Nothing makes it stable: a Kalman filter's gain follows from a
-covariance, and this one loses the track where its network answers wrongly.
+with a in [-1, 1] the network's outputs, j the axis that corrects component i, G_i = logistic(logit G0_i + gain_reach a)
+and i in m_l the component that is moved. All zero is a filter with the fixed gain G0. Gains are output as logits, and
+other terms of a component are in units of its gain: in straight flight the best gains are some thousandths, and any
+larger term makes the estimate drift. Because all inputs and outputs are relative to the frame, the estimator is as
+symmetric as the frame is. Its stability is not guaranteed: a Kalman filter's gain follows from a covariance, and this
+one loses the track where its network outputs a wrong gain.
 
 A network that is trained through its own recursive estimate is that of Haarnoja and others, "Backprop KF: Learning
-Discriminative Deterministic State Estimators" (NeurIPS 2016); theirs answers with the measurement of a Kalman filter.
+Discriminative Deterministic State Estimators" (NeurIPS 2016); theirs outputs the measurement of a Kalman filter.
 """
 
 import itertools
@@ -34,55 +34,55 @@ from ..contract.filter import Bank, Initial, Measurement, TaskT
 from ..contract.observation import SIGNED_LOG, Array, Block
 
 GAIN_REACH = 5.0
-"""Logits by which an answer of one moves a gain: from a half to 0.007 or 0.993."""
+"""Logits by which an output of one moves a gain: from a half to 0.007 or 0.993."""
 OFFSET_REACH = 2.0
-"""Innovation, in sigmas, that a correction without one counts for at most."""
+"""Largest correction without an innovation, as an equivalent innovation in sigmas."""
 DEVIATION_RANGE = 50.0
-"""Largest factor and divisor of a reported deviation; before what it shares with the components above."""
+"""Largest factor and divisor of a reported deviation, before its correlation with earlier components."""
 COUPLING_REACH = 4.0
-"""Largest entry of a Cholesky factor beside the diagonal, over that on it: correlations of up to 0.97."""
+"""Largest off-diagonal entry of the Cholesky factor over the diagonal one: correlations of up to 0.97."""
 
 
 class View(NamedTuple):
-    """A measurement and the estimate predicted to it."""
+    """A measurement and the estimate predicted to it, in the frame."""
 
     mean: Array
-    """Predicted, ``(C, N)``."""
+    """Predicted mean, ``(C, N)``."""
     frame: Array
-    """U, ``(C, C, N)``."""
+    """Rotation U into the frame, ``(C, C, N)``."""
     unit: Array
-    """s, ``(C, N)``."""
+    """Units s of the components in the frame, ``(C, N)``."""
     innovation: Array
-    """nu, ``(m, N)``."""
+    """Innovation nu over the sensor's sigma, ``(m, N)``."""
 
 
 class StudentState(NamedTuple):
-    """The estimate at one moment."""
+    """State of the learned estimator."""
 
     mean: Array
-    """``(C, N)``; predicted between :meth:`StudentBank.predict` and the action."""
+    """Mean, ``(C, N)``; predicted between :meth:`StudentBank.predict` and the action."""
     covariance: Array
-    """As it was reported last, ``(C, C, N)``."""
+    """Last reported covariance, ``(C, C, N)``."""
     motion: Array
-    """Answered last of the motion, between -1 and 1, ``(k, N)``; one row of zeros where nothing is."""
+    """Last motion output, between -1 and 1, ``(k, N)``; one row of zeros where there is none."""
     view: View
-    """Of the measurement at hand."""
+    """Current measurement and the estimate predicted to it."""
 
 
 class StudentBank(Bank[TaskT, Measurement, StudentState]):
-    """An estimate that the action corrects; what an environment declares stands below.
+    """Base class of the banks of ``student``: an estimate that the action corrects.
 
-    A subclass defines how the estimate moves and in which frame it is corrected (:meth:`rotate`, :meth:`look`), and
-    what else is shown (:attr:`features`).
+    A subclass defines how the estimate moves and in which frame it is corrected (:meth:`rotate`,
+    :meth:`predict_view`), and further features (:attr:`features`).
     """
 
     gain: ClassVar[Sequence[tuple[int, float]]]
-    """For each component the axis of the innovation that corrects it, and G0 in (0, 1): what a network without training
-    corrects by."""
+    """For each component the axis of the innovation that corrects it, and the gain G0 in (0, 1) of an untrained
+    network."""
     axes: ClassVar[Sequence[str]]
     """Names of the numbers of an innovation, ``(m,)``."""
     motions: ClassVar[Sequence[int]] = ()
-    """For each number that is answered of the motion the component that it moves."""
+    """Index of the component that each motion output moves."""
 
     def __init__(self, task: TaskT, control: str) -> None:
         super().__init__(task, control)
@@ -91,35 +91,36 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
 
     @abstractmethod
     def rotate(self, mean: Array) -> Array:
-        """Return U at an estimate, ``(C, C, N)``; the identity where the components are the frame."""
+        """Return the rotation U into the frame at an estimate, ``(C, C, N)``; an identity without a frame."""
 
     @abstractmethod
-    def look(self, mean: Array, motion: Array, measurement: Any) -> View:
-        """Predict to a measurement and compare.
+    def predict_view(self, mean: Array, motion: Array, measurement: Any) -> View:
+        """Return the estimate predicted to a measurement, with frame, units and innovation.
 
         Args:
-            mean: estimate before, ``(C, N)``.
-            motion: what was answered of the motion then, ``(k, N)``.
+            mean: previous estimate, ``(C, N)``.
+            motion: last motion output, ``(k, N)``.
             measurement: that arrives, whose missing values are zero.
         """
 
     @property
     @abstractmethod
     def features(self) -> Sequence[Block]:
-        """Return the features of the measurement beside the innovation, relative to the frame."""
+        """Observation blocks beside the innovation, in units of the frame; a subclass declares them."""
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gains, offsets, the Cholesky factor and the motion."""
+        """Gymnasium box of gains, offsets, the Cholesky factor and the motion."""
         count = self.size * (self.measured + 1) + self.size * (self.size + 1) // 2 + len(self.motions)
         return gymnasium.spaces.Box(-1.0, 1.0, (count,), numpy.float32)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """The innovation, and what the environment shows; what was answered before, only the network's memory knows.
+        """Observation blocks: the innovation and the features, without the last action.
 
-        Shown again, answers that vary little before anything is learned would be normalised by that little, and
-        gradients would grow with every scan that they flow back.
+        At the beginning of training the outputs vary little. As observations they would be normalised by that small
+        spread, and
+        their gradients would grow with every scan in the backward pass.
         """
         return (
             Block(
@@ -133,7 +134,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         )
 
     def start(self, initial: Initial) -> StudentState:
-        """Start at the initial estimate."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         frame, none = self.rotate(initial.mean), 0.0 * initial.mean
         motion = self.xp.stack([none[0]] * max(len(self.motions), 1))
         innovation = self.xp.stack([none[0]] * self.measured)
@@ -141,12 +142,12 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         return StudentState(initial.mean, initial.covariance, motion, view)
 
     def predict(self, state: StudentState, measurement: Measurement) -> StudentState:
-        """Predict by the motion that was answered, and compare."""
-        view = self.look(state.mean, state.motion, measurement)
+        """Return the state predicted to the measurement with the last motion output, with the innovation."""
+        view = self.predict_view(state.mean, state.motion, measurement)
         return state._replace(mean=view.mean, view=view)
 
     def act(self, state: StudentState, measurement: Measurement, action: Array) -> StudentState:
-        """Correct the estimate and report the covariance as the network answers."""
+        """Return the state with the estimate corrected and its covariance set by the network's outputs."""
         xp, C, m = self.xp, self.size, self.measured
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         ends = numpy.cumsum([0, C * m, C, C, C * (C - 1) // 2, len(self.motions)])
@@ -173,7 +174,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         )
 
     def _correct(self, by_gain: Array, offset: Array, innovation: Array) -> tuple[list[Array], Array]:
-        """Return G of each component, and c, ``(C, N)``."""
+        """Return the gain G of each component, and the correction c, ``(C, N)``."""
         gains, corrections = [], []
         for row, beyond, (axis, first) in zip(by_gain, offset, self.gain, strict=True):
             gain = 1.0 / (1.0 + (1.0 / first - 1.0) * self.xp.exp(-GAIN_REACH * row[axis]))

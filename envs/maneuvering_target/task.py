@@ -2,7 +2,7 @@
 
 Source: P. A. Bakulev, M. I. Sychev and Nguyen Trong Luu, "Tracking a manoeuvring target with an IMM
 algorithm over two alpha-beta filters" (in Russian). Equation numbers are theirs as far as they print them;
-the mathematics stands in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``filters/polar.py``.
+the equations are in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``filters/polar.py``.
 """
 
 from typing import Any, ClassVar
@@ -23,18 +23,19 @@ from .parameters import ManeuveringTargetParameters
 from .problem import TargetProblem
 from .scenarios import SCENARIOS
 from .student import RadarStudentBank
+from .unscented_banks import ScalingBank, SigmaPointsBank
 from .world import RadarWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return what draws an episode; imported here, because it brings matplotlib."""
+    """Return the object that draws an episode; imported here, because it needs matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
 
 
 class ManeuveringTarget(TargetProblem):
-    """Radar tracking of an aircraft that manoeuvres, with fixed-gain filters (Bakulev, Sychev, Nguyen).
+    """Radar tracking of a manoeuvring aircraft: steer an IMM of fixed-gain filters (Bakulev, Sychev, Nguyen).
 
     ## Description
 
@@ -48,7 +49,7 @@ class ManeuveringTarget(TargetProblem):
 
     ## Action Space
 
-    What each control means stands in ``Actions``. Values outside the box are taken at its edge.
+    ``Actions`` describes each control. Values outside the box are clipped to it.
 
     ## Observation Space
 
@@ -107,6 +108,8 @@ class ManeuveringTarget(TargetProblem):
         "gain": GainBank,
         "hypotheses": HypothesesBank,
         "mode": FilterBank,
+        "sigma-points": SigmaPointsBank,
+        "unscented": ScalingBank,
         "weights": FilterBank,
     }
     scenarios = SCENARIOS
@@ -116,7 +119,7 @@ class ManeuveringTarget(TargetProblem):
         Component("velocity_x", "m/s", group="velocity"),
         Component("velocity_y", "m/s", group="velocity"),
     )
-    # What a turn costs rules the noise of the reward, and who does nothing bears it too; a logarithm, because a few
+    # The cost of turns dominates the noise of the reward, also for action zero; a logarithm, because a few
     # hard turns would hide what an action changes on all other flights.
     reward: ClassVar[Reward] = Reward(
         "squared position error over the squared range sigma",
@@ -133,13 +136,18 @@ class ManeuveringTarget(TargetProblem):
             {
                 "evidence": "times 2 nats (`evidence_scale`), added to the log-posterior of each mode; **0 is the paper's IMM**",
                 "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
-                "the beta that belongs to it; **0 is the paper's IMM**",
+                "the beta that follows from it; **0 is the paper's IMM**",
                 "gain": "position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; "
                 "beta = alpha^2 / (2 - alpha)",
                 "hypotheses": "factors r^a in the semi-Markov Gaussian sum at this scan: odds that a manoeuvre has begun (r = 3), "
                 "has ended (9), is a turn (1.5); predicted covariances in straight flight and in manoeuvres (1.25 each); variance "
                 "of the measurement (1.25); **0 is the estimator `semi-markov`**",
-                "mode": "the filter of the bank that is believed; the bank collapses to one filter that switches",
+                "mode": "the selected filter of the bank; the bank collapses to one filter that switches",
+                "sigma-points": "factors 5^a of the weights of the 11 sigma points in the estimator `unscented-turn` at this scan: "
+                "ten for the mean, normalised, eleven for the covariance (MA-UKF); **0 is that estimator**",
+                "unscented": "factors r^a in the estimator `unscented-turn` at this scan: spread of the sigma points "
+                "(r = sqrt(2)), variances of the acceleration and of the change of the turn rate (30 each), variance of "
+                "the measurement (10); **0 is that estimator**",
                 "weights": "weights of the bank, normalised; all zero is uniform",
             },
             {"evidence": ("evidence_scale",)},
@@ -160,7 +168,7 @@ class ManeuveringTarget(TargetProblem):
     )
 
     def set_up(self) -> None:
-        """Name the hypotheses and the paper's action."""
+        """Name the hypotheses, and set the paper's action."""
         super().set_up()
         count = len(self.parameters.gains)
         self.flights: tuple[int, ...] = self.parameters.track_scans
@@ -169,7 +177,7 @@ class ManeuveringTarget(TargetProblem):
         self.closes_loop: bool = self.parameters.cluttered
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> ReportedTrack:
-        """Track about which the radar looks for plots."""
+        """Return the filter's estimate, around which the radar returns plots, in clutter."""
         return ReportedTrack(mean, covariance)
 
 

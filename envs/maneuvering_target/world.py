@@ -1,4 +1,4 @@
-"""The flight of ManeuveringTarget, and the radar that measures it; equations in ``filters/polar.py``."""
+"""World of ManeuveringTarget: the flight and the radar that measures it; equations in ``filters/polar.py``."""
 
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -19,27 +19,27 @@ from .scans import RegularScans, Reliability, UnreliableScans
 
 
 class Truth(NamedTuple):
-    """The aircraft."""
+    """The true state of the aircraft, and of scans and disturbances."""
 
     scan: Array
     """Number of the current scan, ``(N,)``."""
     position: Array
-    """At its time, m, ``(2, N)``."""
+    """Position at the time of the scan, m, ``(2, N)``."""
     velocity: Array
-    """m/s, ``(2, N)``."""
+    """Velocity at the time of the scan, m/s, ``(2, N)``."""
     flight: Any
-    """What the course has drawn; None where it draws nothing."""
+    """Constants of the flight that the course has drawn; None where it draws nothing."""
     scans: Reliability | None
-    """None where every scan comes on time and sees the target."""
+    """State of the scans; None where every scan comes on time and sees the target."""
     disturbances: dict[str, Any]
-    """State of each by its name, of those that the world has, see :mod:`.disturbances`."""
+    """State of each disturbance by its name, see :mod:`.disturbances`."""
 
 
 class Odometry(NamedTuple):
-    """Motion since the scan before by a second sensor: wheels and a compass, a camera, an INS."""
+    """Motion since the previous scan by a second sensor: wheels and a compass, a camera, an INS."""
 
     displacement: Array
-    """x and y, m, ``(2, N)``; zero without a reading."""
+    """Displacement along x and y, m, ``(2, N)``; zero without a reading."""
     available: Array
     """1 with a reading, 0 without, ``(N,)``."""
 
@@ -47,38 +47,37 @@ class Odometry(NamedTuple):
 class Measurement(NamedTuple):
     """Report of the radar on a scan.
 
-    Where there is clutter, fields of one plot are those of the nearest in the gate; a scan with none there missed the
-    target.
+    In clutter the fields of one plot are those of the nearest in the gate; a scan without one there missed the target.
     """
 
     scan: Array
     """Scans since the start of the track, ``(N,)``."""
     position: Array
-    """x and y, m, ``(2, N)``; zero in a scan that missed the target, where an estimator gets NaN."""
+    """Measured x and y, m, ``(2, N)``; in a scan that missed the target zero, and NaN for an estimator."""
     variance: Array
     """Variances of their errors, evaluated at the measured position, m^2, ``(2, N)``; ``range_sigma`` squared in a scan
-    that missed the target. Reading: those at the true position would show it."""
+    that missed the target. Reading: those at the true position would reveal it."""
     available: Array
     """1 if the scan saw the target, 0 if not, ``(N,)``."""
     interval: Array
-    """s since the scan before, ``(N,)``."""
+    """Time since the previous scan, s, ``(N,)``."""
     elapsed: Array
-    """s since the last scan that saw the target, or the start of the track, ``(N,)``: the interval, unless that before
-    missed it."""
+    """Time since the last scan that saw the target, or the start of the track, s, ``(N,)``: the interval, unless the
+    previous scan missed it."""
     odometry: Odometry | None = None
-    """Motion by a second sensor; None except in recordings that have one. No bank reads it, and no agent
-    is shown it."""
+    """Motion by a second sensor; None except in recordings that have one. No bank reads it, and no agent observes
+    it."""
     plots: Plots | None = None
-    """All plots about the track; None where there is no clutter. No bank reads them, and no agent is shown them."""
+    """All plots around the track; None where there is no clutter. No bank reads them, and no agent observes them."""
 
 
 class RadarWorld(World[Task, Truth, Measurement]):
-    """An aircraft on its course and a surveillance radar at the origin.
+    """World of an aircraft on its course and a surveillance radar at the origin.
 
     Attributes:
-        course: what the aircraft flies.
-        scans: when scans come, and which of them see it.
-        disturbances: what else may go wrong with it.
+        course: flight path of the aircraft.
+        scans: times of scans, and which of them see it.
+        disturbances: further errors of the radar.
     """
 
     own_parameters: ClassVar[tuple[str, ...]] = ("flight", "track", "track_scans")
@@ -99,7 +98,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         self.row_uniforms: int = self.scans.row_uniforms + self.disturbances.row_uniforms
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Draw the flight; the track starts with errors of the measurement's size, equation (24)."""
+        """Return the drawn truth of the flight, and the initial estimate with errors of a measurement's size (24)."""
         xp, p = self.xp, self.parameters
         ones = xp.ones_like(normals[0])
         flight, (position, velocity) = self.course.begin(draws, ones)
@@ -119,13 +118,13 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def advance(
         self, truth: Truth, noise: Array, feedback: ReportedTrack | None
     ) -> tuple[Truth, Measurement]:
-        """Fly one scan and measure; in clutter, about the track of the filter."""
+        """Return the truth at the next scan and its measurement; in clutter with plots around the filter's track."""
         p, number, flight = self.parameters, truth.scan + 1.0, truth.flight
         uniforms, before = noise[self.normals :], (truth.position, truth.velocity)
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
         (position, velocity), available = scan.motion, scan.available
         further = noise[2 : self.normals], uniforms[self.scans.row_uniforms :]
-        steps = self.disturbances.share(number, scan.interval, *further, feedback)
+        steps = self.disturbances.split_noise(number, scan.interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         errors = self.disturbances.change_errors(states, noise[:2])
         states, measured = self._measure(position, errors, states)
@@ -139,12 +138,13 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return Truth(number, position, velocity, flight, scans, states), measurement
 
     def variances(self, position: Array) -> Array:
-        """Return the variances of a measurement of a position, m^2, ``(2, N)``."""
+        """Return the variances of a measurement at a position, m^2, ``(2, N)``."""
         return polar.cartesian_variances(position, self.parameters.range_sigma, self.bearing_sigma)
 
     def error_axes(self, position: Array) -> Array:
-        """Return the effect of errors of one standard deviation on the measured position, to first order, ``(2, 2,
-        N)``: in columns those along x and y or, where measurements are polar, of range and azimuth.
+        """Return the displacement of the measured position by errors of one standard deviation, ``(2, 2, N)``.
+
+        To first order; the columns are errors along x and y or, where measurements are polar, of range and azimuth.
         """
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:
@@ -157,8 +157,9 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def _measure(
         self, position: Array, errors: Array, states: dict[str, Any]
     ) -> tuple[dict[str, Any], Array]:
-        """Return the measured position, m, ``(2, N)``, from errors in units of their standard deviations: range and
-        azimuth are read, or x and y. With it the states of disturbances.
+        """Return the disturbances' states and the measured position, m, ``(2, N)``, from errors in standard deviations.
+
+        The radar reads range and azimuth, or x and y.
         """
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:
@@ -170,11 +171,11 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return states, radius * xp.stack([xp.cos(azimuth), xp.sin(azimuth)])
 
     def state(self, truth: Truth) -> Array:
-        """Return the position and velocity, ``(4, N)``."""
+        """Return the true position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
-        """Replace what was not received, of all plots too."""
+        """Return the measurement with NaN in place of every value that was not received, of all plots too."""
         masked = super().mask_missing(measurement)
         if masked.plots is None:
             return masked
@@ -183,31 +184,31 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return masked._replace(plots=plots._replace(position=position))
 
     def add_recorded_fields(self, measurement: Measurement) -> Measurement:
-        """Add the odometry, which is not simulated."""
+        """Return the measurement with zeros as odometry, which is not simulated."""
         nothing = 0.0 * measurement.position
         return measurement._replace(odometry=Odometry(nothing, nothing[0]))
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """Return the measured position, without the velocity."""
+        """Return the measured position, ``(4, N)`` with NaN for the velocity."""
         position = self.mask_missing(measurement).position
         return self.xp.concat([position, position * math.nan])
 
     def component_deviations(self, measurement: Measurement) -> Array:
-        """Return the root of the position's variance."""
+        """Return the standard deviations of the measured position, ``(4, N)`` with NaN for the velocity."""
         sigma = self.xp.sqrt(measurement.variance)
         return self.xp.concat([sigma, sigma * math.nan])
 
     def error_cost(self, error: Array) -> Array:
-        """Return the squared position error over the squared range sigma."""
+        """Return the squared position error over ``range_sigma`` squared, ``(N,)``."""
         scaled = error[:2] * (1.0 / self.parameters.range_sigma)
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the records of the disturbances."""
+        """Return the values of the disturbances to record at a scan, by name."""
         return self.disturbances.records(truth.disturbances)
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the context of course, scans and disturbances."""
+        """Return the context of course, scans and disturbances, by name."""
         time = self.scans.time(truth.scans, truth.scan)
         return {
             **self.course.context(truth.flight, truth.scan, time),

@@ -1,4 +1,4 @@
-"""Environment RadarEsmTracking; begin with ``task.py``."""
+"""The environment RadarEsmTracking; ``task.py`` declares its parts."""
 
 ID = "filtergym/RadarEsmTracking-v0"
-"""Id of the environment, available without further imports."""
+"""Gymnasium id, readable without importing the task."""

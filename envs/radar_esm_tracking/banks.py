@@ -1,4 +1,4 @@
-"""Banks of RadarEsmTracking: a filter for each class, weighted by radar and ESM.
+"""Banks of RadarEsmTracking: a Kalman filter for each class, weighted by radar and ESM (electronic support measures).
 
 Equation numbers are those of ``filters/class_fusion.py``.
 """
@@ -26,10 +26,10 @@ from ..contract.observation import (
     average_log_squared_block,
     innovation_block,
     last_weight_block,
+    limited,
     linear_scale,
     log_squared_block,
     relative_likelihood_block,
-    within,
 )
 from .parameters import RadarEsmTrackingParameters
 from .problem import RadarEsmProblem
@@ -42,7 +42,7 @@ COUNT_UNIT = 10.0
 
 
 class Filters(NamedTuple):
-    """M Kalman filters, one for each class, and the ESM decisions so far."""
+    """State of M Kalman filters, one for each class, and of the ESM decisions so far."""
 
     mean: Array
     """Means after the radar update (and mixing), ``(3, M, N)``."""
@@ -63,23 +63,24 @@ class Filters(NamedTuple):
     accumulated: Array
     """Sum of the log-likelihoods since the start, ``(M, N)``."""
     used: Array
-    """Whether there is an ESM decision at this scan within the gate (6), ``(N,)`` of booleans."""
+    """Whether there is an ESM decision within the gate (6) at this scan, booleans ``(N,)``."""
     used_counts: Array
     """Number of decisions for each type within the gate so far, ``(J, N)``."""
     refused_counts: Array
     """Number of decisions for each type outside the gate so far, ``(J, N)``."""
     probabilities: Array
-    """Weights in force, ``(M, N)``."""
-    believed: Array
-    """Probabilities of the classes at the start of the next scan, ``(M, N)``: those of Bayes' rule alone under
-    ``evidence``, otherwise the weights in force."""
+    """Weights of the classes after the last action, ``(M, N)``."""
+    posterior: Array
+    """Probabilities of the classes before the next scan's transition, ``(M, N)``: under ``evidence`` those of Bayes'
+    rule
+    alone, otherwise the weights."""
     expected: Array
     """Probabilities of the classes at the start of this scan, ``(M, N)``."""
 
 
 @functools.lru_cache(8)  # an evaluation makes the same bank for every competitor, on numbers and on symbols
 def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: int) -> class_fusion.Channels:
-    """Return the gains and innovation statistics of the classes' filters for every scan of an episode.
+    """Return the gains and innovation statistics of the classes' filters at every scan of an episode.
 
     Args:
         content: shape and numbers of the arrays of the models, and of the initial covariances.
@@ -90,12 +91,12 @@ def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: in
 
 
 def bearing_gate(p: RadarEsmTrackingParameters) -> float:
-    """Return the gate of the difference of bearings, degrees, within which the paper assumes one target."""
+    """Return the gate on the difference of radar and ESM bearings, degrees, equations (6) and (7)."""
     return class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
 
 
 def decision_blocks(task: RadarEsmProblem) -> tuple[Block, Block]:
-    """Return the blocks of the ESM's decision and of its bearing."""
+    """Return the observation blocks of the ESM's decision and of its bearing difference."""
     none = task.types
     return (
         Block(
@@ -112,17 +113,17 @@ def decision_blocks(task: RadarEsmProblem) -> tuple[Block, Block]:
 
 
 def clock_block(task: RadarEsmProblem) -> Block:
-    """Return the block of the time since the start of the track."""
+    """Return the observation block of the time since the start of the track."""
     xp, factor = task.xp, task.parameters.sampling_interval / TIME_UNIT
     return Block(
         "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * factor,
         f"time since the start of the track over {TIME_UNIT:g} s",
-        compression=within(0.0, (task.parameters.horizon + 1) * factor),
+        compression=limited(0.0, (task.parameters.horizon + 1) * factor),
     )  # fmt: skip
 
 
 class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
-    """Bank of every control: one Kalman filter for each class, mixed by their weights if classes change."""
+    """Bank of ``evidence``, ``mode`` and ``weights``: a Kalman filter for each class, mixed if classes may change."""
 
     parameters: RadarEsmTrackingParameters
 
@@ -148,19 +149,19 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return the action space: one class, or a number for each."""
+        """Gymnasium space of the selected class, or of a number for each class."""
         return bank_action_space(self.control, self.task.classes)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return innovations and likelihoods of each class's filter, ESM decisions, last weights and the clock."""
+        """Observation blocks: each filter's innovations and likelihoods, ESM decisions, last weights, and the time."""
         xp, p, classes = self.xp, self.parameters, self.task.modes
         none = self.task.types
         types = tuple(str(j) for j in range(none))
         decision, bearing_difference = decision_blocks(self.task)
         average = f"exponential average over {p.averaging_measurements:g} scans"
         count = f"decisions for this emitter type so far over {COUNT_UNIT:g}"
-        counted = within(0.0, (self.last_scan + 1) / COUNT_UNIT)
+        counted = limited(0.0, (self.last_scan + 1) / COUNT_UNIT)
 
         return (
             innovation_block(
@@ -205,7 +206,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     # --- the clock
 
     def start(self, initial: Start) -> Filters:
-        """Start all filters on the first radar measurement, and weight them by the first ESM decision."""
+        """Return all filters started on the first radar measurement, and weighted by the first ESM decision."""
         xp = self.xp
         mean = xp.stack([initial.mean] * self.task.classes, axis=1)
         zeros = 0.0 * mean[:2]
@@ -228,16 +229,16 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
             used_counts=used_counts,
             refused_counts=refused_counts,
             probabilities=probabilities,
-            believed=probabilities,
+            posterior=probabilities,
             expected=probabilities,
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Predict by one scan and update with the radar measurement; the ESM decision is only counted."""
+        """Return the filters predicted by one scan and updated with the radar, with the ESM decision counted."""
         xp, models, f = self.xp, self.task.models, state
         if self.mixes:
             mean, covariance, log_predicted, innovation, log_likelihood = class_fusion.advance(
-                f.believed, f.mean, f.covariance, measurement.radar, models, self.class_transition
+                f.posterior, f.mean, f.covariance, measurement.radar, models, self.class_transition
             )
         else:
             scan = xp.clip(measurement.scan, 0, self.last_scan)
@@ -246,7 +247,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
                 f.mean, measurement.radar, models, channels
             )
             covariance = channels.covariance
-            log_predicted = imm.log_probabilities(f.believed) + log_likelihood
+            log_predicted = imm.log_probabilities(f.posterior) + log_likelihood
         log_squared = xp.log1p(ordered_sum(innovation * innovation))
         used, used_counts, refused_counts = self._count_decisions(
             f.used_counts, f.refused_counts, measurement
@@ -265,8 +266,8 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
             used_counts,
             refused_counts,
             f.probabilities,
-            f.believed,
-            f.believed,
+            f.posterior,
+            f.posterior,
         )
 
     def _average(self, old: Array, new: Array) -> Array:
@@ -275,7 +276,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     def _count_decisions(
         self, used_counts: Array, refused_counts: Array, measurement: Measurement
     ) -> tuple[Array, Array, Array]:
-        """Return whether this scan's decision is within the gate (6), and the updated counts."""
+        """Return whether this scan's ESM decision is within the gate (6), and the updated counts of decisions."""
         xp, decision = self.xp, measurement.decision
         decided = one_hot(decision, self.task.types, xp)
         used = (decision < self.task.types) & (xp.abs(measurement.bearing_difference) <= self.gate)
@@ -283,30 +284,30 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         return used, used_counts + accepted, refused_counts + (decided - accepted)
 
     def _esm_log_likelihood(self, used: Array, measurement: Measurement) -> Array:
-        """Return log pi(rho | s) of a decision within the gate, otherwise 0, ``(M, N)``."""
+        """Return the log-probability of an ESM decision in each class, ``(M, N)``; 0 outside the gate."""
         usable = self.xp.where(used, measurement.decision, self.task.types)
         return self.xp.take(self.log_esm, usable, axis=1)
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Put the weights of the action in force; evidence is added to this scan's weights only."""
+        """Return the state with the class weights that follow from the action; evidence affects this scan only."""
         log_predicted, esm = state.log_predicted, self._esm_log_likelihood(state.used, measurement)
         control, scale = self.control, self.parameters.evidence_scale
         probabilities = bank_probabilities(control, action, log_predicted, esm, scale, self.xp)
-        believed = imm.mode_posterior(log_predicted, esm) if control == "evidence" else probabilities
-        return state._replace(probabilities=probabilities, believed=believed)
+        posterior = imm.mode_posterior(log_predicted, esm) if control == "evidence" else probabilities
+        return state._replace(probabilities=probabilities, posterior=posterior)
 
     # --- estimates
 
     def mean(self, state: Filters) -> Array:
-        """Return the combination of the filters (11), ``(3, N)``."""
+        """Return the weighted mean of the filters, equation (11), ``(3, N)``."""
         return weighted_sum(state.probabilities, state.mean)
 
     def covariance(self, state: Filters) -> Array:
-        """Return the covariance (12), including the spread of the filters, ``(3, 3, N)``."""
+        """Return the covariance of the weighted mean with the spread of the filters, equation (12), ``(3, 3, N)``."""
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the weights, NIS, and the predictive log-density of the radar measurement.
+        """Return the values to record at a scan, by name: weights, NIS and log-likelihood of the radar measurement.
 
         The NIS of the bank is the mean over the classes by their probability given the radar. If these are
         calibrated, its expectation is 2, that of the true class's filter.
@@ -323,5 +324,5 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
 
 
 def one_hot(index: Array, count: int, xp: ModuleType) -> Array:
-    """Return the one-hot encoding of indices ``(N,)``, ``(count, N)``."""
+    """Return the one-hot encoding ``(count, N)`` of indices ``(N,)``."""
     return xp.astype(xp.arange(count, device=index.device)[:, None] == index, xp.float64)

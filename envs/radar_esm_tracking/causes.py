@@ -8,35 +8,35 @@ from ..contract.observation import Array
 from .world import DISTURBANCES
 
 AFTERMATH = 20.0
-"""Scans that count as after a change of class: 10 s."""
+"""Number of scans that count as after a change of class: 10 s."""
 RANGE_EDGES = (50.0, 100.0)
 """Edges of the classes of range, km."""
 
 
 def _is_of_class(number: int) -> Callable[[Moment], Array | None]:
     def holds(moment: Moment) -> Array | None:
-        return moment.context["target_class"] == number if moment.knows("target_class") else None
+        return moment.context["target_class"] == number if moment.has_context("target_class") else None
 
     return holds
 
 
 def _has_changed(moment: Moment) -> Array | None:
-    if not moment.knows("change_scan"):
+    if not moment.has_context("change_scan"):
         return None
     change, scan = moment.context["change_scan"], moment.measurement.scan
     return (change >= 0.0) & (scan >= change) & (scan < change + AFTERMATH)
 
 
 def _is_silent(moment: Moment) -> Array | None:
-    return moment.context["radiating"] <= 0.0 if moment.knows("radiating") else None
+    return moment.context["radiating"] <= 0.0 if moment.has_context("radiating") else None
 
 
 def _has_second_emitter(moment: Moment) -> Array | None:
-    return moment.context["second_emitter"] > 0.0 if moment.knows("second_emitter") else None
+    return moment.context["second_emitter"] > 0.0 if moment.has_context("second_emitter") else None
 
 
 def causes_of(classes: Sequence[str]) -> tuple[Cause, ...]:
-    """Return the causes, with one for each class.
+    """Return the causes of costs of the task as one tuple, with one for each class.
 
     Args:
         classes: names of the classes.

@@ -53,7 +53,7 @@ zero, and their ratios would be lost."""
 
 
 class ClassPrior(NamedTuple):
-    """Prior of the filter; times in s."""
+    """Prior of the filter :class:`ExactBayes`; times in s."""
 
     change_rate: float = 0.0077
     """Expected number of changes of class per second."""
@@ -110,7 +110,7 @@ drawn anew, and radar measurements may be outliers."""
 
 
 class ClassTracks(NamedTuple):
-    """Hypotheses of S classes with M = B + 2 each (unchanged, B onsets, older), and J labels of emitters."""
+    """Hypotheses of S classes with M = B + 2 onsets each (unchanged, B onsets, older), and J emitter types."""
 
     mean: Array
     """Means, ``(3, S, M, N)``."""
@@ -119,17 +119,17 @@ class ClassTracks(NamedTuple):
     weights: Array
     """Probabilities of the hypotheses, ``(S, M, N)``."""
     unchanged: Array
-    """v, ``(S, N)``."""
+    """v of equation (1), ``(S, N)``."""
     changed: Array
-    """w, ``(S, M - 1, J, N)``."""
+    """w of equation (2), ``(S, M - 1, J, N)``."""
     first: Array
-    """T0, ``(J, 2, V, N)``."""
+    """T0 of equation (1), ``(J, 2, V, N)``."""
     later: Array
-    """T1, ``(J, 2, V, N)``."""
+    """T1 of equation (2), ``(J, 2, V, N)``."""
 
 
 class ClassState(NamedTuple):
-    """State of the filter."""
+    """State of the filter :class:`ExactBayes`."""
 
     mean: Array
     """Mean of all hypotheses together, ``(3, N)``."""
@@ -197,12 +197,12 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         self.grid = emitters.Surroundings(grid.other_type, *(task.constant(part) for part in grid[1:]))
 
     def start(self, initial: Start) -> ClassState:
-        """Start on the first radar measurement, and weight the classes by the first look."""
+        """Return the state started on the first radar measurement, with classes weighted by the first ESM look."""
         unknown = Likelihood.unknown(initial.mean[0])
         return ClassState(initial.mean, initial.covariance, self.start_tracks(initial), unknown)
 
     def start_tracks(self, initial: Start) -> ClassTracks:
-        """Return the initial hypotheses."""
+        """Return the hypotheses of class and onset at the start of the track."""
         xp, p, M = self.xp, self.prior, self.prior.onsets + 2
         none = 0.0 * initial.mean[0]
         state = xp.concat([initial.mean, xp.zeros((self.states - 3, 1)) + none])
@@ -215,17 +215,17 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             packed_covariance.pack(covariance),
             self.prior_of_class + none,
             nothing,
-            table * self.look(initial.first),
+            table * self.look_likelihood(initial.first),
             table,
         )
 
-    def look(self, measurement: Measurement) -> Array:
-        """Return the likelihood of the ESM look of this scan, ``(J, 2, V, N)``."""
+    def look_likelihood(self, measurement: Measurement) -> Array:
+        """Return the likelihood of this scan's ESM look for types and emitter hypotheses, ``(J, 2, V, N)``."""
         look = emitters.Look(measurement.looked, measurement.decision, measurement.bearing_difference)
         return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
 
     def class_likelihoods(self, table: Array, points: list[list[int]]) -> Array:
-        """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, at some grid points of each type."""
+        """Return the sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``, over some grid points of each type."""
         both = table[:, 0] + table[:, 1]
         sums = [ordered_sum(both[:, v] for v in some) for some in points if some]
         types = [i for i, some in enumerate(points) if some]
@@ -243,7 +243,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
     def normalise(
         self, mean: Array, covariance: Array, unchanged: Array, changed: Array, first: Array, later: Array
     ) -> ClassTracks:
-        """Normalise T0, T1 and the probabilities of the hypotheses to sums of one."""
+        """Return the hypotheses with T0, T1 and probabilities normalised to sums of one."""
         xp = self.xp
         total = ordered_sum(ordered_sum(ordered_sum(first)))
         first, unchanged = first / total, unchanged * total
@@ -268,7 +268,9 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
 
     def apply_factors(self, memory: ClassTracks, logarithms: Array) -> ClassTracks:
-        """Multiply the probabilities of classes, changes and a second emitter by factors, given as logarithms."""
+        """Return the hypotheses with probabilities of classes, changes and second emitter multiplied by
+        ``exp(logarithms)``.
+        """
         xp, S = self.xp, self.classes
         classes, changed = xp.exp(logarithms[:S]), xp.exp(logarithms[S])
         second_emitter = xp.exp(self.disturbed * logarithms[S + 1])
@@ -287,7 +289,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         )
 
     def predict_motion(self, memory: ClassTracks, process: Array = 1.0) -> tuple[Array, Array]:
-        """Predict all hypotheses to the next scan.
+        """Return the means and covariances of all hypotheses predicted to the next scan.
 
         Args:
             memory: hypotheses after the previous scan.
@@ -299,13 +301,16 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         P = packed_covariance.unpack(memory.covariance, self.states)
         return kalman.predict(memory.mean, P, self.F, process * self.Q)
 
-    def update(self, state: ClassState, given: FilterInput) -> ClassState:
-        """Update with a scan: motion and radar, change of class, ESM; the likelihood is that of the radar."""
-        xp, prior, memory, measurement = self.xp, self.prior, state.tracks, given.measurement
+    def update(self, state: ClassState, inputs: FilterInput) -> ClassState:
+        """Return the state updated with a scan: motion and radar, change of class, then ESM.
+
+        Its likelihood is that of the radar measurement.
+        """
+        xp, prior, memory, measurement = self.xp, self.prior, state.tracks, inputs.measurement
         process, variance = 1.0, self.variance
-        if given.action is not None:
-            memory = self.apply_factors(memory, given.action)
-            process, factor = xp.exp(given.action[-2:])
+        if inputs.action is not None:
+            memory = self.apply_factors(memory, inputs.action)
+            process, factor = xp.exp(inputs.action[-2:])
             variance = factor * variance
         mean, P = self.predict_motion(memory, process)
         radar = contaminated_normal.update_position(
@@ -334,9 +339,9 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         moved = self.change(moved, measurement.scan)
         looked = measurement.looked
         first, later = (
-            emitters.fall_silent(table, self.grid, looked) for table in (moved.first, moved.later)
+            emitters.predict_silence(table, self.grid, looked) for table in (moved.first, moved.later)
         )
-        look = self.look(measurement)
+        look = self.look_likelihood(measurement)
         first, later = first * look, later * look
         marginal = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
         memory = self.normalise(
@@ -350,11 +355,11 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             xp.reshape(memory.weights, (size, -1)),
         )
         if self.prior.coloured:
-            estimate, covariance = class_fusion.take_away_coloured_errors(estimate, covariance)
+            estimate, covariance = class_fusion.remove_coloured_errors(estimate, covariance)
         return ClassState(estimate, mirror_lower(covariance), memory, likelihood)
 
     def change(self, m: ClassTracks, scan: Array) -> ClassTracks:
-        """Apply the change of class, at one scan of every ``spacing``."""
+        """Return the hypotheses after a possible change of class; it occurs at one scan of every ``spacing``."""
         xp, prior, B, others = self.xp, self.prior, self.prior.onsets, self.classes - 1
         p, S, n = self.parameters, range(self.classes), self.states
         seconds = p.sampling_interval * scan
@@ -424,7 +429,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return ClassTracks(everything[:n], everything[n:], m.weights, m.unchanged, changed, first, later)
 
     def change_tables(self, m: ClassTracks, hazard: Array, again: Array, born: Array) -> tuple[Array, Array]:
-        """Return T0 without the changed share, and T1 with it."""
+        """Return T0 without, and T1 with, the probability of targets whose class changes now."""
         xp, J, grid = self.xp, m.first.shape[0], self.grid
         classes, types = range(self.classes), self.others.shape[1]
         joint = [

@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the action multiplies settings of the estimator ``exact-bayes``."""
+"""Bank of the control ``hypotheses``: the estimator ``exact-bayes``, whose settings the action multiplies."""
 
 import math
 from collections.abc import Sequence
@@ -29,11 +29,11 @@ from .world import Measurement, Start
 
 READINGS = ("range", "range_rate")
 LEAST = 1e-9
-"""Least probability of a group that is shown: smaller ones are rounding."""
+"""Smallest observed probability of a group: smaller ones are rounding."""
 
 
 class HypothesesState(NamedTuple):
-    """State of the filter, with S classes."""
+    """State of the filter ``exact-bayes`` with the values that the agent observes; S classes."""
 
     own: ClassState
     """State of the estimator after the last action."""
@@ -49,7 +49,7 @@ class HypothesesState(NamedTuple):
     """Probabilities before the scan, at least :data:`LEAST`, of classes that have not changed, then of those that have,
     ``(2 S, N)``."""
     probability: Array
-    """The same probabilities after the scan under the action zero, ``(2 S, N)``."""
+    """Probabilities of these groups after the scan under action zero, ``(2 S, N)``."""
     second_emitter: Array
     """Probability of a second emitter given an unchanged class, after the scan under the action zero, ``(N,)``."""
     entropy: Array
@@ -59,13 +59,13 @@ class HypothesesState(NamedTuple):
     probabilities: Array
     """Probabilities of the classes after the last action, ``(S, N)``."""
     used: Array
-    """Whether there is an ESM decision at this scan, ``(N,)`` of booleans; every decision is used."""
+    """Whether there is an ESM decision at this scan, booleans ``(N,)``; every decision is used."""
 
 
 class HypothesesBank(SettingsBank):
-    """Bayes' rule over classes, changes and emitters, with factors on its probabilities and noises."""
+    """Bank of ``hypotheses``: Bayes' rule over classes and emitters, with factors on probabilities and noises."""
 
-    strong = ExactBayes
+    filter_class = ExactBayes
     task: RadarEsmProblem
 
     def __init__(self, task: RadarEsmProblem, control: str) -> None:
@@ -76,7 +76,9 @@ class HypothesesBank(SettingsBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return innovation, likelihood, probabilities of classes and of a second emitter, the ESM, and the clock."""
+        """Observation blocks: innovation, likelihood, probabilities of classes and second emitter, ESM, and the
+        time.
+        """
         xp, p = self.xp, self.parameters
         unit = math.log(2.0 * math.pi * p.range_sigma * p.range_rate_sigma)
         return (
@@ -107,7 +109,7 @@ class HypothesesBank(SettingsBank):
         )  # fmt: skip
 
     def start(self, initial: Start) -> HypothesesState:
-        """Return the estimator at its initial state."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         xp, own, none = self.xp, self.own.start(initial), 0.0 * initial.mean[0]
         groups = self.group(own.tracks.weights)
         return HypothesesState(
@@ -125,12 +127,12 @@ class HypothesesBank(SettingsBank):
         )
 
     def group(self, weights: Array) -> Array:
-        """Return the probabilities of unchanged and changed classes, ``(2 S, N)``, from hypotheses ``(S, M, N)``."""
+        """Return the probabilities of unchanged and of changed classes, ``(2 S, N)``, from hypotheses ``(S, M, N)``."""
         changed = ordered_sum(weights[:, h] for h in range(1, weights.shape[1]))
         return self.xp.concat([weights[:, 0], changed])
 
     def class_estimates(self, own: ClassState) -> dict[str, Array]:
-        """Return the mean ``(3, S, N)`` and probability ``(S, N)`` of each class."""
+        """Return the mean, ``(3, S, N)``, and the probability, ``(S, N)``, of each class, by name."""
         tracks, hypotheses = own.tracks, range(own.tracks.weights.shape[1])
         probabilities = ordered_sum(tracks.weights[:, h] for h in hypotheses)
         total = ordered_sum(tracks.weights[:, h] * tracks.mean[:3, :, h] for h in hypotheses)
@@ -139,8 +141,10 @@ class HypothesesBank(SettingsBank):
             "probabilities": probabilities,
         }
 
-    def look(self, state: HypothesesState, found: ClassState, measurement: Measurement) -> HypothesesState:
-        """Compute the joint innovation and the probabilities before and after the scan."""
+    def add_observed(
+        self, state: HypothesesState, result: ClassState, measurement: Measurement
+    ) -> HypothesesState:
+        """Return the state with the joint innovation, and the probabilities before and after the scan, filled in."""
         xp, bank, tracks = self.xp, self.own, state.own.tracks
         size = tracks.weights.shape[0] * tracks.weights.shape[1]
         mean, P = bank.predict_motion(tracks)
@@ -151,14 +155,14 @@ class HypothesesBank(SettingsBank):
         )
         R, none = bank.variance[:, 0, 0], 0.0 * mean[0]
         noise = xp.stack([xp.stack([R[0] + none, none]), xp.stack([none, R[1] + none])])
-        after = found.tracks
+        after = result.tracks
         disturbed, every = (
             ordered_sum(after.unchanged * bank.class_likelihoods(after.first, points))
             for points in (bank.disturbed_by_type, bank.by_type)
         )
         p = xp.reshape(after.weights, (size, -1))
         return state._replace(
-            likelihood=found.likelihood,
+            likelihood=result.likelihood,
             innovation=class_fusion.whiten(cholesky(P + noise), measurement.radar - mean),
             prior=0.5 * xp.log(xp.stack([P[0, 0], P[1, 1]]) / R),
             predicted=xp.clip(self.group(tracks.weights), LEAST, None),
@@ -169,10 +173,10 @@ class HypothesesBank(SettingsBank):
         )
 
     def act(self, state: HypothesesState, measurement: Measurement, action: Array) -> HypothesesState:
-        """Update with the settings multiplied by the action's factors."""
+        """Return the state updated by the filter with its settings multiplied by the factors of the action."""
         after = super().act(state, measurement, action)
         return after._replace(**self.class_estimates(after.own))
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return the probabilities of the classes, and the estimator's likelihood of the radar measurement."""
+        """Return the values to record at a scan, by name: class probabilities, likelihood of the radar measurement."""
         return {"mode_probability": state.probabilities, **state.likelihood._asdict()}

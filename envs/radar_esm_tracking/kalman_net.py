@@ -26,7 +26,7 @@ from ...filters import class_fusion, imm, packed_covariance
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.small_matrices import apply, cholesky
 from ..contract.controls import bank_probabilities
-from ..contract.observation import KEPT_AS_LOG, Array, Block, last_action_block
+from ..contract.observation import STORED_AS_LOG, Array, Block, last_action_block
 from .banks import ClassBank
 from .problem import RadarEsmProblem
 from .world import Measurement, Start
@@ -38,12 +38,14 @@ NOISE_RANGE = 3.0
 CAUTION = 3.0
 """Largest factor and divisor of these deviations in the gain alone."""
 MEASURED = (0, 1)
-"""Range and range rate."""
+"""Names of the measured components: range and range rate."""
 NOISES = ("acceleration", "range", "range_rate")
 
 
 class NetFilters(NamedTuple):
-    """Fields of :class:`~.banks.Filters` with packed covariances, the covariance of the gain and the last output."""
+    """State of the bank: :class:`~.banks.Filters` with packed covariances, the gain's covariance and the last
+    output.
+    """
 
     mean: Array
     """Means, ``(3, M, N)``; between :meth:`KalmanNetBank.predict` and the action predicted."""
@@ -60,7 +62,7 @@ class NetFilters(NamedTuple):
     used_counts: Array
     refused_counts: Array
     probabilities: Array
-    believed: Array
+    posterior: Array
     expected: Array
     gain_covariance: Array
     """M after an action, ``(6, M, N)``."""
@@ -69,7 +71,7 @@ class NetFilters(NamedTuple):
 
 
 class KalmanNetBank(ClassBank):
-    """Bank of the paper's filters with noises, gains and weights from the action."""
+    """Bank of ``kalman-net``: the paper's filters, whose noises, gains and weights the action sets."""
 
     def __init__(self, task: RadarEsmProblem, control: str) -> None:
         super().__init__(task, control)
@@ -79,7 +81,7 @@ class KalmanNetBank(ClassBank):
         self.propagator: Array = task.constant(numpy.stack(propagators, axis=-1))[..., None]
         self.process_noise: Array = packed_covariance.pack(task.constant(models.Q)[..., None])
         self.radar_variances: list[float] = [float(variance) for variance in numpy.diagonal(models.R)]
-        self.answers: tuple[str, ...] = (
+        self.action_names: tuple[str, ...] = (
             *(f"evidence_{name}" for name in task.modes),
             *NOISES,
             *(f"caution_{name}" for name in NOISES),
@@ -87,12 +89,14 @@ class KalmanNetBank(ClassBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return the space of evidence, noises, and their factors in the gain alone."""
-        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
+        """Gymnasium box of evidence, noises, and their factors in the gain alone."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of the bank, with the predicted deviation of the range and the last output."""
+        """Observation blocks: those of :class:`ClassBank`, the predicted deviation of the range, and the last
+        output.
+        """
         unit, place = 1.0 / self.radar_variances[0], packed_covariance.position(3, 0, 0)
         return (
             *super().blocks,
@@ -101,26 +105,28 @@ class KalmanNetBank(ClassBank):
                 lambda f, _: 0.5 * self.xp.log(f.covariance[place] * unit),
                 "the predicted deviation of the range over range_sigma",
                 self.task.modes,
-                KEPT_AS_LOG,
+                STORED_AS_LOG,
             ),
-            last_action_block(self.answers),
+            last_action_block(self.action_names),
         )
 
     def start(self, initial: Start) -> Any:
-        """Return the initial state of the paper's algorithm as :class:`NetFilters`."""
+        """Return the paper's algorithm at the start of the track, as :class:`NetFilters`."""
         fields = super().start(initial)._asdict()
         fields["covariance"] = covariance = packed_covariance.pack(fields["covariance"])
-        action = self.xp.stack([0.0 * initial.mean[0]] * len(self.answers))
+        action = self.xp.stack([0.0 * initial.mean[0]] * len(self.action_names))
         return NetFilters(**fields, gain_covariance=covariance, action=action)
 
     def noises(self, action: Array) -> tuple[Array, list[Array]]:
-        """Return the factor on the process noise, and the variances of range and range rate, ``(N,)`` each."""
+        """Return the factor on the process noise, and the variances of range and range rate under an action, ``(N,)``
+        each.
+        """
         classes = self.task.classes
         scale = self.xp.exp(2.0 * math.log(NOISE_RANGE) * action[classes : classes + len(NOISES)])
         return scale[0], [scale[1 + i] * variance for i, variance in enumerate(self.radar_variances)]
 
     def predict(self, state: Any, measurement: Measurement) -> Any:
-        """Predict by one scan, and compute the innovation statistics of the radar measurement."""
+        """Return the filters predicted by one scan, with the innovation statistics of the radar measurement."""
         xp, f = self.xp, state
         mean = apply(self.task.models.Phi[..., None], f.mean)
         covariance = apply(self.propagator, f.covariance)
@@ -139,7 +145,7 @@ class KalmanNetBank(ClassBank):
         return f._replace(
             mean=mean,
             covariance=covariance,
-            log_predicted=imm.log_probabilities(f.believed) + log_likelihood,
+            log_predicted=imm.log_probabilities(f.posterior) + log_likelihood,
             innovation=innovation,
             log_squared=log_squared,
             log_likelihood=log_likelihood,
@@ -149,11 +155,11 @@ class KalmanNetBank(ClassBank):
             used=used,
             used_counts=used_counts,
             refused_counts=refused_counts,
-            expected=f.believed,
+            expected=f.posterior,
         )
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
-        """Update with the gains of the output, apply the class transition, and weight the filters."""
+        """Return the filters updated with the action's gains, after the class transition, and weighted."""
         xp, classes, f = self.xp, self.task.classes, state
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         process, radar = self.noises(a)
@@ -189,12 +195,12 @@ class KalmanNetBank(ClassBank):
             covariance=covariance,
             log_predicted=log_predicted,
             probabilities=bank_probabilities("evidence", a[:classes], log_predicted, esm, EVIDENCE, xp),
-            believed=imm.mode_posterior(log_predicted, esm),
+            posterior=imm.mode_posterior(log_predicted, esm),
             gain_covariance=gain_covariance,
             action=a,
         )
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance (12), including the spread of the filters, ``(3, 3, N)``."""
+        """Return the covariance of the weighted mean with the spread of the filters, equation (12), ``(3, 3, N)``."""
         each = packed_covariance.unpack(state.covariance, 3)
         return imm.combine(state.mean, each, state.probabilities)[1]

@@ -12,7 +12,7 @@ from .world import Measurement, Start
 
 
 class ScanInput(LiveInput):
-    """Reader of range and range rate at every scan, and of the decision of the ESM where there is one.
+    """Converter of range and range rate at every scan, and of ESM decisions, into measurements.
 
     The first scan starts the track: :meth:`start` takes it in place of mean and covariance.
     """
@@ -20,24 +20,26 @@ class ScanInput(LiveInput):
     counter = "scan"
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return the descriptions of the columns of a log, also for the start."""
+        """Return the names and descriptions of the values of a measurement, and of those at the start."""
         texts = {name: column.live_text for name, column in COLUMNS.items()}
         return texts, texts
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Start the track on its first scan; mean and covariance follow from it unless they are given."""
-        first = self._scan(numpy.zeros(self.tracks), {n: v for n, v in given.items() if n in COLUMNS})
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Return the initial estimate from the first scan, or from given mean and covariance, and the memory."""
+        first = self._scan(
+            numpy.zeros(self.tracks), {n: v for n, v in initial_values.items() if n in COLUMNS}
+        )
         measured = {name: numpy.moveaxis(array, -1, 0)[:, None] for name, array in first._asdict().items()}
         twice = {name: numpy.repeat(array, 2, axis=1) for name, array in measured.items()}
         found = start_track(twice, numpy.reshape(time, (-1, 1)), self.parameters).initial
         initial = {name: numpy.moveaxis(found[name], 0, -1) for name in ("mean", "covariance")}
         for name, array in initial.items():
-            if given.get(name) is not None:
-                initial[name] = self.read(given, name, array.shape[:-1]).reshape(array.shape)
-        return Start(**initial, first=first), {"time": time, "count": self.same_of_all(0.0)}
+            if initial_values.get(name) is not None:
+                initial[name] = self.read(initial_values, name, array.shape[:-1]).reshape(array.shape)
+        return Start(**initial, first=first), {"time": time, "count": self.broadcast(0.0)}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the measurement of a scan and the memory."""
+        """Return the measurement of a scan, and the memory for the next one."""
         scan = memory["count"] + 1.0
         found = self._scan(numpy.atleast_1d(scan), values)
         return found if self.lanes else map_arrays(_first, found), {"time": time, "count": scan}

@@ -1,4 +1,4 @@
-"""Log format of RadarEsmTracking: ranges, range rates, bearings and type decisions.
+"""Tables of ranges, range rates, bearings and type decisions, read as measurements of RadarEsmTracking.
 
 The first row is scan 0, which starts the track. A decision is the number of an emitter type, empty where the ESM
 received nothing. A row with a decision contains both bearings, or their difference.
@@ -10,7 +10,15 @@ from typing import Any
 import numpy
 
 from ...filters.class_fusion import bearing_difference
-from ..contract.log_format import Column, LogFormat, Predicted, Readings, TrackLog, TrackStart, optional
+from ..contract.log_format import (
+    Column,
+    LogFormat,
+    PredictedCoordinate,
+    Readings,
+    TrackLog,
+    TrackStart,
+    optional_column,
+)
 from ..logs.recorded_tables import Columns
 from .parameters import RadarEsmTrackingParameters
 
@@ -30,7 +38,7 @@ COLUMNS = {
 
 
 def read_log(columns: Columns) -> TrackLog:
-    """Return the measurements of one track.
+    """Return the measurements of one track from the columns of a table.
 
     Raises:
         ValueError: if a column is missing or a value is not possible.
@@ -40,7 +48,7 @@ def read_log(columns: Columns) -> TrackLog:
             raise ValueError(f"it lacks the column {name}")
     radar = columns.whole("range", "range_rate")
     interval = columns.regular("the filters of this environment are tabulated by scans")
-    named = {n: v for n, v in columns.given.items() if n not in ("horizon", "decision_interval")}
+    named = {n: v for n, v in columns.user_parameters.items() if n not in ("horizon", "decision_interval")}
     p = RadarEsmTrackingParameters(**{"sampling_interval": interval, **named})
     scans = numpy.arange(len(radar))
     if columns.has("looked"):
@@ -52,14 +60,14 @@ def read_log(columns: Columns) -> TrackLog:
         {name: values[0] for name, values in later.items()},
         {name: values[0] for name, values in initial.items()},
         scans[1:],
-        {} if "sampling_interval" in columns.given else {"sampling_interval": interval},
+        {} if "sampling_interval" in columns.user_parameters else {"sampling_interval": interval},
         float(columns.time[0]),
         columns.time[1:],
     )
 
 
 def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, p: Any) -> TrackStart:
-    """Start every episode on its first measurement.
+    """Return the start of every episode, on its first measurement.
 
     Args:
         measurements: ``(E, T, ...)``.
@@ -84,7 +92,7 @@ def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarra
 
 
 def _start_variances(p: Any) -> list[float]:
-    """Return the initial variances of range, range rate and acceleration; the last as in (12) for an unknown class."""
+    """Return the initial variances of range, range rate and acceleration, the last one of an unknown class (12)."""
     acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
     return [p.range_sigma**2, p.range_rate_sigma**2, acceleration]
 
@@ -95,7 +103,7 @@ def _numbers(p: Any) -> dict[str, float]:
 
 
 def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str, numpy.ndarray]:
-    """Return the arrays of a measurement other than ``scan`` and ``radar`` from the reports of radar and ESM.
+    """Return the arrays of a measurement, except ``scan`` and ``radar``, from radar and ESM reports, by name.
 
     Args:
         readings: n rows of a table, or live values.
@@ -106,7 +114,7 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
         ValueError: for a decision that is no emitter type, or lacks a bearing.
     """
     types, count = len(p.recognition), len(scans)
-    decision = optional(readings, "decision", count)
+    decision = optional_column(readings, "decision", count)
     decided = numpy.isfinite(decision)
     wrong = decided & ((decision != numpy.round(decision)) | (decision < 0) | (decision >= types))
     if wrong.any():
@@ -115,8 +123,8 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
             f"decision is the number of an emitter type from 0 to {types - 1}, and {readings.place(number)} has "
             f"{decision[number]:g}"
         )
-    difference = optional(readings, "bearing_difference", count)
-    radar, esm = (optional(readings, name, count) for name in ("radar_bearing", "esm_bearing"))
+    difference = optional_column(readings, "bearing_difference", count)
+    radar, esm = (optional_column(readings, name, count) for name in ("radar_bearing", "esm_bearing"))
     apart = numpy.where(numpy.isfinite(difference), difference, radar - esm)
     lacking = decided & ~numpy.isfinite(apart)
     if lacking.any():
@@ -124,7 +132,7 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
             f"{readings.place(int(lacking.argmax()))} has a decision and lacks a bearing: a decision needs "
             "radar_bearing and esm_bearing (degrees), or bearing_difference"
         )
-    looked = optional(readings, "looked", count)
+    looked = optional_column(readings, "looked", count)
     listens = scans % p.esm_period == 0
     return {
         "looked": numpy.where(numpy.isfinite(looked), looked > 0.5, listens) | decided,
@@ -136,7 +144,7 @@ def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str
 
 
 def predict_radar(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
-    """Return the predicted range and range rate, and those of the radar, ``(2, N)`` each."""
+    """Return the predicted and the measured range and range rate, ``(2, N)`` each."""
     T = parameters.sampling_interval
     distance, rate, acceleration = mean
     predicted = numpy.stack([distance + T * rate + 0.5 * T**2 * acceleration, rate + T * acceleration])
@@ -148,7 +156,10 @@ LOG_FORMAT = LogFormat(
     read_log,
     start_track,
     predict=predict_radar,
-    predicted=(Predicted("range", "m", "range"), Predicted("range_rate", "m/s", "range rate")),
+    predicted=(
+        PredictedCoordinate("range", "m", "range"),
+        PredictedCoordinate("range_rate", "m/s", "range rate"),
+    ),
     longest_interval=60.0,
     decision_interval=1,
     regular_rows=_numbers,

@@ -20,7 +20,7 @@ from ..drawing.rendering import (
     Picture,
     Strip,
     error_strip,
-    grown,
+    widen_limits,
 )
 from .problem import RadarEsmProblem
 
@@ -38,7 +38,7 @@ CLASS_ROW = -1.0
 
 
 class RadarEsmTrackingPicture(Picture):
-    """Panels of the acceleration by truth, filters and estimate, ESM decisions, probabilities and errors."""
+    """Picture of the acceleration by truth, filters and estimate, ESM decisions, probabilities and errors."""
 
     clock = "scan"
     strips_left: float = 0.56
@@ -54,7 +54,7 @@ class RadarEsmTrackingPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Return the accelerations, weights, true class and type, and the decision of this scan."""
+        """Return the values drawn at this scan by name: accelerations, weights, true class and type, decision."""
         filters, truth, decision = state.filter, state.truth, state.measurement.decision[0]
         decided, used = decision < self.task.types, filters.used[0]
         nothing = float("nan")
@@ -70,7 +70,7 @@ class RadarEsmTrackingPicture(Picture):
         }
 
     def begin(self, state: Episode) -> None:
-        """Store the time of the class change and the scale of accelerations."""
+        """Store the time of the episode's class change and the scale of its accelerations."""
         truth, p = state.truth, self.task.parameters
         change = int(truth.change_scan[0])
         classes = [int(truth.target_class[0])]
@@ -84,7 +84,7 @@ class RadarEsmTrackingPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Return the strips of the weights and the three errors."""
+        """Return the time series of the weights and of the three errors."""
         weights = {mode: f"weight.{s}" for s, mode in enumerate(self.task.modes)}
         limits = {"range": 2000.0, "range_rate": 30.0, "acceleration": 20.0}
         return [
@@ -100,17 +100,17 @@ class RadarEsmTrackingPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """Return False: the strips show it in the filter's terms."""
+        """Return False: the time series show the filters' quantities instead of the observation."""
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return the interval of scans after the change of class."""
+        """Return the interval of scans after the change of class, which is shaded."""
         return [] if self.change is None else [(self.change, self.task.horizon + 0.5)]
 
     # --- panels
 
     def open(self, figure: Figure) -> None:
-        """Create both panels."""
+        """Create the panels of acceleration and of ESM decisions."""
         top = self.acceleration = figure.add_axes(ACCELERATION)
         bottom = self.decisions = figure.add_axes(DECISIONS)
         legend: dict[str, Any] = {
@@ -168,11 +168,11 @@ class RadarEsmTrackingPicture(Picture):
         bottom.legend(ncols=3, **legend)
 
     def arrange(self) -> None:
-        """Set the limits of the acceleration axis to the accelerations of this episode's classes."""
+        """Set the limits of the acceleration axis for the classes of this episode."""
         self.acceleration.set_ylim(-self.height, self.height)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Draw the scans so far."""
+        """Update accelerations and ESM decisions to the current scan."""
         empty = numpy.empty(0)
         times = numpy.arange(1, len(history.get("true", empty)) + 1)
 
@@ -191,7 +191,7 @@ class RadarEsmTrackingPicture(Picture):
         for s, line in enumerate(self.classes):
             put(line, numpy.where(true_class == s, CLASS_ROW, numpy.nan))
         shown = numpy.concatenate([history.get("true", empty), history.get("estimate", empty), [0.0]])
-        reach = grown((-self.height, self.height), float(shown.min()), float(shown.max()))
+        reach = widen_limits((-self.height, self.height), float(shown.min()), float(shown.max()))
         self.acceleration.set_ylim(*reach)
 
 

@@ -26,14 +26,14 @@ from .world import RadarEsmWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return the class of the picture; imported here, because it imports matplotlib."""
+    """Return the object that draws an episode; imported here, because it needs matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Return the variances, and the weight of the true class if there are weights."""
+    """Return the reported variances, and the weight of the true class if there are weights, by name."""
     task: Any = model.task
     covariance = model.covariance(episode)
     own = {f"variance_{c.name}": covariance[i, i] for i, c in enumerate(task.components)}
@@ -44,7 +44,7 @@ def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str
 
 
 class RadarEsmTracking(RadarEsmProblem):
-    """Radar and ESM fused, the target's class recognised (Ivanov, Seliverstov).
+    """Fusion of radar and ESM for tracking and target classification: weight a filter for each class.
 
     ## Description
 
@@ -59,7 +59,7 @@ class RadarEsmTracking(RadarEsmProblem):
 
     The agent observes the innovations of the filters and the ESM decisions, and weights the classes. Zero
     ``evidence`` is the paper's algorithm. In order (8)-(10): every filter predicts and updates with the radar
-    measurement under the class at the previous scan; the weights in force times the radar likelihoods go
+    measurement under the class at the previous scan; the last weights times the radar likelihoods go
     through the class transition, and the filters mix on them; the agent observes the result; the ESM
     decision is the last factor, and the action gives P(s(k)) given everything to k. Evidence is added to the
     weights of this scan only: Bayes' rule continues from its own posterior. ``mode`` and ``weights`` replace
@@ -175,7 +175,7 @@ class RadarEsmTracking(RadarEsmProblem):
     )
 
     def set_up(self) -> None:
-        """Set the names of the classes, the paper's action and the causes of cost."""
+        """Set the names of the classes, the paper's action and the causes of costs."""
         super().set_up()
         self.modes = self.parameters.class_names
         self.companions = (Causes(causes_of(self.modes)), *type(self).companions)

@@ -1,4 +1,4 @@
-"""Target, radar and ESM station of RadarEsmTracking."""
+"""World of RadarEsmTracking: target, radar and ESM station."""
 
 import math
 from typing import Any, NamedTuple
@@ -8,7 +8,7 @@ import numpy
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
 from ..contract.draws import Draws, category, draw_between
-from ..contract.faults import Disturbance, Disturbances, GaussMarkov, Glint, undisturbed
+from ..contract.faults import Disturbance, Disturbances, GaussMarkov, Glint, draw_undisturbed
 from ..contract.observation import Array
 from ..contract.world import World
 from .parameters import RadarEsmTrackingParameters
@@ -19,7 +19,7 @@ DISTURBANCES: tuple[type[Disturbance], ...] = (Glint,)
 
 
 class Truth(NamedTuple):
-    """State of the target, its emitters and the radar errors."""
+    """The true state of the target, its emitters and the radar errors."""
 
     scan: Array
     """Number of the current scan, integer, ``(N,)``; 0 starts the track."""
@@ -36,7 +36,7 @@ class Truth(NamedTuple):
     next_type: Array
     """Index of the type after the change, ``(N,)``."""
     radiating: Array
-    """Whether the target radiates, ``(N,)`` of booleans."""
+    """Whether the target radiates, booleans ``(N,)``."""
     other_class: Array
     """Class of the second emitter, ``(N,)``."""
     other_type: Array
@@ -71,7 +71,7 @@ class Measurement(NamedTuple):
     radar: Array
     """Range (m) and range rate (m/s), ``(2, N)``; errors of ``range_sigma`` and ``range_rate_sigma``."""
     looked: Array
-    """Whether the ESM looked at this scan, ``(N,)`` of booleans; it may have received nothing."""
+    """Whether the ESM looked at this scan, booleans ``(N,)``; it may have received nothing."""
     decision: Array
     """Index of the emitter type that the ESM decides for, or the number of types without a decision, ``(N,)``."""
     bearing_difference: Array
@@ -92,7 +92,7 @@ class Start(NamedTuple):
 
 
 class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
-    """A target of one class on one range channel, measured by a radar and an ESM station."""
+    """World of a target of one class on one range channel, measured by a radar and an ESM station."""
 
     parameters: RadarEsmTrackingParameters
     reading_field = "radar"
@@ -133,7 +133,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     # --- the target and its emissions
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
-        """Draw the target and its surroundings, and make the measurement of scan 0."""
+        """Return the drawn truth (target, class, disturbances) and the initial estimate from scan 0."""
         xp, p, own = self.xp, self.parameters, self.own_initial_normals
         distance = draws.uniform("initial_range", p.initial_range)
         closing_speed = draws.uniform("closing_speed", p.closing_speed)
@@ -159,7 +159,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         if p.class_change_probability < 1.0:
             changes = draws.event("class_changes", p.class_change_probability)
             change = xp.where(changes, change, self.never)
-        calm = undisturbed(draws, p)
+        calm = draw_undisturbed(draws, p)
         if calm is not None:
             change = xp.where(calm, self.never, change)
             second_emitter, coloured, correlation = (
@@ -199,12 +199,12 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return self.xp.take(self.type_thresholds, target_class, axis=1)
 
     def _another_class(self, draws: Draws, name: str, target_class: Array) -> Array:
-        """Return another class than the given one, all equally probable."""
+        """Return a drawn index of another class than the given one, all equally probable, ``(N,)``."""
         step = draws.integer(name, (1, self.task.classes - 1))
         return (target_class + self.xp.astype(step, self.xp.int64)) % self.task.classes
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Move by one scan under the previous class, apply class change and silence, and measure.
+        """Return the truth at the next scan, after a possible class change and silence, and the measurement.
 
         A row of noise: 3 normal numbers for the motion, 2 for the radar, 2 for the bearings, 2 for the radar's coloured
         errors if there are any; uniform ones for the type, the decision, the source and the silence. Those of the
@@ -237,7 +237,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
             wandering = GaussMarkov(truth.radar_decay, truth.radar_kick)
             truth = truth._replace(radar_error=wandering.advance(truth.radar_error, noise[7:9]))
         further = noise[self.own_normals : self.normals], uniforms[4:]
-        steps = self.disturbances.share(scan, p.sampling_interval, *further, feedback)
+        steps = self.disturbances.split_noise(scan, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         truth = truth._replace(disturbances=states)
         truth, measurement = self._measure(truth, noise[3:5], noise[5:7], uniforms[:3])
@@ -252,7 +252,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     def _measure(
         self, truth: Truth, errors: Array, bearings: Array, uniforms: Array
     ) -> tuple[Truth, Measurement]:
-        """Return the measurement of radar and ESM.
+        """Return the truth and the measurement of radar and ESM at this scan.
 
         Args:
             truth: truth at this scan.
@@ -297,40 +297,40 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     # --- costs and readings
 
     def error_factor(self, truth: Truth) -> Array:
-        """Return the ratio of this scan's white radar errors to nominal, ``(N,)``; not 1 with glint."""
+        """Return the ratio of this scan's white radar errors to nominal ones, ``(N,)``; 1 without glint."""
         return truth.disturbances.get("glint", self.xp.ones_like(truth.separation))
 
     def state(self, truth: Truth) -> Array:
-        """Return the range, range rate and acceleration, ``(3, N)``."""
+        """Return the true range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Return the standard deviations of range and range rate."""
+        """Return the standard deviations of range and range rate, ``(2, N)``."""
         p = self.parameters
         return self.task.constant([[p.range_sigma], [p.range_rate_sigma]]) + 0.0 * measurement.radar
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
-        """Return the measurement with NaN as the difference of bearings without an ESM decision."""
+        """Return the measurement with NaN as the bearing difference where there is no ESM decision."""
         decided = measurement.decision < self.task.types
         difference = self.xp.where(decided, measurement.bearing_difference, math.nan)
         return measurement._replace(bearing_difference=difference)
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """Return the readings of range and range rate, and NaN for the acceleration."""
+        """Return the measured range and range rate, ``(3, N)`` with NaN for the acceleration."""
         return self.xp.concat([measurement.radar, measurement.radar[:1] * math.nan])
 
     def component_deviations(self, measurement: Measurement) -> Array:
-        """Return the standard deviations of range and range rate."""
+        """Return the standard deviations of range and range rate, ``(3, N)`` with NaN for the acceleration."""
         p, once = self.parameters, self.xp.ones_like(measurement.radar[0])
         return self.xp.stack([p.range_sigma * once, p.range_rate_sigma * once, math.nan * once])
 
     def error_cost(self, error: Array) -> Array:
-        """Return the mean of the three squared errors over their scales."""
+        """Return the mean of the three squared errors over their scales, ``(N,)``."""
         scaled = error * self.cost_factors
         return ordered_sum(scaled * scaled) * (1.0 / 3.0)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the true class and type, and the time."""
+        """Return the values to record at a scan, by name: true class and type, and the time."""
         xp = self.xp
         return {
             **self.disturbances.records(truth.disturbances),
@@ -340,7 +340,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return class and type of the target, their change, the second emitter, further radar errors, and silence."""
+        """Return the context by name: class and type, their change, second emitter, radar errors and silence."""
         p, xp = self.parameters, self.xp
         never = 0 * truth.change_scan - 1
         changes = (p.class_change is not None) & (truth.change_scan <= p.horizon + 1)
@@ -367,5 +367,5 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
 
 
 def _thresholds(rows: object) -> numpy.ndarray:
-    """Return the cumulative probabilities as thresholds of a uniform number, ``(columns - 1, rows)``."""
+    """Return cumulative probabilities of rows as thresholds of a uniform number, ``(columns - 1, rows)``."""
     return numpy.cumsum(numpy.array(rows), axis=1)[:, :-1].T

@@ -1,4 +1,4 @@
-"""TightlyCoupledNavigation: everything of one environment; ``task.py`` names it all."""
+"""The environment TightlyCoupledNavigation; ``task.py`` declares its parts."""
 
 ID = "filtergym/TightlyCoupledNavigation-v0"
-"""Known before anything else is imported."""
+"""Gymnasium id, readable without importing the task."""

@@ -1,9 +1,9 @@
-"""The filters of TightlyCoupledNavigation that are steered: a bank of extended Kalman filters.
+"""Banks of TightlyCoupledNavigation: extended Kalman filters for hypotheses on the motion, which an action steers.
 
-One filter for each hypothesis on the motion, mixed before every measurement by the weights in force and
-combined after it. The steps are numbered as in the paper (see :mod:`.task`). Of steps 1 to 4, the prediction, the
-combined mean is computed twice: after :meth:`act`, because it steers the tracking loops of the next measurement, and
-with the rest of the prediction in :meth:`predict`.
+The filters, one for each hypothesis, are mixed with their weights before every measurement and combined after it. The
+steps are numbered as in the paper (see :mod:`.task`). Of steps 1 to 4, the prediction, the combined mean is computed
+twice: after :meth:`act`, because it steers the tracking loops of the next measurement, and with the rest of the
+prediction in :meth:`predict`.
 
 Reading: step 3 of the scan lacks a hat and carries the index k|k-1; the spread is taken about the posterior
 estimates, otherwise the matrix is not symmetric.
@@ -39,59 +39,61 @@ from .problem import NavigationProblem
 from .world import Measurement
 
 EFFICIENT = 1.345
-"""Threshold that keeps 95 % of the efficiency where the noise is Gaussian (Huber, Robust Statistics, 1981)."""
+"""Huber threshold with an efficiency of 95 % for Gaussian noise (Huber, Robust Statistics, 1981)."""
 LEAST_STRENGTH = 1e-9
-"""Of the robust update: with a threshold of 1e9 deviations it is the plain one."""
+"""Smallest strength of the robust update: with a threshold of 1e9 deviations it is the plain one."""
 
 
 class Prediction(NamedTuple):
     """Prediction of the bank for a measurement, steps 1 to 4; M = 3 hypotheses."""
 
     mean: Array
-    """``(17, M, N)``."""
+    """Predicted means, ``(17, M, N)``."""
     covariance: Array
-    """Packed, as those of :class:`Filters`, ``(153, M, N)``."""
+    """Predicted covariances, packed, ``(153, M, N)``."""
     probabilities: Array
-    """``(M, N)``."""
+    """Predicted probabilities, ``(M, N)``."""
 
 
 class Filters(NamedTuple):
-    """The bank at one moment.
+    """State of the bank.
 
-    Covariances are packed (:mod:`~filtergym.filters.packed_covariance`), so that a compiled step knows that they are
-    symmetric and computes one half. That of the combination (step 8) is computed where somebody asks for it.
+    Covariances are packed (:mod:`~filtergym.filters.packed_covariance`), so that a compiled step computes only one
+    half of
+    them. The covariance of the combination (step 8) is computed on demand.
     """
 
     means: Array
-    """After the update, ``(17, M, N)``; of a bank whose action sets the noise, before :meth:`act`, as predicted."""
+    """Means after the update, ``(17, M, N)``; where the action sets the noise, the predicted ones before
+    :meth:`act`."""
     covariances: Array
     """Predicted covariances, packed, ``(153, M, N)``."""
     log_predicted: Array
     """Logarithm of the predicted probabilities, ``(M, N)``."""
     log_likelihood: Array
-    """``(M, N)``."""
+    """Log-likelihood of the readings in each filter, ``(M, N)``."""
     nis: Array
-    """Normalised innovation squared by group of sensors, each given those before it, ``(4, M, N)``."""
+    """Normalised innovation squared by group of sensors, each conditional on the previous groups, ``(4, M, N)``."""
     log_density: Array
-    """Of the measurement as the filters predict it with the nominal noise, ``(N,)``."""
+    """Log-density of the measurement under the prediction with the nominal noise, ``(N,)``."""
     average_nis: Array
-    """Short average of the same per reading, ``(4, M, N)``."""
+    """Short average of the NIS per reading, ``(4, M, N)``."""
     accelerometers: Array
-    """Their last readings, ``(3, N)``, m/s^2; infinite before the first."""
+    """Last readings of the accelerometers, ``(3, N)``, m/s^2; infinite before the first."""
     repeated: Array
-    """1 where they repeat the readings before exactly, ``(N,)``."""
+    """1 where the accelerometers repeat their previous readings exactly, ``(N,)``."""
     range_innovation: Array
-    """Of the combined prediction: S pseudoranges, m, S rates, m/s; ``(2 S, N)``."""
+    """Innovations at the combined prediction: S pseudoranges, m, S rates, m/s; ``(2 S, N)``."""
     probabilities: Array
-    """Weights of the hypotheses in force, ``(M, N)``."""
+    """Weights of the hypotheses, ``(M, N)``."""
     mean: Array
-    """Of the combination, ``(17, N)``."""
+    """Combined mean, ``(17, N)``."""
     action: Array
-    """``(A, N)``."""
+    """Last action, ``(A, N)``."""
 
 
 class SatelliteBank(Bank[Task, Measurement, Any]):
-    """Common base of all controls: statistics of each filter of a bank by group of sensors."""
+    """Base class of all banks: statistics of each filter by group of sensors, and the observation blocks of them."""
 
     task: NavigationProblem
     parameters: TightlyCoupledNavigationParameters
@@ -102,11 +104,11 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
         """Names of the components of the action."""
         return self.hypotheses
 
-    # --- what the agent is shown
+    # --- the agent's observation
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Statistics of each filter by group of sensors, readings, missing readings, and the clock."""
+        """Observation blocks: statistics of each filter by group of sensors, readings, availability, and the time."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in self.hypotheses]
@@ -158,7 +160,7 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Innovations as they are."""
+        """Innovations in m and m/s, computed from the observation."""
         ranges, rates, *_ = self.task.sensors
         return (
             Quantity(
@@ -172,21 +174,21 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
         )  # fmt: skip
 
     def _present(self, measurement: Measurement) -> Array:
-        """Return the readings of each group of sensors that are there, at least one, ``(4, 1, N)``."""
+        """Return the number of available readings of each group of sensors, at least one, ``(4, 1, N)``."""
         here = [ordered_sum(measurement.available[sensor.readings]) for sensor in self.task.sensors]
         return self.xp.stack([self.xp.clip(count, 1.0, None) for count in here])[:, None]
 
 
 class HypothesisBank(SatelliteBank):
-    """Controls ``evidence``, ``mode`` and ``weights``: the action weighs the hypotheses."""
+    """Bank of ``evidence``, ``mode`` and ``weights``: the action weights the hypotheses on the motion."""
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """One hypothesis, or a number for each."""
+        """Gymnasium space of the selected hypothesis, or of a number for each."""
         return bank_action_space(self.control, len(self.hypotheses))
 
     def start(self, initial: Initial) -> Filters:
-        """Start every filter from what is known of the start."""
+        """Return the bank's state at the start of the track, with the initial probabilities."""
         xp, M, task = self.xp, len(self.hypotheses), self.task
         zeros = 0.0 * initial.mean[0]
         means = xp.stack([initial.mean] * M, axis=1)
@@ -210,7 +212,7 @@ class HypothesisBank(SatelliteBank):
         )
 
     def _predict_hypotheses(self, state: Filters) -> Prediction:
-        """Return the steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
+        """Return steps 1 to 4: mix the filters with their weights, and extrapolate each under its hypothesis."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = imm.mix(state.means, unpack(state.covariances, gnss_ins.SIZE), chain.mixing)
@@ -218,7 +220,7 @@ class HypothesisBank(SatelliteBank):
         return Prediction(mean, pack(covariance), chain.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
-        """Return the state that the tracking loops expect at the next measurement, ``(17, N)``."""
+        """Return the state predicted for the next measurement, ``(17, N)``, which steers the tracking loops."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = weighted_sum(chain.mixing, state.means[:, :, None])
@@ -226,7 +228,7 @@ class HypothesisBank(SatelliteBank):
         return weighted_sum(chain.probabilities, mean)
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Predict, compare the prediction with a measurement, and update with the nominal noise."""
+        """Return the filters predicted to a measurement and updated with the nominal noise, with NIS and likelihood."""
         xp, task, predicted = self.xp, self.task, self._predict_hypotheses(state)
         combined = weighted_sum(predicted.probabilities, predicted.mean)
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
@@ -260,7 +262,7 @@ class HypothesisBank(SatelliteBank):
     def _before_the_action(
         self, predicted: Prediction, update: extended_kalman.Correction
     ) -> tuple[Array, Array]:
-        """Return the means and covariances, packed, that :meth:`act` goes on from."""
+        """Return the means and packed covariances from which :meth:`act` continues: here the updated ones."""
         return update.mean, pack(update.covariance)
 
     def _update_hypotheses(
@@ -272,7 +274,7 @@ class HypothesisBank(SatelliteBank):
         thresholds: Sequence[Array] | None = None,
         cautions: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
-        """Return the steps 5 and 6 for every hypothesis."""
+        """Return steps 5 and 6: every filter updated with the readings."""
         expected, rows = gnss_ins.observe(
             means,
             measurement.satellite_position[:, :, None],
@@ -293,11 +295,11 @@ class HypothesisBank(SatelliteBank):
         )
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
-        """Return the thresholds of the robust update for each reading; None: the paper's update."""
+        """Return the threshold of the robust update for each reading; None for the paper's update."""
         return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Weigh the hypotheses by the action (step 7)."""
+        """Return the hypotheses weighted by the action (step 7) and combined (step 8)."""
         xp, control, dtype = self.xp, self.control, state.log_likelihood.dtype
         probabilities = bank_probabilities(
             control,
@@ -315,12 +317,12 @@ class HypothesisBank(SatelliteBank):
         return self._combine(state, probabilities, last)
 
     def weigh_by_bayes(self, state: Filters, last_action: Array) -> Filters:
-        """Weigh the hypotheses by Bayes' rule (step 7), as the paper does."""
+        """Return the hypotheses weighted by Bayes' rule (step 7), as in the paper, and combined (step 8)."""
         probabilities = imm.mode_posterior(state.log_predicted, state.log_likelihood)
         return self._combine(state, probabilities, last_action)
 
     def _combine(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
-        """Combine the means (step 8)."""
+        """Return the state with these weights and the combined mean (step 8)."""
         return state._replace(
             probabilities=probabilities,
             mean=weighted_sum(probabilities, state.means),
@@ -328,13 +330,16 @@ class HypothesisBank(SatelliteBank):
         )
 
     def covariance(self, state: Filters) -> Array:
-        """Return the covariance of the combination (step 8)."""
+        """Return the covariance of the combined mean (step 8), ``(17, 17, N)``."""
         covariances = unpack(state.covariances, gnss_ins.SIZE)
         return imm.combine(state.means, covariances, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the probabilities, NIS of the combination and its degrees, log-density of the measurement as
-        predicted, whether a rate is beyond its aperture.
+        """Return the values to record at a measurement, by name: probabilities, NIS, log-likelihood, aperture.
+
+        They are the probabilities, the NIS of the combination with its degrees of freedom, the log-density of the
+        measurement
+        under the prediction, and whether a rate is outside its aperture.
         """
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
@@ -348,30 +353,31 @@ class HypothesisBank(SatelliteBank):
 
 
 class NoiseBank(HypothesisBank):
-    """Control ``gain``: the action scales the noise of the sensors; the paper's probabilities."""
+    """Bank of ``gain``: the action scales the sensors' noise; the hypotheses have the paper's probabilities."""
 
     adapts_covariance = True
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """A number for each group of sensors."""
+        """Gymnasium box with one number for each group of sensors, which scales its noise."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.actions),), numpy.float32)
 
     @property
     def actions(self) -> Sequence[str]:
-        """The groups of sensors."""
+        """Names of the groups of sensors, one for each component of the action."""
         return [sensor.name for sensor in self.task.sensors]
 
     def _before_the_action(
         self, predicted: Prediction, update: extended_kalman.Correction
     ) -> tuple[Array, Array]:
-        """Those of the prediction: the update waits for the noise that the action asks for. What of the nominal one
-        is not kept, a compiled step does not compute.
+        """Return the predicted means and covariances, since the update waits for the action's noise.
+
+        A compiled step does not compute the unused update with the nominal noise.
         """
         return predicted.mean, predicted.covariance
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Update with the noise that the action asks for, and weigh by Bayes' rule."""
+        """Return the filters updated with the noise that the action sets, weighted by Bayes' rule."""
         xp = self.xp
         exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
         variance, thresholds = self._variance(exponent, state), self._thresholds(exponent)
@@ -382,7 +388,7 @@ class NoiseBank(HypothesisBank):
         return self.weigh_by_bayes(state, exponent)
 
     def _variance(self, exponent: Array, state: Filters) -> list[Array]:
-        """Return the variance of the noise of every reading, ``(N,)`` each."""
+        """Return the noise variance of every reading under an action, ``(N,)`` each."""
         xp, p, task = self.xp, self.parameters, self.task
         up, down = 2.0 * math.log(p.noise_scale), 2.0 * math.log(p.noise_reduction)
         factor = xp.exp(xp.where(exponent > 0.0, up * exponent, down * exponent))
@@ -393,15 +399,15 @@ class NoiseBank(HypothesisBank):
         ]
 
     def _thresholds(self, exponent: Array) -> Sequence[Array] | None:
-        """Return the thresholds of the robust update of every reading, ``(N,)`` each; None: the plain update."""
+        """Return the thresholds of the robust update of every reading, ``(N,)`` each; None for the plain update."""
         return None
 
     def covariance(self, state: Filters) -> Array:
-        """Return the covariance of the combination, times the short average of the NIS per reading if that is above
-        one.
+        """Return the covariance of the combined mean, ``(17, 17, N)``; under an action inflated by the average NIS.
 
-        Whether the action is right about the sensors, only the innovations tell. Left alone, it is the paper's bank
-        with the paper's covariance.
+        The factor is the short average of the NIS per reading, if that is above one: only the innovations indicate
+        whether the
+        action's noise is right. With action zero it is the covariance of the paper's bank.
         """
         groups = int(state.average_nis.shape[0])
         average = weighted_sum(state.probabilities, ordered_sum(state.average_nis)) / groups
@@ -410,27 +416,26 @@ class NoiseBank(HypothesisBank):
 
 
 class RobustBank(NoiseBank):
-    """Control ``robust``: noise as under ``gain``, and what to do with a reading that repeats itself or is an outlier.
+    """Bank of ``robust``: noise as under ``gain``, and the treatment of repeated readings and outliers.
 
-    What a reading is shows only with the measurement, between two decisions; so the action determines beforehand what
-    is to be done then.
+    Whether a reading repeats or is an outlier is known only with the measurement, between two decisions; so the
+    action sets
+    the treatment in advance.
     """
 
     @property
     def reach(self) -> float:
-        """Return the share of the noises' range that an action of one has, as an exponent."""
+        """Share of the logarithm of the noises' range that an action of one applies."""
         return self.parameters.noise_reach
 
     @property
     def actions(self) -> Sequence[str]:
-        """The groups of sensors, accelerometers that repeat themselves, outliers of ranges and rates."""
+        """Names of the action's components: sensor groups, repeated accelerometers, outliers of ranges and of rates."""
         ranges, rates = (sensor.name for sensor in self.task.sensors[:2])
         return [*super().actions, "accelerometers_repeated", f"{ranges}_outliers", f"{rates}_outliers"]
 
     def _variance(self, exponent: Array, state: Filters) -> list[Array]:
-        """Return the variances as under ``gain``; accelerometers that repeat their last reading are noisier by an
-        action of their own.
-        """
+        """Return the noise variances of the readings; repeated accelerometer readings have a further factor."""
         xp, forces = self.xp, self.task.sensors[2].readings
         groups = len(self.task.sensors)
         variance = super()._variance(self.reach * exponent[:groups], state)
@@ -439,7 +444,7 @@ class RobustBank(NoiseBank):
         return [*variance[: forces.start], *(v * factor for v in variance[forces]), *variance[forces.stop :]]
 
     def _thresholds(self, exponent: Array) -> Sequence[Array]:
-        """Return Huber's for an action of 1, none for 0 or less."""
+        """Return the Huber thresholds of every reading: finite for an action above 0, infinite for 0 or less."""
         sensors = self.task.sensors
         strength = self.xp.clip(exponent[len(sensors) + 1 :], LEAST_STRENGTH, None)
         none = math.inf + 0.0 * exponent[0]

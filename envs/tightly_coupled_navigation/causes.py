@@ -11,7 +11,7 @@ from .parameters import LINE, REST, SINGER
 
 def _moves_as(hypothesis: int) -> Callable[[Moment], Array | None]:
     def holds(moment: Moment) -> Array | None:
-        return moment.context["mode"] == hypothesis if moment.knows("mode") else None
+        return moment.context["mode"] == hypothesis if moment.has_context("mode") else None
 
     return holds
 

@@ -1,7 +1,7 @@
-"""Motion of the user of TightlyCoupledNavigation: legs drawn anew for every episode, or the paper's fixed ones.
+"""Motion of the user of TightlyCoupledNavigation: random legs for every episode, or the fixed legs of the paper.
 
-Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so nothing
-is left to jump at step 2000. The truth was probably a sequence of states with V incremented and A = 0:
+Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so no jump
+is left for step 2000. The truth was probably a sequence of states with V incremented and A = 0:
 ``course="increment"``. Physically that is an accelerometer stuck at zero through leg 2. The consistent
 alternative, where A = 30 m/s^2 in leg 2 and turns by 90 degrees, is ``course="kinematic"``.
 """
@@ -19,18 +19,18 @@ from .problem import NavigationProblem
 
 
 class Legs(NamedTuple):
-    """The course, L legs."""
+    """The L legs of a course."""
 
     start: Array
     """Last step before each leg, ``(L, N)``."""
     kind: Array
-    """REST, LINE or SINGER, ``(L, N)``."""
+    """Kind of each leg, REST, LINE or SINGER, ``(L, N)``."""
     acceleration: Array
-    """With which each leg begins, ``(3, L, N)``, m/s^2."""
+    """Initial acceleration of each leg, ``(3, L, N)``, m/s^2."""
 
 
 class Course:
-    """Legs of rest, straight flight and manoeuvre.
+    """Motion along legs of rest, straight flight and manoeuvre.
 
     Args:
         task: the problem, with parameters and models.
@@ -43,7 +43,7 @@ class Course:
         self.singer_root: Array = task.constant(numpy.linalg.cholesky(task.models[SINGER].noise))
 
     def begin(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Draw the legs.
+        """Return the drawn legs of each episode, the initial velocity and the heading.
 
         Args:
             draws: of the episode.
@@ -57,7 +57,7 @@ class Course:
         return self._fixed_legs(draws, zeros)
 
     def _fixed_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Return the legs of the paper's experiment, or one that is matched to hypothesis 3, velocity and heading."""
+        """Return the legs, initial velocity and heading of the paper's experiment, or of the matched course."""
         xp, p = self.xp, self.parameters
         # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
         draws.unit("legs", 15)
@@ -79,7 +79,7 @@ class Course:
         return legs, along * speed, heading
 
     def _random_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Return the legs of rest, straight flight and manoeuvre at random, velocity at the start and heading."""
+        """Return random legs of rest, straight flight and manoeuvre, the initial velocity and heading."""
         xp, p = self.xp, self.parameters
         columns: list[tuple[Array, ...]] = []
         start: Array = None
@@ -119,9 +119,7 @@ class Course:
         return legs, velocity, heading
 
     def leg_at(self, legs: Legs, k: Array) -> tuple[Array, Array]:
-        """Return the kind of the leg that step k belongs to, ``(N,)``, and the acceleration with which it begins,
-        ``(3, N)``.
-        """
+        """Return the kind, ``(N,)``, and the initial acceleration, ``(3, N)``, of the leg to which step k belongs."""
         kind, push = legs.kind[0], legs.acceleration[:, 0]
         for i in range(1, legs.start.shape[0]):
             begun = k > legs.start[i]
@@ -130,7 +128,7 @@ class Course:
         return kind, push
 
     def move(self, legs: Legs, k: Array, state: Array, moved: Array, w: Array) -> tuple[Any, Array, Array]:
-        """Move the user through step k.
+        """Return position, velocity and acceleration after step k, the hypothesis it follows, and whether it jumps.
 
         Args:
             legs: of the episode.

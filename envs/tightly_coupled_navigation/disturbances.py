@@ -1,4 +1,4 @@
-"""Disturbances of the sensors of TightlyCoupledNavigation: a class for each."""
+"""Disturbances of the sensors of TightlyCoupledNavigation: one class each."""
 
 import math
 from typing import Any, ClassVar, NamedTuple
@@ -6,22 +6,28 @@ from typing import Any, ClassVar, NamedTuple
 from ...filters import gnss_ins
 from ..contract.causes import Cause, Moment, context_flag
 from ..contract.draws import Draws, draw_between
-from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput, undisturbed
+from ..contract.faults import (
+    ColouredErrors,
+    ColouredErrorsState,
+    Disturbance,
+    DisturbanceInput,
+    draw_undisturbed,
+)
 from ..contract.observation import Array
 from .problem import NavigationProblem
 
 QUANTILE_95 = 1.6448536269514722
-"""Of the standard normal distribution."""
+"""95 % quantile of the standard normal distribution."""
 CLEAR_ERROR = 19.0
 """95 % quantile of the multipath error, the positive part of a normal one, at 44 dB-Hz and more, m."""
 MULTIPATH = ((44.0, 7.0, 49.0), (38.0, 25.0, 79.0), (30.0, 50.0, 152.0))
-"""Below a C/N0, dB-Hz, the error is lognormal: its median and 95 % quantile, m."""
+"""Median and 95 % quantile, m, of the lognormal multipath error below each C/N0, dB-Hz."""
 PULLED = 5.0
-"""m by which a pseudorange is off from which it is wrong: noise is some metres."""
+"""Error of a pseudorange, m, above which it counts as wrong; noise is some metres."""
 
 
 def _is_noisy(moment: Moment) -> Array | None:
-    if not moment.knows("noise_factor"):
+    if not moment.has_context("noise_factor"):
         return None
     noisy: Array = moment.xp.any(moment.context["noise_factor"] > 1.0, axis=0)
     return noisy
@@ -40,14 +46,14 @@ def _lacks_rate(moment: Moment) -> Array:
 
 
 def _is_pulled(moment: Moment) -> Array | None:
-    if not moment.knows("range_error"):
+    if not moment.has_context("range_error"):
         return None
     pulled: Array = moment.xp.any(moment.xp.abs(moment.context["range_error"]) > PULLED, axis=0)
     return pulled
 
 
 class _OfSatellites(Disturbance):
-    """Disturbance of satellites, S of them; pseudoranges come first in the readings, then their rates."""
+    """Base class of disturbances of S satellites; the readings begin with pseudoranges, then their rates."""
 
     def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
@@ -56,37 +62,40 @@ class _OfSatellites(Disturbance):
         self.places: Array = task.constant(range(task.satellites))[:, None]
 
     def change_rows(self, values: Array, first: int, changed: Array) -> Array:
-        """Return the values of the readings, ``(m, N)``, with some of them changed, from the first on."""
+        """Return the values of all readings, ``(m, N)``, with those of ``changed`` put in from row ``first`` on."""
         return self.xp.concat([values[:first], changed, values[first + changed.shape[0] :]])
 
-    def change_available(self, measurement: Any, first: int, kept: Array) -> Any:
-        """Return the measurement of which some readings are there only if one more number is above zero."""
+    def change_available(self, measurement: Any, first: int, factor: Array) -> Any:
+        """Return the measurement with the availability of readings from ``first`` on multiplied by ``factor``."""
         available = measurement.available
-        changed = available[first : first + kept.shape[0]] * kept
+        changed = available[first : first + factor.shape[0]] * factor
         return measurement._replace(available=self.change_rows(available, first, changed))
 
 
 class Fault(NamedTuple):
-    """State of what goes wrong for a while, once in an episode."""
+    """State of a temporary disturbance that occurs at most once in an episode."""
 
     window: Array
-    """First and last step of it, ``(2, N)``; -1 where it does not happen."""
+    """First and last step of the disturbance, ``(2, N)``; -1 where it does not occur."""
     satellites: Array
-    """Places of the satellites that it concerns, ``(n, N)``; None where it concerns none."""
+    """Indices of the affected satellites, ``(n, N)``; None where it affects none."""
     own: Array
-    """What else it has."""
+    """Further state, which depends on the disturbance."""
     now: Array
-    """One where it happens at this step, else zero, ``(N,)``."""
+    """One where it occurs at this step, else zero, ``(N,)``."""
 
 
 class _Once(_OfSatellites):
-    """Temporary disturbance, once in an episode, with a probability."""
+    """Temporary disturbance that occurs at most once in an episode, with a probability."""
 
     title: ClassVar[str]
-    """Of the parameters of its probability and duration."""
+    """Prefix of the parameters of its probability and duration."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Draw whether it happens, and when: the start is a share of the time left free."""
+        """Return the drawn state: first and last step of the disturbance, if it occurs, and its satellites.
+
+        The start is uniform over the times that leave room for the duration.
+        """
         xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
         happens = draws.event(self.name, getattr(p, f"{self.title}_probability"))
         start = draws.unit(f"{self.name}_start")
@@ -96,133 +105,133 @@ class _Once(_OfSatellites):
         return Fault(xp.where(happens, window, -1.0), self.draw_satellites(draws), zero, zero)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Draw which satellites it concerns: here none."""
+        """Return the drawn indices of the affected satellites, ``(n, N)``; by default None."""
         return None
 
     def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
-        """Look whether it happens."""
+        """Return the disturbance's state with ``now`` set: whether it occurs at this step."""
         happens = (step.number >= state.window[0]) & (step.number <= state.window[1])
         return state._replace(now=self.xp.astype(happens, state.now.dtype))
 
     def is_at(self, state: Fault) -> Array:
-        """Return whether it affects each satellite now, booleans ``(S, N)``."""
+        """Return booleans ``(S, N)``: whether the disturbance affects each satellite now."""
         chosen = self.places == state.satellites[0]
         for i in range(1, state.satellites.shape[0]):
             chosen = chosen | (self.places == state.satellites[i])
         return chosen & (state.now > 0.0)
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the first and last step, -1 where there is none."""
+        """Return the context: first and last step of the disturbance (-1 where it does not occur), by name."""
         window = state.window
         return {self.name: self.xp.where(window[1] >= window[0], window, -1.0)}
 
 
 class _Hidden(_Once):
-    """A disturbance that the measurement does not report."""
+    """Temporary disturbance that the measurement does not report."""
 
-    def quiet(self, state: Fault, calm: Array) -> Fault:
-        """Remove it."""
-        return state._replace(window=self.xp.where(calm, -1.0, state.window))
+    def switch_off(self, state: Fault, undisturbed: Array) -> Fault:
+        """Return the state without the disturbance in the episodes where ``undisturbed``."""
+        return state._replace(window=self.xp.where(undisturbed, -1.0, state.window))
 
 
 class StuckAccelerometers(_Hidden):
-    """The accelerometers repeat their last reading, its own state, m/s^2, ``(3, N)``."""
+    """Accelerometers that repeat their last reading; that is the further state, m/s^2, ``(3, N)``."""
 
     name, title = "stuck", "stick"
     causes = (Cause("stuck accelerometers", "while the accelerometers are stuck", context_flag("stuck_now")),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Draw it; nothing was read yet."""
+        """Return the drawn state: whether and when the accelerometers stick, with zero as the last reading."""
         return super().begin(draws, normals, zero)._replace(own=self.xp.stack([zero] * 3))
 
     def change_reading(self, state: Fault, reading: Array) -> tuple[Fault, Array]:
-        """Hold it. One that sticks at the first measurement has no last reading to hold."""
+        """Return the state with the last reading, and the readings with it repeated while accelerometers stick."""
         rows = self.task.sensors[2].readings
         forces = self.xp.where(state.now > 0.0, state.own, reading[rows])
         return state._replace(own=forces), self.change_rows(reading, rows.start, forces)
 
     def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
-        """Look whether it happens; the first measurement is never one."""
+        """Return the state with ``now`` set for this step; never at the first measurement."""
         state = super().advance(state, step)
         return state._replace(now=self.xp.where(step.number > 1.0, state.now, 0.0))
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the window, and whether it happens."""
+        """Return the context: window of the fault, and whether the accelerometers stick now, by name."""
         return {**super().context(state), "stuck_now": state.now}
 
 
 class NoisyRate(_Hidden):
-    """The rate of one satellite is noisier than stated, by a factor of its own, ``(N,)``."""
+    """Noisy rate channel of one satellite, by a factor on its standard deviation, the further state, ``(N,)``."""
 
     name, title = "noisy", "rate_fault"
     causes = (Cause("noisy rate", "while a pseudorange rate is too noisy", _is_noisy),)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Draw one."""
+        """Return the drawn index of the satellite with a noisy rate, ``(1, N)``."""
         return draws.integer("noisy_satellite", (0, self.satellites - 1))[None]
 
     def complete(self, state: Fault, draws: Draws) -> Fault:
-        """Draw how much noisier."""
+        """Return the state with the drawn factor on the standard deviation of the satellite's rate."""
         factor = draw_between(draws.log_uniform, "rate_fault_factor", self.parameters.rate_fault_factor)
         return state._replace(own=state.own + factor)
 
     def change_deviations(self, state: Fault, deviations: Array) -> Array:
-        """Multiply that of its rate."""
+        """Return the deviations with that of the satellite's rate multiplied by the factor."""
         S = self.satellites
         factor = self.xp.where(self.is_at(state), state.own, 1.0)
         return self.change_rows(deviations, S, factor * deviations[S : 2 * S])
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the window and satellite."""
+        """Return the context: window and satellite of the noisy rate, by name."""
         return {**super().context(state), "noisy_satellite": state.satellites[0]}
 
 
 class HiddenSatellites(_Once):
-    """Two satellites are gone."""
+    """Outage of two satellites."""
 
     name, title = "hidden", "satellites_outage"
     causes = (Cause("range lost", "where a pseudorange is missing", _lacks_range),)
 
     def draw_satellites(self, draws: Draws) -> Array:
-        """Draw two."""
+        """Return the drawn indices of the two hidden satellites, ``(2, N)``."""
         S = self.satellites
         first = draws.integer("hidden_satellite", (0, S - 1))
         second = (first + 1.0 + draws.integer("other_hidden_satellite", (0, max(S - 2, 0)))) % S
         return self.xp.stack([first, second])
 
     def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
-        """Take their pseudoranges and rates away."""
+        """Return the state, and the measurement with both satellites' pseudoranges and rates missing."""
         seen = self.xp.where(self.is_at(state), 0.0, self.xp.ones_like(state.now))
         return state, self.change_available(measurement, 0, self.xp.concat([seen, seen]))
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the window and satellites."""
+        """Return the context: window and satellites of the outage, by name."""
         return {**super().context(state), "hidden_satellites": state.satellites}
 
 
 class LostRates(_Once):
-    """No satellite has a rate."""
+    """Outage of all rates."""
 
     name, title = "no_rates", "rates_outage"
     causes = (Cause("rate lost", "where a pseudorange rate is missing", _lacks_rate),)
 
     def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
-        """Take them away."""
+        """Return the state, and the measurement with the rates of all satellites missing."""
         kept = self.xp.stack([1.0 - state.now] * self.satellites)
         return state, self.change_available(measurement, self.satellites, kept)
 
 
 class RangeColour(ColouredErrors):
-    """Errors of the pseudoranges that last: diffuse multipath, atmosphere, ephemerides."""
+    """Pseudorange errors that are correlated in time: diffuse multipath, atmosphere, ephemerides."""
 
     def __init__(self, task: NavigationProblem) -> None:
         p = task.parameters
         super().__init__(task, p.sampling_interval, task.satellites, p.pseudorange_coloured[1] > 0.0)
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw deviation, m, and correlation time, s, ``(N,)`` each."""
+        """Return the drawn standard deviation, m, and correlation time, s, of pseudorange errors, ``(N,)`` each."""
         p = self.parameters
-        undisturbed(draws, p)  # comes first among the random numbers
+        draw_undisturbed(draws, p)  # comes first among the random numbers
         if not self.normals:
             return zero, zero + p.pseudorange_correlation_time[0]
         lasting = p.pseudorange_correlation_time
@@ -232,11 +241,11 @@ class RangeColour(ColouredErrors):
         )
 
     def change_errors(self, state: ColouredErrorsState, errors: Array) -> Array:
-        """Add them."""
+        """Return the errors with the correlated ones added to the pseudoranges."""
         return errors + state.level
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Their deviation, m, and what is left of them from one measurement to the next."""
+        """Return the context: standard deviation, m, and decay of the pseudorange errors, by name."""
         return {"coloured_deviation": state.deviation, "coloured_decay": state.process.decay}
 
 
@@ -244,19 +253,19 @@ class Reception(NamedTuple):
     """State of :class:`Reflections`."""
 
     urban: Array
-    """One between houses, else zero, ``(N,)``."""
+    """One for reception between houses, else zero, ``(N,)``."""
     cn0: Array
-    """``(S, N)``, dB-Hz."""
+    """Carrier-to-noise density C/N0, ``(S, N)``, dB-Hz."""
     multipath: Array
-    """Held error of each pseudorange, ``(S, N)``, m."""
+    """Present multipath error of each pseudorange, ``(S, N)``, m."""
     hold: Array
-    """Steps for which it still holds, ``(S, N)``."""
+    """Remaining steps of that error, ``(S, N)``."""
 
 
 class Reflections(_OfSatellites):
-    """Between houses C/N0 walks, and pseudoranges have the errors of reflections.
+    """Reception between houses: C/N0 walks randomly, and pseudoranges have multipath errors.
 
-    Its numbers: S normals of the walk, S of the errors, S uniforms of how long they hold.
+    The random numbers of a measurement: S normals of the walk, S of the errors, S uniforms of their durations.
     """
 
     name = "reflections"
@@ -267,22 +276,23 @@ class Reflections(_OfSatellites):
         self.normals: int = 2 * self.row_uniforms
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Reception:
-        """Draw C/N0, in open country too: every scenario takes the same numbers."""
+        """Return the state with the drawn initial C/N0 of each satellite.
+
+        It is drawn under an open sky, too, so that all scenarios use the same random numbers.
+        """
         cn0 = draws.uniform("cn0", self.parameters.cn0_limits, self.satellites)
         none = self.xp.stack([zero] * self.satellites)
         return Reception(zero, cn0, none, none)
 
     def complete(self, state: Reception, draws: Draws) -> Reception:
-        """Draw whether the episode is between houses."""
+        """Return the state with the drawn choice whether the episode is between houses."""
         urban = _draw_share(draws, "urban", self.parameters, state.urban)
         return state._replace(
             urban=urban, cn0=self.xp.where(urban < 0.5, self.parameters.clear_cn0, state.cn0)
         )
 
     def advance(self, state: Reception, step: DisturbanceInput) -> Reception:
-        """Return the C/N0 walks between its limits; where a multipath error has run out, a new one is drawn by the
-        C/N0 now.
-        """
+        """Return the state with C/N0 walked between its limits, and new multipath errors where old ones have ended."""
         xp, p, S = self.xp, self.parameters, self.satellites
         if not p.urban:
             return state
@@ -307,22 +317,24 @@ class Reflections(_OfSatellites):
         )
 
     def change_errors(self, state: Reception, errors: Array) -> Array:
-        """Add them."""
+        """Return the errors with the multipath errors added to the pseudoranges."""
         return errors + state.multipath
 
     def change_measurement(
         self, state: Reception, measurement: Any, step: DisturbanceInput
     ) -> tuple[Reception, Any]:
-        """Change the C/N0."""
+        """Return the state, and the measurement with the C/N0 filled in."""
         return state, measurement._replace(cn0=state.cn0)
 
     def context(self, state: Reception) -> dict[str, Array]:
-        """Return whether the episode is between houses."""
+        """Return the context: whether the episode is between houses, by name."""
         return {"urban": state.urban}
 
 
 def _draw_share(draws: Draws, name: str, parameters: Any, zero: Array) -> Array:
-    """Draw in which share of the episodes there is something, one or zero, ``(N,)``; no number where in all or none."""
+    """Return ones with the probability ``name_probability``, else zeros, ``(N,)``; at 0 or 1 no random number is
+    used.
+    """
     share = getattr(parameters, f"{name}_probability")
     if not getattr(parameters, name) or share == 1.0:
         return zero + float(getattr(parameters, name))
@@ -330,19 +342,20 @@ def _draw_share(draws: Draws, name: str, parameters: Any, zero: Array) -> Array:
 
 
 class Ramp(_Hidden):
-    """One pseudorange drifts off from some time to the end; its own state, by how much, ``(2, N)``, m: the bias with
-    which that begins, and now.
+    """A pseudorange that drifts off from some time to the end.
+
+    The further state is its initial and its present error, m, ``(2, N)``.
     """
 
     name = "ramp"
     causes = (Cause("wrong range", f"where a pseudorange is off by more than {PULLED:g} m", _is_pulled),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Never, until it is drawn."""
+        """Return the disturbance's state without a ramp; :meth:`complete` draws one."""
         return Fault(self.xp.stack([zero - 1.0] * 2), zero[None], self.xp.stack([zero] * 2), zero)
 
     def complete(self, state: Fault, draws: Draws) -> Fault:
-        """Draw time, satellite and bias."""
+        """Return the state with the drawn start, satellite and initial error of the ramp."""
         xp, p, zero = self.xp, self.parameters, state.now
         if not p.ramp_probability:
             return state
@@ -354,38 +367,43 @@ class Ramp(_Hidden):
         return Fault(window, satellite[None], xp.stack([jump, zero]), zero)
 
     def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
-        """Return the drift on."""
+        """Return the state with the ramp's error at this step."""
         p, jump = self.parameters, state.own[0]
         run = jump + (p.ramp_rate * p.sampling_interval) * (step.number - state.window[0] + 1.0)
         return super().advance(state._replace(own=self.xp.stack([jump, run])), step)
 
     def change_errors(self, state: Fault, errors: Array) -> Array:
-        """Add it."""
+        """Return the errors with the ramp's error added to its pseudorange."""
         if not self.parameters.ramp_probability:
             return errors
         return errors + self.xp.where(self.is_at(state), state.own[1], 0.0)
 
     def context(self, state: Fault) -> dict[str, Array]:
-        """Return the window, satellite and the bias with which it begins."""
+        """Return the context: window, satellite and initial error of the ramp, by name."""
         own = {"ramp_satellite": state.satellites[0], "ramp_jump": state.own[0]}
         return {**super().context(state), **own}
 
 
 class Aperture(_OfSatellites):
-    """Tracking loops, steered by the combined prediction, lose what they do not expect; one where they do, ``(N,)``."""
+    """Tracking loops that lose signals too far from the combined prediction; the state is one where they do,
+    ``(N,)``.
+    """
 
     name = "aperture"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Keep what :meth:`complete` takes."""
+        """Return zeros, the disturbance's state without an aperture; :meth:`complete` draws one."""
         return zero
 
     def complete(self, state: Array, draws: Draws) -> Array:
-        """Draw whether they do."""
+        """Return ones where the tracking loops of a drawn episode have an aperture, else zeros, ``(N,)``."""
         return _draw_share(draws, "aperture", self.parameters, state)
 
     def change_measurement(self, state: Array, measurement: Any, step: DisturbanceInput) -> tuple[Array, Any]:
-        """Take away what is too far from the state ``(17, N)`` that they expect."""
+        """Return the state, and the measurement with ranges and rates outside the aperture missing.
+
+        The aperture is centred on the predicted state ``(17, N)``.
+        """
         feedback = step.feedback
         if feedback is None:
             return state, measurement
@@ -396,7 +414,7 @@ class Aperture(_OfSatellites):
         return state, self.change_available(measurement, 0, self.xp.astype(kept, feedback.dtype))
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return whether rates are outside the aperture."""
+        """Return the context: whether the tracking loops have an aperture, by name."""
         return {"aperture": state}
 
 
@@ -410,6 +428,6 @@ DISTURBANCES: tuple[type[Disturbance], ...] = (
     Ramp,
     Aperture,
 )
-"""In the order in which they act; a further one comes last, so that episodes stay."""
+"""Disturbances in the order in which they act. New ones are appended, so that episodes do not change."""
 DRAWN_FIRST = (NoisyRate, StuckAccelerometers, LostRates, HiddenSatellites, Ramp, Reflections, Aperture)
-"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""
+"""Disturbances that are drawn before the others, in this order, which fixes the random numbers of episodes."""

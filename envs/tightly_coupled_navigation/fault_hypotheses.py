@@ -1,34 +1,33 @@
-r"""A bank of extended Kalman filters over motion and faults of TightlyCoupledNavigation.
+r"""A bank of extended Kalman filters over motion and sensor faults of TightlyCoupledNavigation.
 
-Three hypotheses on the motion are kept, the paper's: rest, constant velocity, Singer manoeuvre. They follow each other
-as legs do: a manoeuvre begins with an acceleration that has nothing to do with the past, whatever was before it, also
-another manoeuvre; constant velocity follows a manoeuvre; rest does not return. So before each measurement a
-fourth hypothesis, "a manoeuvre has begun at this step", is made of the predictions of all three, with an acceleration
-of zero and the variance of the prior; after the measurement it is merged with the manoeuvre by moments.
+The bank has the paper's three hypotheses on the motion: rest, constant velocity, Singer manoeuvre. Legs follow each
+other so: a manoeuvre begins with an acceleration that is independent of the past, also after another manoeuvre;
+constant velocity follows a manoeuvre; rest does not return. So before each measurement a fourth hypothesis, "a
+manoeuvre has begun at this step", is made of the predictions of all three, with an acceleration of zero and the
+variance of the prior; after the measurement it is merged with the manoeuvre by moments.
 
 Each filter has, beside the 17 states of the paper, one error for every pseudorange (``filters/range_errors.py``). Under
-an open sky it is a Gauss-Markov process. Between houses, which the C/N0 shows, it holds for about a second and is then
-drawn anew, with a mean and a variance that depend on the C/N0. The update by a pseudorange tests each satellite for
-that: a pseudorange that has jumped is left to its own error and excluded from the position.
+an open sky it is a Gauss-Markov process. Between houses, which the C/N0 indicates, it is constant for about a second
+and is then drawn anew, with a mean and a variance that depend on the C/N0. The update by a pseudorange tests each
+satellite for that: a jump of a pseudorange is assigned to its own error and excluded from the position.
 
 The noise of every rate is at one of L levels, a Markov chain that all hypotheses share; the rate enters each filter as
-a Gaussian sum. Accelerometers that repeat themselves exactly are left out: noise never does.
+a Gaussian sum. Accelerometer readings that repeat exactly are excluded: noise never repeats.
 
-Reading: levels and renewals are weighed under each hypothesis on the motion, and the levels then averaged over them.
+Reading: levels and renewals are weighted under each hypothesis on the motion, and the levels then averaged over them.
 
-It is the estimator ``fault-hypotheses`` of the baselines, and what the control ``hypotheses`` steers. Before the
-readings the hypotheses on the motion have probabilities p', each range error j is drawn anew with the probability p_j,
-and the level l of every rate has the probability q'(l). Factors f of its settings change what the readings are weighed
-with:
+It is the estimator ``fault-hypotheses`` of the baselines, and the filter that the control ``hypotheses`` steers. Before
+the readings the hypotheses on the motion have probabilities p', each range error j is drawn anew with the probability
+p_j, and the level l of every rate has the probability q'(l). Factors f of its settings change the update:
 
     p'(begun) <- p'(begun) f1,  p'(manoeuvre) <- p'(manoeuvre) f2                          renormalised by Bayes' rule
     p_j / (1 - p_j) <- f3 p_j / (1 - p_j)
     q'(l) <- q'(l) f4^s(l)                                                            renormalised
     Q <- Q f5,  R_k <- R_k f(5 + k)                                                        k = 1, 2, 3
 
-begun: a manoeuvre begins at this step; manoeuvre: one goes on; s(l): how far the level lies above the nominal one,
-logarithmically, one for the highest; Q: process noise of the 17 states; R_k: variance of pseudoranges, of rates at all
-their levels, of accelerometers. Where a rate is missing its levels stay what they were expected to be.
+begun: a manoeuvre begins at this step; manoeuvre: one continues; s(l): logarithm of level l over the nominal one,
+one for the highest; Q: process noise of the 17 states; R_k: variance of pseudoranges, of rates at all their levels, of
+accelerometers. Where a rate is missing its levels keep their predicted probabilities.
 """
 
 import math
@@ -49,44 +48,44 @@ from .problem import NavigationProblem
 from .world import Measurement
 
 LEAST_PROBABILITY = 1e-30
-"""Of constant velocity: what is merged has weights that are never zero by zero."""
+"""Smallest probability of constant velocity: the weights of merged hypotheses are never zero by zero."""
 CN0_LIMITS = (30.0, 38.0, 44.0)
-"""dB-Hz, between which the errors between houses are alike."""
+"""Limits of C/N0 classes, dB-Hz, within which the errors between houses have the same distribution."""
 
 
 class FaultPrior(NamedTuple):
-    """Prior of a bank."""
+    """Prior of the bank."""
 
     quiet: float = 1.0
-    """Time from the start in which no leg ends, s."""
+    """Time from the start within which no leg ends, s."""
     leg: float = 2.0
     """Mean duration of a leg, s."""
     acceleration: float = 13.0
-    """Standard deviation of the acceleration with which a manoeuvre begins, m/s^2 per axis."""
+    """Standard deviation of the initial acceleration of a manoeuvre, m/s^2 per axis."""
     acceleration_between_houses: float = 1.3
     start: tuple[float, float, float] = (0.425, 0.425, 0.15)
     """Probabilities of rest, constant velocity and manoeuvre at the start."""
     levels: tuple[float, ...] = (1.0, 2.5, 4.5, 8.0)
-    """Standard deviations of a rate over the nominal one, ascending, the first one 1."""
+    """Ratios of a rate's standard deviation to the nominal one, ascending, the first one 1."""
     noisy_rate: float = 0.012
-    """Of one satellite, faults of the rate expected in a second."""
+    """Expected number of faults of one satellite's rate per second."""
     noisy_time: float = 2.0
     """Mean duration of such a fault, s."""
     coloured: float = 1.15
     """Standard deviation of the error of a pseudorange under an open sky, m."""
     correlation_time: float = 4.5
-    """Of it, s."""
+    """Correlation time of that error, s."""
     jump: float = 0.0
-    """Of one satellite under an open sky, jumps of the pseudorange expected in a second."""
+    """Expected number of pseudorange jumps of one satellite under an open sky per second."""
     jump_sigma: float = 30.0
     """Standard deviation of the error after such a jump, m."""
     hold: float = 1.25
-    """Mean time for which an error between houses holds, s."""
+    """Mean duration of an error between houses, s."""
     error_mean: tuple[float, ...] = (62.8, 31.9, 14.1, 4.6)
     """Mean of errors between houses, m, below each of ``CN0_LIMITS`` and above the last one: those of the lognormal
     and the half normal distributions of the environment."""
     error_sigma: tuple[float, ...] = (48.0, 25.0, 24.5, 6.7)
-    """Standard deviation of the same, m."""
+    """Standard deviation of these errors, m."""
 
 
 TRAINING = FaultPrior()
@@ -110,57 +109,58 @@ class Hypotheses(NamedTuple):
     """Hypotheses of the bank; n = 17 + S states, M = 3 hypotheses on the motion."""
 
     means: Array
-    """``(n, M, N)``."""
+    """Means, ``(n, M, N)``."""
     covariances: Array
-    """Packed, ``(n (n + 1) / 2, M, N)``."""
+    """Covariances, packed, ``(n (n + 1) / 2, M, N)``."""
     probabilities: Array
-    """``(M, N)``."""
+    """Probabilities of the hypotheses on the motion, ``(M, N)``."""
     levels: Array
     """Probabilities of the noise levels of every rate, ``(L, S, N)``."""
     accelerometers: Array
-    """Last readings, ``(3, N)``, m/s^2; infinite before the first."""
+    """Last readings of the accelerometers, ``(3, N)``, m/s^2; infinite before the first."""
 
 
 class Factors(NamedTuple):
-    """Factors of the prior at one measurement, ``(N,)`` or a number."""
+    """Factors on the prior at one measurement, ``(N,)`` or a number."""
 
     begun: Array = 1.0
-    """Probability that a manoeuvre has begun at this step, before the readings are weighed."""
+    """Factor on the probability that a manoeuvre has begun at this step."""
     manoeuvre: Array = 1.0
-    """Factor of the odds that a manoeuvre goes on."""
+    """Factor on the odds that a manoeuvre continues."""
     renewal: Array = 1.0
-    """Odds that a range error has been drawn anew."""
+    """Factor on the odds that a range error has been drawn anew."""
     levels: Array = 1.0
-    """Probabilities of the levels of every rate that is there, ``(L, N)``."""
+    """Factors on the probabilities of the levels of every available rate, ``(L, N)``."""
     motion: Array = 1.0
-    """Process noise of the 17 states."""
+    """Factor on the process noise of the 17 states."""
     pseudoranges: Array = 1.0
-    """Variance of their white noise."""
+    """Factor on the variance of the pseudoranges' white noise."""
     rates: Array = 1.0
-    """Variance of every level."""
+    """Factor on the variance of every rate level."""
     accelerometers: Array = 1.0
-    """Variance."""
+    """Factor on the variance of the accelerometers."""
 
 
 UNCHANGED = Factors()
 
 
 class Posterior(NamedTuple):
-    """Posterior of the bank after a measurement; four hypotheses: those on the motion, and a manoeuvre that has
-    begun.
+    """Posterior of the bank after a measurement.
+
+    Its four hypotheses are those on the motion, and a manoeuvre that has begun.
     """
 
     after: "FaultState"
     predicted: Array
     """Probabilities of the hypotheses before the readings, ``(4, N)``."""
     log_likelihoods: Array
-    """Of the readings under each, ``(4, N)``."""
+    """Log-likelihood of the readings under each hypothesis, ``(4, N)``."""
     squares: Array
-    """Normalised innovation squared of each group of sensors, given those before it, ``(4, 4, N)``."""
+    """Normalised innovation squared of each group of sensors, conditional on the previous groups, ``(4, 4, N)``."""
     residual: Array
-    """Of every reading at the predicted mean of each hypothesis, ``(m, 4, N)``."""
+    """Innovation of every reading at the predicted mean of each hypothesis, ``(m, 4, N)``."""
     between: Array
-    """Whether the C/N0 is that of a place between houses, ``(N,)``."""
+    """Whether the C/N0 indicates reception between houses, ``(N,)``."""
     repeated: Array
     """Whether the accelerometers repeat their last readings exactly, ``(N,)``."""
 
@@ -169,19 +169,19 @@ class FaultState(NamedTuple):
     """State of the bank."""
 
     mean: Array
-    """Of all hypotheses together, ``(17, N)``."""
+    """Mean of all hypotheses together, ``(17, N)``."""
     covariance: Array
-    """``(17, 17, N)``."""
+    """Covariance of all hypotheses together, ``(17, 17, N)``."""
     hypotheses: Hypotheses
     likelihood: Likelihood
 
 
 class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState]):
-    """Extended Kalman filters over the motion, with errors of pseudoranges and levels of rates.
+    """Extended Kalman filters over hypotheses on the motion, with pseudorange errors and noise levels of rates.
 
     Args:
         task: the problem.
-        prior: what it expects.
+        prior: of motion and faults.
         **changed: fields of the prior.
     """
 
@@ -225,7 +225,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         self.heights: Array = task.constant(heights)[:, None]
 
     def start(self, initial: Initial) -> FaultState:
-        """Start every filter from what is known of the start."""
+        """Return every filter at the initial estimate, with the prior probabilities."""
         xp, S, task = self.xp, self.task.satellites, self.task
         none = 0.0 * initial.mean[0]
         mean, covariance = range_errors.start(
@@ -241,18 +241,18 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         )
         return FaultState(initial.mean, initial.covariance, hypotheses, Likelihood.unknown(none))
 
-    def update(self, state: FaultState, given: FilterInput) -> FaultState:
-        """Predict, weigh hypotheses, levels and renewals by the readings, and report the moments of all."""
-        if given.action is None:
-            return self.examine(state, given.measurement).after
-        factors = Factors(*self.xp.exp(given.action))
-        levels = self.xp.exp(self.heights * given.action[Factors._fields.index("levels")])
-        return self.examine(state, given.measurement, factors._replace(levels=levels)).after
+    def update(self, state: FaultState, inputs: FilterInput) -> FaultState:
+        """Return the state predicted and updated with a measurement: hypotheses, levels, renewals, moments."""
+        if inputs.action is None:
+            return self.examine(state, inputs.measurement).after
+        factors = Factors(*self.xp.exp(inputs.action))
+        levels = self.xp.exp(self.heights * inputs.action[Factors._fields.index("levels")])
+        return self.examine(state, inputs.measurement, factors._replace(levels=levels)).after
 
     def _predict(
         self, memory: Hypotheses, measurement: Measurement, between: Array, factors: Factors
     ) -> tuple[Array, Array, Array]:
-        """Predict under the four hypotheses: mean, covariance, probabilities."""
+        """Return the mean, covariance and probability predicted under each of the four hypotheses."""
         xp, task, prior, common = self.xp, self.task, self.prior, self.task.common
         number = xp.astype(measurement.number, memory.means.dtype)
         # Half a step further, or rounding would choose the measurement at which the time is over.
@@ -295,12 +295,12 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         return mean, xp.concat([covariance, C[:, :, None]], axis=2), probabilities
 
     def _error_process(self, between: Array) -> tuple[Any, Any]:
-        """Return the decay of a range error in a step, and the variance that it gains, m^2; one for all, or a list."""
+        """Return the decay of a range error in a step and its variance gain, m^2, for all satellites or a list."""
         xp = self.xp
         return xp.where(between, 1.0, self.open_sky), xp.where(between, 0.0, self.gained)
 
     def _renewals(self, measurement: Measurement, between: Array, odds: Array) -> list[range_errors.Renewal]:
-        """Return the distributions of range errors that may have been drawn anew."""
+        """Return the distributions of range errors that may have been drawn anew, one for each satellite."""
         xp, prior = self.xp, self.prior
         first = measurement.number <= 1
         renewals = []
@@ -322,12 +322,12 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         return renewals
 
     def examine(self, state: FaultState, measurement: Measurement, factors: Factors = UNCHANGED) -> Posterior:
-        """Predict, weigh hypotheses, levels and renewals by the readings, and report the moments of all.
+        """Return the posterior of hypotheses, levels and renewals given a measurement, with factors on the prior.
 
         Args:
             state: after the measurement before.
             measurement: that arrives.
-            factors: of what is expected. Probabilities need not sum to one with them; then neither the log-likelihood
+            factors: on the prior. Probabilities need not sum to one with them; then neither the log-likelihood
                 nor the NIS is that of a density.
         """
         xp, task, S, memory = self.xp, self.task, self.task.satellites, state.hypotheses
@@ -428,7 +428,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         )
 
     def _move_levels(self, levels: Array) -> Array:
-        """Return the probabilities of the levels after a step, ``(L, N)``."""
+        """Return the predicted probabilities of the levels after a step, ``(L, N)``."""
         L = levels.shape[0]
         return self.xp.stack(
             [
@@ -438,7 +438,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         )
 
     def _merge(self, means: Array, covariances: Array, weights: Array) -> tuple[Array, Array, Array]:
-        """Merge a manoeuvre that has begun with the one that was there."""
+        """Return the hypotheses with a begun manoeuvre merged into the continued one, by moments."""
         xp = self.xp
         pair: Sequence[Array] = (weights[SINGER], weights[3])
         total = pair[0] + pair[1]

@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the estimator ``fault-hypotheses``, steered; its settings are in ``fault_hypotheses.py``."""
+"""Bank of the control ``hypotheses``: the estimator ``fault-hypotheses``, whose settings the action multiplies."""
 
 import math
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from ..contract.controls import SettingsBank, SteerableFilter
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import (
     BOUNDED_LOG,
-    KEPT_AS_LOG,
     SHARE,
+    STORED_AS_LOG,
     Array,
     Block,
     log_density_block,
@@ -24,55 +24,58 @@ from .world import Measurement
 
 
 class HypothesesState(NamedTuple):
-    """The bank over motion and faults at one moment; four hypotheses: those on the motion, and one that has begun."""
+    """State of the bank over motion and faults, with the values that the agent observes.
+
+    Its four hypotheses are those on the motion, and a manoeuvre that has begun.
+    """
 
     own: FaultState
-    """After the last action."""
+    """State of the estimator after the last action."""
     likelihood: Likelihood
-    """Of the readings as the estimator predicts them."""
+    """Likelihood of the readings under the estimator's prediction."""
     action: Array
     """Last action, ``(8, N)``."""
     log_predicted: Array
     """Logarithms of the probabilities before the readings, ``(4, N)``."""
     log_likelihood: Array
-    """Of the readings under each hypothesis, ``(4, N)``."""
+    """Log-likelihood of the readings under each hypothesis, ``(4, N)``."""
     nis: Array
-    """Normalised innovation squared by group of sensors, each given those before it, ``(4, 4, N)``."""
+    """Normalised innovation squared by group of sensors, each conditional on the previous groups, ``(4, 4, N)``."""
     average_nis: Array
-    """Short average of the same per reading, ``(4, 4, N)``."""
+    """Short average of the NIS per reading, ``(4, 4, N)``."""
     repeated: Array
-    """1 where the accelerometers repeat the readings before exactly, ``(N,)``."""
+    """1 where the accelerometers repeat their previous readings exactly, ``(N,)``."""
     range_innovation: Array
-    """Of all hypotheses together: S pseudoranges, m, S rates, m/s; ``(2 S, N)``."""
+    """Innovations of all hypotheses together: S pseudoranges, m, S rates, m/s; ``(2 S, N)``."""
     expected: Array
-    """Probabilities after the readings if the action is zero, ``(4, N)``."""
+    """Probabilities after the readings under action zero, ``(4, N)``."""
     range_error: Array
-    """Error of each pseudorange then, m, ``(S, N)``."""
+    """Estimated error of each pseudorange under action zero, m, ``(S, N)``."""
     noisy: Array
-    """Probability then that the noise of a rate is above its nominal level, ``(S, N)``."""
+    """Probability under action zero that the noise of a rate is above its nominal level, ``(S, N)``."""
     between: Array
-    """1 where the C/N0 is that of a place between houses, ``(N,)``."""
+    """1 where the C/N0 indicates reception between houses, ``(N,)``."""
 
     @property
     def probabilities(self) -> Array:
-        """Of rest, constant velocity and manoeuvre after the last action, ``(3, N)``."""
+        """Probabilities of rest, constant velocity and manoeuvre after the last action, ``(3, N)``."""
         return self.own.hypotheses.probabilities
 
 
 class FaultHypothesesBank(SettingsBank, SatelliteBank):
-    """The bank over motion and faults, steered by factors of its probabilities and of its noises."""
+    """Bank of ``hypotheses``: the bank over motion and faults with factors on probabilities and noises."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultHypotheses
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultHypotheses
     hypotheses: Sequence[str] = (*HYPOTHESES, "begun")
 
     @property
     def actions(self) -> Sequence[str]:
-        """The settings."""
+        """Names of the settings, one for each component of the action."""
         return tuple(self.own.settings)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation of the paper's bank, and probabilities of this one."""
+        """Observation blocks of the paper's bank, and probabilities of this bank."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         units = task.constant([0.5 * math.log(2.0 * math.pi * r) for r in task.sensor_variance])[:, None]
@@ -98,12 +101,12 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
             ),
             Block(
                 "position_sigma", lambda f, y: 0.5 * xp.log(ordered_sum(f.own.covariance[i, i] for i in range(3))),
-                "the sigma of the position after the last action, m", compression=KEPT_AS_LOG,
+                "the sigma of the position after the last action, m", compression=STORED_AS_LOG,
             ),
         )  # fmt: skip
 
     def start(self, initial: Initial) -> HypothesesState:
-        """Start where the estimator starts."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         xp, S, M = self.xp, self.task.satellites, len(self.hypotheses)
         own, none = self.own.start(initial), 0.0 * initial.mean[0]
         probabilities = xp.concat([own.hypotheses.probabilities, none[None]])
@@ -124,29 +127,31 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
             between=none,
         )
 
-    def look(self, state: HypothesesState, found: Posterior, measurement: Measurement) -> HypothesesState:
-        """Show what the filters say of the measurement, and what is believed after it."""
+    def add_observed(
+        self, state: HypothesesState, result: Posterior, measurement: Measurement
+    ) -> HypothesesState:
+        """Return the state with innovation statistics, and probabilities before and after a measurement, filled in."""
         xp, task = self.xp, self.task
-        log_predicted = imm.log_probabilities(found.predicted)
-        change = found.squares / self._present(measurement) - state.average_nis
-        memory = found.after.hypotheses
+        log_predicted = imm.log_probabilities(result.predicted)
+        change = result.squares / self._present(measurement) - state.average_nis
+        memory = result.after.hypotheses
         return state._replace(
-            likelihood=found.after.likelihood,
+            likelihood=result.after.likelihood,
             log_predicted=log_predicted,
-            log_likelihood=found.log_likelihoods,
-            nis=found.squares,
+            log_likelihood=result.log_likelihoods,
+            nis=result.squares,
             average_nis=state.average_nis + (1.0 / self.parameters.averaging_measurements) * change,
-            repeated=xp.astype(found.repeated, xp.float64)
+            repeated=xp.astype(result.repeated, xp.float64)
             * measurement.available[task.sensors[2].readings.start],
-            range_innovation=weighted_sum(found.predicted, found.residual[task.tracked]),
-            expected=imm.mode_posterior(log_predicted, found.log_likelihoods),
+            range_innovation=weighted_sum(result.predicted, result.residual[task.tracked]),
+            expected=imm.mode_posterior(log_predicted, result.log_likelihoods),
             range_error=weighted_sum(memory.probabilities, memory.means[gnss_ins.SIZE :]),
             noisy=1.0 - memory.levels[0],
-            between=xp.astype(found.between, xp.float64),
+            between=xp.astype(result.between, xp.float64),
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return the records of the paper's bank, likelihood and NIS as the estimator finds them."""
+        """Return the records of the paper's bank, with the likelihood and NIS of the estimator, by name."""
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
         return {

@@ -1,19 +1,19 @@
-r"""The filter of TightlyCoupledNavigation that a recurrent network steers from inside: the learned estimator
-``kalman-net``.
+r"""The filter of TightlyCoupledNavigation inside the learned estimator ``kalman-net``, which a recurrent network
+steers.
 
 One extended Kalman filter with Singer's model of the manoeuvre, in place of the paper's three hypotheses on the motion.
-At every measurement the network answers with numbers in [-1, 1]:
+At every measurement the network outputs numbers in [-1, 1]:
 
     noise    the groups of sensors, accelerometers that repeat themselves, and outliers of ranges and rates, as under
-             control ``robust`` at its whole reach
+             control ``robust`` at its full range
     motion   until the next measurement the acceleration's noise is manoeuvre_range^(2 a) times that of Singer's model
     gain     of a reading with variance r, g = caution^(2 b) in its group of sensors:
              k = P h^T / (h P h^T + g r),  P -= k u^T + u k^T,  u = P h^T - k (h P h^T + r) / 2         (Joseph form)
 
-All zero is the policy ``singer``, the paper's third hypothesis alone, but for what tracking loops expect where there
-are apertures: of the bank of ``singer`` it is what all three hypotheses predict, here what this filter predicts.
-Whether the user stands, moves straight or manoeuvres, which the paper asks the hypotheses, the network answers by the
-noise of the motion. References and reading stand in ``maneuvering_target/kalman_net.py``.
+All zero is the policy ``singer``, the paper's third hypothesis alone, except for the state that steers the tracking
+loops where there are apertures: for ``singer`` it is predicted by all three hypotheses, here by this filter. In place
+of the paper's hypotheses of rest, constant velocity and manoeuvre the network sets the noise of the motion. References
+and reading are in ``maneuvering_target/kalman_net.py``.
 """
 
 import math
@@ -25,7 +25,7 @@ import numpy
 from ...filters import gnss_ins
 from ...filters.packed_covariance import diagonal, pack, unpack
 from ..contract.filter import Initial
-from ..contract.observation import KEPT_AS_LOG, Array, Block
+from ..contract.observation import STORED_AS_LOG, Array, Block
 from .banks import Filters, Prediction, RobustBank
 from .parameters import HYPOTHESES, SINGER
 from .problem import NavigationProblem
@@ -34,14 +34,14 @@ from .world import Measurement
 MANOEUVRE_RANGE = 30.0
 """Largest factor and divisor of the deviation of the acceleration."""
 CAUTION = 2.0
-"""Largest factor and divisor of the deviation of a reading in the gain alone. Far larger ones can make a filter
+"""Largest factor and divisor of the deviation of a reading in the gain alone. Much larger ones can make a filter
 unstable."""
 DROPPED = ("log_likelihood", "log_predicted")
-"""Blocks that compare hypotheses."""
+"""Names of the observation blocks that compare hypotheses, which one filter has not."""
 
 
 class KalmanNetBank(RobustBank):
-    """One filter, whose noises, gain and motion the action sets."""
+    """Bank of ``kalman-net``: one extended Kalman filter, whose noises, gain and motion the action sets."""
 
     hypotheses: Sequence[str] = HYPOTHESES[SINGER:]
     reach: float = 1.0  # it learns through the filter, and does not explore
@@ -61,13 +61,13 @@ class KalmanNetBank(RobustBank):
 
     @property
     def actions(self) -> Sequence[str]:
-        """Actions of ``robust``, the manoeuvre, and the noise of the sensors in the gain alone."""
+        """Names of the action's components: those of ``robust``, the manoeuvre, and sensor noise in the gain alone."""
         groups = [sensor.name for sensor in self.task.sensors]
         return [*super().actions, "manoeuvre", *(f"caution_{name}" for name in groups)]
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation of the paper's filters, and deviations of this one."""
+        """Observation blocks of the paper's filters, and the deviations of this filter."""
         xp, p = self.xp, self.parameters
         parts = {
             "position": (gnss_ins.POSITION, p.position_unit),
@@ -84,18 +84,18 @@ class KalmanNetBank(RobustBank):
 
         *shown, last = (block for block in super().blocks if block.name not in DROPPED)
         sure = Block(
-            "spread", spread, "predicted deviation over the unit of the cost", tuple(parts), KEPT_AS_LOG
+            "spread", spread, "predicted deviation over the unit of the cost", tuple(parts), STORED_AS_LOG
         )
         return (*shown, sure, last)
 
     def start(self, initial: Initial) -> Filters:
-        """Start the one filter."""
+        """Return the bank's state at the start of the track, from the initial estimate."""
         state = super().start(initial)
         certain = state.log_likelihood
         return state._replace(log_predicted=certain, probabilities=1.0 + certain)
 
     def _predict_hypotheses(self, state: Filters) -> Prediction:
-        """Extrapolate with the noise of the motion that was answered."""
+        """Return the prediction with the motion noise that the last action set."""
         common = self.task.common
         factor = self.xp.exp(2.0 * math.log(MANOEUVRE_RANGE) * state.action[self.manoeuvre])
         noise = self.common_noise + factor * self.manoeuvre_noise
@@ -106,11 +106,11 @@ class KalmanNetBank(RobustBank):
         return Prediction(mean, pack(covariance), state.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
-        """None: the tracking loops expect what follows from the estimate."""
+        """Return None: the tracking loops are steered by the estimate, see :meth:`.Task.feedback`."""
         return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Update by the gain that was answered."""
+        """Return the state updated with the noises and the gain that the action sets."""
         xp = self.xp
         exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
         caution = xp.exp(2.0 * math.log(CAUTION) * exponent[self.manoeuvre + 1 :])
@@ -132,11 +132,11 @@ class KalmanNetBank(RobustBank):
         return self._combine(state, state.probabilities, exponent)
 
     def covariance(self, state: Filters) -> Array:
-        """Return the covariance of the one filter."""
+        """Return the covariance of the single filter, ``(17, 17, N)``."""
         return unpack(state.covariances[:, 0], gnss_ins.SIZE)
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the records of the paper's bank, without probabilities."""
+        """Return the records of the paper's bank without probabilities, by name."""
         records = super().records(state, measurement)
         del records["mode_probability"]
         return records

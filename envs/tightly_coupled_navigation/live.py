@@ -1,4 +1,4 @@
-"""Live readings of receiver and inertial system, as measurements of TightlyCoupledNavigation."""
+"""Live measurements of TightlyCoupledNavigation: readings of receiver and inertial system."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,10 +9,10 @@ from ..contract.live_input import LiveInput, LiveReader, Memory
 
 
 class ReceiverInput(LiveInput):
-    """The readings of each sensor by its name, what the inertial system shows, and the satellites."""
+    """Converter of sensor readings by name, INS angles and satellite positions into measurements."""
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return names and sizes."""
+        """Return the names and descriptions of the values of a measurement, and of those at the start."""
         values = {
             sensor.name: f"{self._count(sensor)} readings, NaN where there is none"
             for sensor in self._sensors
@@ -36,7 +36,7 @@ class ReceiverInput(LiveInput):
         return int(sensor.readings.stop - sensor.readings.start)
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Put the readings of all sensors one after another."""
+        """Return the measurement with the readings of all sensors in one array, and the memory."""
         names = {sensor.name for sensor in self._sensors}
         readings = [self.read(values, sensor.name, (self._count(sensor),)) for sensor in self._sensors]
         others = {name: value for name, value in values.items() if name not in names}

@@ -1,4 +1,4 @@
-"""Every constant of TightlyCoupledNavigation, with its limits, and the names of its hypotheses."""
+"""Constants of TightlyCoupledNavigation with their limits, and the names of its hypotheses."""
 
 import math
 from dataclasses import dataclass
@@ -20,31 +20,31 @@ KNOWN_BY: dict[str, tuple[str, ...]] = {
     "accelerometer_sigma": ("initial_acceleration_sigma", "reset_acceleration_sigma", "singer_sigma"),
     "attitude_sigma": ("initial_attitude_sigma", "attitude_rate_sigma", "angle_walk"),
 }  # fmt: skip
-"""Standard deviations of what each sensor reads, as they are before it does."""
+"""Names of the prior standard deviations of the quantities that each sensor measures."""
 WALKS = {"pseudorange_sigma": "frequency_density", "rate_sigma": "frequency_walk_density"}
-"""Densities of the walks of the clock that each sensor reads."""
+"""Names of the random-walk densities of the clock quantities that each sensor measures."""
 LARGEST_RATIO = 1e6
-"""Of them to that of the sensor: squared, it takes twelve of the sixteen digits."""
+"""Largest ratio of these deviations to that of the sensor: squared, it takes twelve of the sixteen digits."""
 
 
 class SensorGroup(NamedTuple):
-    """Sensors of one kind."""
+    """Group of sensors of one kind."""
 
     name: str
     readings: slice
-    """Where they stand among all readings."""
+    """Slice of the group in all readings."""
     sigma: float
-    """Nominal standard deviation of each, m, m/s, m/s^2 or rad."""
+    """Nominal standard deviation of each reading, m, m/s, m/s^2 or rad."""
     aperture: float | None = None
-    """Distance from what they expect at which tracking loops lose them, in the same unit."""
+    """Deviation from the prediction beyond which tracking loops lose the signal, in the same unit."""
 
 
 @dataclass(frozen=True)
 class TightlyCoupledNavigationParameters(TaskParameters):
-    """Every constant of the task; each is a keyword of ``gym.make``. "ours": the paper gives no value."""
+    """Constants of the task; each is a keyword of ``gym.make``. "ours": the paper gives no value."""
 
     course: str = parameter("random", choices=("increment", "kinematic", "matched", "random"))
-    """How the user moves: "increment" (the paper), "kinematic", "matched" or "random"."""
+    """Motion of the user: "increment" (the paper), "kinematic", "matched" or "random"."""
     horizon: int = parameter(600, at_least=1)
     """Measurements in an episode. Paper: 3000; ours for training: 6 s."""
     decision_interval: int = parameter(10, at_least=1)
@@ -53,29 +53,30 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """Step T, s. Ours: the paper's smallest adaptation time must be one step at least."""
 
     latitude: float = parameter(53.9, at_least=-90.0, at_most=90.0)
-    """Of the site, degrees. Ours: Minsk."""
+    """Latitude of the site, degrees. Ours: Minsk."""
     longitude: float = parameter(27.5667, at_least=-180.0, at_most=180.0)
-    """Of the site, degrees. Ours."""
+    """Longitude of the site, degrees. Ours."""
     height: float = 220.0
-    """Of the site, m. Ours."""
+    """Height of the site, m. Ours."""
     satellites: tuple[int, ...] = (1, 11, 19, 20)
-    """Slots of the nominal GLONASS. Paper: four; ours: the four of smallest GDOP. With fewer, the filter
-    coasts on what is left."""
+    """Slots of the nominal GLONASS. Paper: four; ours: the four of smallest GDOP. With fewer, the filter has no
+    complete
+    fix."""
     epoch: float = 0.0
     """Time of the constellation at the start, s. Ours."""
     elevation_mask: float = parameter(10.0, at_least=0.0)
-    """Satellites below are refused, degrees. Ours."""
+    """Smallest elevation of a satellite in use, degrees. Ours."""
     gravity: float = parameter(9.81, above=0.0)
-    """m/s^2."""
+    """Acceleration of gravity, m/s^2."""
 
     pseudorange_sigma: float = parameter(3.0, above=0.0)
-    """m. Ours."""
+    """Standard deviation of pseudoranges, m. Ours."""
     rate_sigma: float = parameter(0.1, above=0.0)
-    """m/s. Ours."""
+    """Standard deviation of pseudorange rates, m/s. Ours."""
     accelerometer_sigma: float = parameter(0.05, above=0.0)
-    """m/s^2. Ours."""
+    """Standard deviation of accelerometers, m/s^2. Ours."""
     attitude_sigma: float = parameter(0.5, above=0.0)
-    """Of the independent attitude reference, degrees. Ours."""
+    """Standard deviation of the independent attitude reference, degrees. Ours."""
 
     frequency_density: float = parameter(0.009, above=0.0)
     """White frequency noise of the receiver clock, m^2/s. Ours."""
@@ -88,7 +89,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     attitude_rate_time: float = parameter(100.0, above=0.0)
     """Correlation time of the attitude rates, s. Ours."""
     rest_velocity_sigma: float = parameter(0.01, above=0.0)
-    """Regularising noise of hypothesis 1, m/s; the position takes T times as much. Ours."""
+    """Regularising velocity noise of hypothesis 1, m/s; that of the position is T times as much. Ours."""
     reset_acceleration_sigma: float = parameter(0.05, above=0.0)
     """Regularising noise of the acceleration in hypotheses 1 and 2, m/s^2. Ours."""
     increment_sigma: float = parameter(0.02, above=0.0)
@@ -104,43 +105,43 @@ class TightlyCoupledNavigationParameters(TaskParameters):
         at_most=1.0,
         stochastic=True,
     )
-    """Of the hypotheses, row = from, column = to. Ours: a mean stay of 5 s."""
+    """Transition matrix of the hypotheses, row = from, column = to. Ours: a mean sojourn time of 5 s."""
     initial_probabilities: tuple[float, ...] = parameter(
         (1 / 3, 1 / 3, 1 / 3), at_least=0.0, at_most=1.0, stochastic=True
     )
-    """Of the hypotheses. Ours."""
+    """Initial probabilities of the hypotheses. Ours."""
 
     initial_position_sigma: float = parameter(10.0, above=0.0)
-    """m. Ours."""
+    """Standard deviation of the initial position, m per axis. Ours."""
     initial_clock_sigma: float = parameter(30.0, above=0.0)
-    """m. Ours."""
+    """Standard deviation of the initial clock offset, m. Ours."""
     initial_velocity_sigma: float = parameter(0.5, above=0.0)
-    """m/s. Ours."""
+    """Standard deviation of the initial velocity, m/s per axis. Ours."""
     initial_drift_sigma: float = parameter(1.0, above=0.0)
-    """m/s. Ours."""
+    """Standard deviation of the initial clock drift, m/s. Ours."""
     initial_acceleration_sigma: float = parameter(0.5, above=0.0)
-    """m/s^2. Ours."""
+    """Standard deviation of the initial acceleration, m/s^2 per axis. Ours."""
     initial_attitude_sigma: float = parameter(1.0, above=0.0, at_most=180.0)
-    """Degrees. Ours."""
+    """Standard deviation of the initial attitude errors, degrees. Ours."""
 
     heading: tuple[float, float] = parameter((0.0, 360.0), ascending=True)
     """Limits of the heading of the level aircraft, degrees; legs of the fixed courses follow it. Ours."""
     leg_steps: tuple[int, int] = parameter((1000, 2000), at_least=1, ascending=True)
     """Last step of leg 1 and of leg 2 of the fixed courses. Paper."""
     leg_acceleration: float = parameter(30.0, at_least=0.0)
-    """Of leg 2, and the jump at its end, m/s^2. Paper: 0.3 m/s per step, and 30 m/s^2."""
+    """Acceleration of leg 2, and the jump at its end, m/s^2. Paper: 0.3 m/s per step, and 30 m/s^2."""
     matched_speed: float = parameter(300.0, at_least=0.0)
     """Initial speed of the matched course, m/s. Ours."""
     legs: int = parameter(4, at_least=1)
-    """Of the random course. Ours."""
+    """Number of legs of the random course. Ours."""
     leg_duration: tuple[float, float] = parameter((1.0, 3.0), at_least=0.0, ascending=True)
     """Limits of the duration of a random leg, s. Ours."""
     strength: tuple[float, float] = parameter((2.0, 40.0), at_least=0.0, at_most=1e4, ascending=True)
-    """Limits of the acceleration with which a random manoeuvre begins, m/s^2. Ours."""
+    """Limits of the initial acceleration of a random manoeuvre, m/s^2. Ours."""
     initial_speed: tuple[float, float] = parameter((0.0, 300.0), at_least=0.0, ascending=True)
     """Limits of the speed of a random course that does not start at rest, m/s. Ours."""
     rest_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
-    """That a random course starts at rest. Ours."""
+    """Probability that a random course starts at rest. Ours."""
     manoeuvre_throughout: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """Probability that a random course is one manoeuvre from its start to its end, with the strength that its second
     leg would have. Ours."""
@@ -149,50 +150,53 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     that of hypothesis 2, so that the known mode is the optimum."""
 
     rate_fault_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
-    """That one satellite's rate channel is noisy for a while. Ours."""
+    """Probability of a temporary fault in which one satellite's rate channel is noisy. Ours."""
     rate_fault_factor: tuple[float, float] = parameter((5.0, 5.0), above=0.0, ascending=True)
-    """Limits of how much noisier. Ours."""
+    """Limits of the factor on the standard deviation of a noisy rate. Ours."""
     rate_fault_duration: tuple[float, float] = parameter((1.0, 3.0), at_least=0.0, ascending=True)
-    """s. Ours."""
+    """Limits of the duration of a noisy rate, s. Ours."""
     stick_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
-    """That the accelerometers stick at their last reading for a while. Ours."""
+    """Probability that the accelerometers stick at their last reading temporarily. Ours."""
     stick_duration: tuple[float, float] = parameter((0.3, 1.0), at_least=0.0, ascending=True)
-    """s. Ours."""
+    """Limits of the duration of stuck accelerometers, s. Ours."""
     rates_outage_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That all rates are lost for a while. Ours."""
+    """Probability of a temporary outage of all rates. Ours."""
     rates_outage_duration: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
-    """s. Ours."""
+    """Limits of its duration, s. Ours."""
     satellites_outage_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That two satellites drop out for a while. Ours."""
+    """Probability of a temporary outage of two satellites. Ours."""
     satellites_outage_duration: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
-    """s. Ours."""
+    """Limits of its duration, s. Ours."""
     ramp_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """That one satellite's pseudorange drifts off from some time to the end, as one with a failing clock does. Ours."""
+    """Probability that one satellite's pseudorange drifts off from some time to the end, as with a failing clock.
+    Ours."""
     ramp_start: tuple[float, float] = parameter((1.0, 3.0), at_least=0.0, ascending=True)
-    """Limits of that time, s. Ours."""
+    """Limits of the start of the drift, s. Ours."""
     ramp_rate: float = 10.0
-    """m/s; the rate channel does not show it. Ours."""
+    """Rate of the drift, m/s; the rate channel does not contain it. Ours."""
     ramp_jump: tuple[float, float] = parameter((0.0, 0.0), ascending=True)
-    """Limits of the bias with which the drift begins, m. Ours."""
+    """Limits of the error at the start of the drift, m. Ours."""
     pseudorange_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
-    """Limits of the stationary standard deviation of a coloured error (first-order Gauss-Markov) that every pseudorange
-    has beside the white one, each its own: diffuse multipath, atmosphere, ephemerides; m. It is not reported. Ours."""
+    """Limits of the stationary standard deviation of an unreported coloured error (first-order Gauss-Markov) of every
+    pseudorange, independent of the others and added to the white one: diffuse multipath, atmosphere, ephemerides; m.
+    Ours."""
     pseudorange_correlation_time: tuple[float, float] = parameter((10.0, 10.0), above=0.0, ascending=True)
-    """Limits of its correlation time, s. Ours."""
+    """Limits of the correlation time of the coloured error, s. Ours."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode without noisy rates, stuck accelerometers and coloured errors. Ours. Hidden satellites,
-    lost rates, reception between houses and apertures, which measurements show, have the law of other episodes."""
+    """Probability of an episode without noisy rates, stuck accelerometers and coloured errors. Ours. Disturbances that
+    measurements indicate (hidden satellites, lost rates, reception between houses, apertures) have the law of other
+    episodes."""
     urban: bool = False
     """Whether pseudoranges have the positive, heavy-tailed errors of reception between houses. Ours: medians
     and 95 % quantiles by C/N0 as in the public smartLoc data of Berlin."""
     urban_probability: float = parameter(1.0, at_least=0.0, at_most=1.0)
     """Share of the episodes that are between houses, where there are any. Ours."""
     urban_speed: float = parameter(1.0, at_least=0.0)
-    """Speeds between houses over those that are drawn. Ours."""
+    """Factor on drawn speeds between houses. Ours."""
     urban_strength: float = parameter(1.0, at_least=0.0)
-    """Accelerations between houses over those that are drawn. Ours."""
+    """Factor on drawn accelerations between houses. Ours."""
     urban_hold: tuple[float, float] = parameter((0.5, 2.0), at_least=0.0, ascending=True)
-    """Limits of the time for which such an error holds, s. Ours."""
+    """Limits of the duration of such an error, s. Ours."""
     urban_cn0_walk: float = parameter(0.5, at_least=0.0)
     """Random walk of C/N0, dB per step, reflected at its limits. Ours."""
     cn0_limits: tuple[float, float] = parameter((22.0, 50.0), at_least=0.0, ascending=True)
@@ -201,26 +205,27 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """C/N0 under a clear sky, dB-Hz. Ours."""
 
     aperture: bool = False
-    """Whether the tracking loops, steered by the combined prediction, lose what they do not expect."""
+    """Whether the tracking loops, steered by the combined prediction, lose signals too far from it."""
     aperture_probability: float = parameter(1.0, at_least=0.0, at_most=1.0)
-    """Share of the episodes in which they do, where they do at all. Ours."""
+    """Share of the episodes in which they do, if ``aperture`` is set. Ours."""
     rate_aperture: float = parameter(9.36, above=0.0)
-    """m/s: wavelength of L1 over four times a coherent time of 5 ms. Ours."""
+    """Aperture of rates, m/s: wavelength of L1 over four times a coherent time of 5 ms. Ours."""
     range_aperture: float = parameter(293.0, above=0.0)
-    """Half a chip, m. Ours."""
+    """Aperture of pseudoranges, half a chip, m. Ours."""
 
     evidence_scale: float = parameter(10.0, above=0.0)
     """Nats that an evidence of one adds to the log-posterior. Ours."""
     noise_scale: float = parameter(300.0, above=1.0)
-    """Largest factor of a sensor's standard deviation under control "gain". Ours: 300 switches a sensor off
-    for practical purposes."""
+    """Largest factor on a sensor's standard deviation under control "gain". Ours: 300 practically excludes a sensor."""
     noise_reduction: float = parameter(3.0, above=1.0)
-    """Largest divisor of it. Ours: a filter that trusts its sensors far too much is never right, and
-    amplifies rounding from one backend to another."""
+    """Largest divisor of it. Ours: a filter that trusts its sensors far too much is never right, and amplifies rounding
+    differences between backends."""
     noise_reach: float = parameter(0.3, above=0.0, at_most=1.0)
-    """Share of the logarithms of these two that an action of one has under control "robust". Ours: a policy that has
-    just been made explores with a standard deviation of about one, and at the whole reach it learns to survive its own
-    noise, at the cost of most episodes. Who explores less may ask for more."""
+    """Share of the logarithms of these two factors that an action of one applies under control "robust". Ours: a new
+    policy
+    explores with a standard deviation of about one, and at the full range it learns to survive its own noise, at
+    the cost
+    of most episodes. A policy that explores less may use more."""
     averaging_measurements: float = parameter(10.0, at_least=1.0)
     """Time constant n of the short averages in the observation, measurements: the newest has the weight 1/n.
     Ours."""
@@ -230,7 +235,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """Error of a single-epoch velocity, m/s: the unit of the cost. Ours: 0.1 m/s times 2.47."""
 
     def check(self) -> None:
-        """Check what concerns several fields together: the chain, and where the satellites stand."""
+        """Raise ValueError for fields that contradict each other: transition matrix, satellites and sensors."""
         square_matrix("transition", self.transition, len(HYPOTHESES))
         check_length("initial_probabilities", self.initial_probabilities, len(HYPOTHESES))
         if not self.satellites or len(set(self.satellites)) != len(self.satellites):
@@ -254,7 +259,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
             satellites.dilution_of_precision(first / numpy.sqrt((first**2).sum(axis=0)))
 
     def _check_digits(self) -> None:
-        """Check that a reading leaves a covariance digits: its square is subtracted from that of what was unknown."""
+        """Raise ValueError if a sensor is so much better than the prior that a covariance update loses all digits."""
         for sensor, unknowns in KNOWN_BY.items():
             known = getattr(self, sensor)
             for name in unknowns:
@@ -279,12 +284,12 @@ class TightlyCoupledNavigationParameters(TaskParameters):
 
     @property
     def site(self) -> tuple[float, float, float]:
-        """Latitude and longitude, rad, and height, m."""
+        """Latitude and longitude, rad, and height, m, of the site."""
         return self.latitude * DEGREE, self.longitude * DEGREE, self.height
 
     @property
     def sensors(self) -> tuple[SensorGroup, ...]:
-        """Every group of sensors, in the order of the readings."""
+        """All groups of sensors (:class:`SensorGroup`), in the order of the readings."""
         ranges, rates, forces, angles = gnss_ins.sensor_groups(len(self.satellites))
         return (
             SensorGroup("pseudoranges", ranges, self.pseudorange_sigma, self.range_aperture),

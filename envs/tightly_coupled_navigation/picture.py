@@ -1,4 +1,4 @@
-"""Picture of TightlyCoupledNavigation: course and motion, what is steered, innovations, errors."""
+"""Picture of TightlyCoupledNavigation: course and motion, actions, innovations, errors."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from ...filters import gnss_ins
 from ..contract.model import Episode, Model
-from ..drawing.rendering import BLACK, BLUE, CURVES, FIGURE_SIZE, PALE, History, Picture, Strip, grown
+from ..drawing.rendering import BLACK, BLUE, CURVES, FIGURE_SIZE, PALE, History, Picture, Strip, widen_limits
 from .parameters import HYPOTHESES, LINE, REST, SINGER
 from .problem import NavigationProblem
 
@@ -22,19 +22,19 @@ FAULTS = ("two satellites out", "rates lost", "noisy rate", "accelerometers stuc
 ACCELERATION_LIMIT = 10.0
 """Height of the panel of accelerations at the start, m/s^2."""
 MOTION_ROW = -1.0
-"""Where the true hypothesis is drawn below the faults."""
+"""Row of the true hypothesis, below the faults."""
 LEAST_REACH = 30.0
-"""Half width of the course that is shown at least, m."""
+"""Smallest half width of the displayed course, m."""
 ACTIONS: dict[str, tuple[str, ...]] = {
     "gain": ("action",),
     "robust": ("action", "readings"),
     "hypotheses": ("action: odds", "noises"),
 }
-"""Controls whose actions are drawn, and the titles of their strips, of four components the first one."""
+"""Controls whose actions are drawn, and the titles of their time series; of four components the first one."""
 
 
 class TightlyCoupledNavigationPicture(Picture):
-    """Course, acceleration, sensor faults; weights or noise factors, innovations, errors."""
+    """Picture of course, acceleration and sensor faults; weights or noise factors, innovations, errors."""
 
     strips_left: float = 0.56
     strip_columns = 1
@@ -49,7 +49,7 @@ class TightlyCoupledNavigationPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Return the positions in m, accelerations, weights, factors, innovations, errors."""
+        """Return the values drawn at a step by name: positions (m), accelerations, weights, innovations, errors."""
         task, bank, S, lane = self.task, state.filter, self.task.satellites, 0
         error = self.model.error(state)[:, lane]
         P = numpy.diagonal(self.model.covariance(state)[:, :, lane])
@@ -79,7 +79,7 @@ class TightlyCoupledNavigationPicture(Picture):
         return {name: float(value) for name, value in values.items()}
 
     def begin(self, state: Episode) -> None:
-        """Look ahead when the user manoeuvres and when sensors fail: that does not depend on noise."""
+        """Simulate the truth in advance, for the intervals of manoeuvres and faults, which do not depend on noise."""
         task, truth = self.task, state.truth
         still = numpy.zeros((task.noise.normals + task.noise.row_uniforms, truth.step.shape[-1]))
         modes = []
@@ -100,7 +100,7 @@ class TightlyCoupledNavigationPicture(Picture):
     # --- strips
 
     def strips(self) -> Sequence[Strip]:
-        """Return the strips: actions, innovations, errors."""
+        """Return the time series of actions, innovations and errors."""
         hypotheses = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
         weights = {name: f"weight.{i}" for i, name in enumerate(hypotheses)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
@@ -128,17 +128,17 @@ class TightlyCoupledNavigationPicture(Picture):
         ]
 
     def shows_observation(self) -> bool:
-        """No: the strips say it in the filter's terms."""
+        """Return False: the time series show the filters' quantities instead of the observation."""
         return False
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return the steps on which the user manoeuvres."""
+        """Return the intervals of manoeuvres, which are shaded."""
         return self.motions[SINGER]
 
     # --- panels
 
     def open(self, figure: Figure) -> None:
-        """Make the three panels."""
+        """Create the panels of course, acceleration and sensor faults."""
         course = self.course = figure.add_axes(COURSE)
         motion = self.motion = figure.add_axes(MOTION)
         sensors = self.sensors = figure.add_axes(SENSORS)
@@ -189,17 +189,17 @@ class TightlyCoupledNavigationPicture(Picture):
         self.now: Line2D = sensors.plot([], [], color=BLACK, linewidth=0.8)[0]
 
     def arrange(self) -> None:
-        """Limits of the start; they grow with the flight, which is not known in advance."""
+        """Set the axis limits of the start; they grow with the flight, which is not known in advance."""
         self._show_course(numpy.empty((2, 0)))
         self.motion.set_ylim(0.0, ACCELERATION_LIMIT)
 
     def _show_course(self, places: numpy.ndarray) -> None:
-        """Hold the places in the panel, at equal scales."""
+        """Set the limits of the course panel so that it contains the positions, at equal scales."""
         sides = []
         for values in places:
             low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
-            sides.append(grown((-LEAST_REACH, 0.0), 1.05 * low, 0.0)[0])
-            sides.append(grown((0.0, LEAST_REACH), 0.0, 1.05 * high)[1])
+            sides.append(widen_limits((-LEAST_REACH, 0.0), 1.05 * low, 0.0)[0])
+            sides.append(widen_limits((0.0, LEAST_REACH), 0.0, 1.05 * high)[1])
         west, east, south, north = sides
         metres_per_inch = max(
             (east - west) / (FIGURE_SIZE[0] * COURSE[2]), (north - south) / (FIGURE_SIZE[1] * COURSE[3])
@@ -210,7 +210,7 @@ class TightlyCoupledNavigationPicture(Picture):
         self.course.set_ylim(0.5 * (south + north) - half, 0.5 * (south + north) + half)
 
     def draw(self, history: History, state: Episode) -> None:
-        """Move everything to where it is now."""
+        """Update course, accelerations and sensor faults to the current step."""
         nothing = numpy.empty(0)
         pairs = {}
         for name in ("true", "estimated"):
@@ -226,7 +226,7 @@ class TightlyCoupledNavigationPicture(Picture):
         self.thought.set_data(steps, thought)
         if len(felt):
             self.motion.set_ylim(
-                *grown((0.0, ACCELERATION_LIMIT), 0.0, float(max(felt.max(), thought.max())))
+                *widen_limits((0.0, ACCELERATION_LIMIT), 0.0, float(max(felt.max(), thought.max())))
             )
         for row, (line, runs) in enumerate(zip(self.fault_lines, self.faults, strict=True)):
             line.set_data(*_segments(runs, row))
@@ -236,7 +236,9 @@ class TightlyCoupledNavigationPicture(Picture):
 
 
 def _runs(flags: Sequence[bool]) -> list[tuple[float, float]]:
-    """Return the stretches of steps, counted from 1, over which a flag holds: from and to, half a step beyond."""
+    """Return the intervals of steps, counted from 1, in which a flag is true; they extend half a step on either
+    side.
+    """
     steps = 1 + numpy.flatnonzero(flags)
     if not len(steps):
         return []

@@ -1,4 +1,4 @@
-"""Parts of the task that world, filters and picture of TightlyCoupledNavigation use: sensors, satellites and models."""
+"""Base class of the task TightlyCoupledNavigation, used by its world, filters and picture."""
 
 import numpy
 
@@ -10,7 +10,7 @@ from .parameters import DEGREE, SensorGroup, TightlyCoupledNavigationParameters
 
 
 class NavigationProblem(Task):
-    """Sensors, orbits of the satellites, and the models of motion and errors."""
+    """Base class of the task: sensors, orbits of the satellites, and models of motion and errors."""
 
     parameters: TightlyCoupledNavigationParameters
 
@@ -27,7 +27,7 @@ class NavigationProblem(Task):
         apertures = [s.aperture for s in each if s.aperture is not None]
         self.apertures: Array = constant(apertures)[:, None]
         self.tracked: slice = slice(0, len(apertures))
-        """Readings that tracking loops make: pseudoranges and rates."""
+        """Slice of the readings of tracking loops: pseudoranges and rates."""
 
         times = p.epoch + T * numpy.arange(p.horizon + 2)
         local, velocity = satellites.local_orbits(p.satellites, times, *p.site)
@@ -53,7 +53,7 @@ class NavigationProblem(Task):
         self.transition: Array = constant(p.transition)
 
     def _row(self, number: Array) -> Array:
-        """Return the row of a measurement in the tables; an episode that is over stays at the end."""
+        """Return the row of a measurement in the tables; beyond the episode the last row."""
         return self.xp.clip(number, None, self.horizon + 1)
 
     def satellites_at(self, number: Array) -> tuple[Array, Array]:

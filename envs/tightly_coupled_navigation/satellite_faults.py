@@ -1,15 +1,15 @@
-r"""A bank over the faults of one pseudorange: the filter of healthy satellites, and one for a fault of each of them.
+r"""A bank over faults of one pseudorange: a filter of healthy satellites, and one for a fault of each satellite.
 
-Every member is a whole :class:`.FaultHypotheses`. In member j the error of pseudorange j may jump once in a while and
-then walks at random, so that the pseudorange has little information on the position from the start on, and a fault that
-creeps in cannot have bent the estimate before it is found (solution separation: R. G. Brown and P. W. McBurney,
+Every member is a whole :class:`.FaultHypotheses`. In member j the error of pseudorange j may jump rarely and then walks
+at random, so that this pseudorange gives little information on the position from the start on, and a slowly growing
+fault cannot bias the estimate before it is detected (solution separation: R. G. Brown and P. W. McBurney,
 Self-contained GPS integrity check using maximum solution separation, Navigation 35, 1988). At most one pseudorange is
 wrong. Faults begin at a rate h, of all satellites together, and last. With weights w0 of no fault and wj of that of
 satellite j,
 
     w0' = (1 - h T) w0,    wj' = wj + h T w0 / S,
 
-before the readings weigh them by their densities. Between houses, where reflections are what is wrong, none begins.
+before the readings weight them by their densities. Between houses, where errors are reflections, none begins.
 """
 
 import math
@@ -25,13 +25,13 @@ from .world import Measurement
 
 
 class OneFault(FaultHypotheses):
-    """Member of the bank: the error of one pseudorange jumps and walks, those of the others are as expected.
+    """Member of the bank: the error of one pseudorange jumps and walks randomly, those of the others follow the prior.
 
     Args:
         task: the problem.
-        prior: what it expects; of jumps those of this pseudorange.
+        prior: of motion and faults; its jumps are those of this pseudorange.
         wrong: number of the satellite.
-        walk: m, standard deviation of a step of its error in a second.
+        walk: standard deviation of its error's random walk in a second, m.
     """
 
     def __init__(self, task: NavigationProblem, prior: FaultPrior, wrong: int, walk: float) -> None:
@@ -40,7 +40,7 @@ class OneFault(FaultHypotheses):
         self.walk: Array = task.constant(walk**2 * task.common.T)
 
     def _error_process(self, between: Array) -> tuple[Any, Any]:
-        """Return that of the prior, but of its own pseudorange a random walk."""
+        """Return the error process of the prior, with a random walk for the faulty pseudorange."""
         kept, gained = super()._error_process(between)
         places = range(self.task.satellites)
         return [1.0 if j == self.wrong else kept for j in places], [
@@ -48,7 +48,7 @@ class OneFault(FaultHypotheses):
         ]
 
     def _renewals(self, measurement: Measurement, between: Array, odds: Array) -> list[range_errors.Renewal]:
-        """Return the prior of its own pseudorange; under an open sky no other jumps."""
+        """Return the jump distribution of the faulty pseudorange; under an open sky the others do not jump."""
         found = super()._renewals(measurement, between, odds)
         return [
             one if j == self.wrong else one._replace(probability=self.xp.where(between, one.probability, 0.0))
@@ -60,20 +60,20 @@ class SatelliteFaultState(NamedTuple):
     """State of the bank."""
 
     members: tuple[FaultState, ...]
-    """Of no fault, and of that of each satellite."""
+    """States of the members: without a fault, and with one of each satellite."""
     weights: Array
-    """``(1 + S, N)``."""
+    """Weights of the members, ``(1 + S, N)``."""
     likelihood: Likelihood
 
 
 class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState]):
-    """`fault-hypotheses`, and a copy of it for a fault of each pseudorange that jumps and walks off to the end.
+    """Bank of `fault-hypotheses` filters: one without, and one with a lasting fault of each pseudorange.
 
     Args:
         task: the problem.
-        prior: what the members expect.
-        begins: faults expected in a second, of all satellites together.
-        walk: m, what the error of a wrong pseudorange moves in a second.
+        prior: of all members.
+        begins: expected number of faults per second, of all satellites together.
+        walk: standard deviation of the wrong pseudorange's random walk in a second, m.
         **changed: fields of the prior.
     """
 
@@ -93,20 +93,20 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
         self.begins: float = 1.0 - math.exp(-begins * task.common.T)
 
     def start(self, initial: Initial) -> SatelliteFaultState:
-        """Start every member from what is known of the start; nothing is wrong yet."""
+        """Return every member at the initial estimate, with all weight on no fault."""
         none = 0.0 * initial.mean[0]
         weights = self.xp.stack([none + 1.0, *[none] * self.task.satellites])
         members = tuple(member.start(initial) for member in self.members)
         return SatelliteFaultState(members, weights, Likelihood.unknown(none))
 
-    def update(self, state: SatelliteFaultState, given: FilterInput) -> SatelliteFaultState:
-        """Update every member, and weigh them."""
-        xp, S, measurement = self.xp, self.task.satellites, given.measurement
+    def update(self, state: SatelliteFaultState, inputs: FilterInput) -> SatelliteFaultState:
+        """Return every member updated with a measurement, and weighted by its likelihood."""
+        xp, S, measurement = self.xp, self.task.satellites, inputs.measurement
         between = xp.any(measurement.cn0 != self.task.parameters.clear_cn0, axis=0)
         beginning = xp.where(between, 0.0, self.begins) * state.weights[0]
         predicted = [state.weights[0] - beginning, *(state.weights[1 + j] + beginning / S for j in range(S))]
         members = tuple(
-            member.update(own, given) for member, own in zip(self.members, state.members, strict=True)
+            member.update(own, inputs) for member, own in zip(self.members, state.members, strict=True)
         )
         log_prior = imm.log_probabilities(xp.stack(predicted))
         log_likelihood, nis, degrees = (

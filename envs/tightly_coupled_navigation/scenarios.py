@@ -7,7 +7,7 @@ from typing import Any
 from ..contract.task import Scenario
 
 WINDOWS = MappingProxyType({"leg1": (200, 999), "leg2": (1100, 1999), "leg3": (2100, 3000)})
-"""Steady parts of the three legs of the paper's experiment."""
+"""Windows of measurements: the steady parts of the three legs of the paper's experiment."""
 RANDOM_WINDOWS = MappingProxyType({"settled": (100, 600)})
 
 EXPERIMENT: Mapping[str, Any] = MappingProxyType(
@@ -132,4 +132,4 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
         )
     }
 )
-"""By name."""
+"""Scenarios by name."""

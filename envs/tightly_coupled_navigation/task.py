@@ -12,7 +12,7 @@ as there:
     8     combination                                                     filters.imm
 
 Reading: the paper gives the algorithm and almost no values. The step is 0.01 s, because its shortest
-adaptation time of 0.01 s must be at least one step. What is read of its motion stands in :mod:`.world`, of its
+adaptation time of 0.01 s must be at least one step. Readings of its motion are in :mod:`.world`, of its
 step 3 in :mod:`.banks`.
 """
 
@@ -37,14 +37,14 @@ from .world import NavigationWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return what draws an episode; imported here, because it brings matplotlib."""
+    """Return the object that draws an episode; imported here, because it needs matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
 
 
 class TightlyCoupledNavigation(NavigationProblem):
-    """Steer a bank of extended Kalman filters over pseudoranges, their rates, and inertial sensors.
+    """Tightly coupled INS/GNSS navigation: steer a bank of extended Kalman filters over motion hypotheses.
 
     ## Description
 
@@ -52,8 +52,8 @@ class TightlyCoupledNavigation(NavigationProblem):
     pseudoranges and pseudorange rates of four GLONASS satellites, a strapdown INS its accelerometers and
     the difference of its angles from an attitude reference. Three extended Kalman filters of 17 states
     (position, velocity, acceleration, receiver clock, attitude errors) run side by side, one for each
-    hypothesis on the motion: rest, constant velocity, Singer manoeuvre. They are mixed before every step by
-    the weights in force and combined into the estimate after it. Sensors fail for a while in the default
+    hypothesis on the motion: rest, constant velocity, Singer manoeuvre. They are mixed before every step with
+    their weights and combined into the estimate after it. Sensors fail for a while in the default
     scenario: a rate channel becomes five times noisier, the accelerometers stick, all rates or two satellites
     are lost.
 
@@ -63,7 +63,7 @@ class TightlyCoupledNavigation(NavigationProblem):
 
     ## Action Space
 
-    What each control means stands in ``Actions``. Values outside the box are taken at its edge.
+    ``Actions`` describes each control. Values outside the box are clipped to it.
 
     The weights are used for the combination and as the prior of the next mixing.
 
@@ -72,9 +72,9 @@ class TightlyCoupledNavigation(NavigationProblem):
     A flat `Box`; see `observation_fields` for each component, unit and scale. For every hypothesis the
     normalised innovation squared by sensor group (now, and as a short average; given the groups before it in
     the order of the action `gain`), the log-likelihood relative to the largest, the predicted
-    log-probability; the accelerometers, and whether they repeat themselves; the innovations of pseudoranges
+    log-probability; the accelerometers, and whether they repeat exactly; the innovations of pseudoranges
     and rates at the combined prediction; availability of every satellite; the time; the last action.
-    Innovations and likelihoods, which a wrong hypothesis makes as large as it likes, are shown as
+    Innovations and likelihoods, which are unbounded under a wrong hypothesis, are observed as
     ``y / (1 + |y| / 8)`` of ``y = sign(x) log(1 + |x|)``, so below 8.
 
     ## Rewards
@@ -95,8 +95,8 @@ class TightlyCoupledNavigation(NavigationProblem):
 
     ## Arguments
 
-    Every field of `TightlyCoupledNavigationParameters` is a keyword, among them `satellites` (slots; fewer than four:
-    the filter coasts on what is left), `increment_sigma` of hypothesis 2, sensor sigmas, faults, and `aperture`: the
+    Every field of `TightlyCoupledNavigationParameters` is a keyword, among them `satellites` (slots; fewer than four
+    give no complete fix), `increment_sigma` of hypothesis 2, sensor sigmas, faults, and `aperture`: the
     tracking loops, steered by the combined prediction, lose a rate that is 9.36 m/s or a range that is 293 m away from
     it.
 
@@ -131,7 +131,7 @@ class TightlyCoupledNavigation(NavigationProblem):
         *(Component(f"{angle}_rate_error", "rad/s") for angle in ("heading", "pitch", "roll")),
     )
     modes: tuple[str, ...] = HYPOTHESES
-    # A few lost tracks rule the mean, and who does nothing bears them, too.
+    # A few lost tracks dominate the mean, also for action zero.
     reward: ClassVar[Reward] = Reward(
         "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
         "a single-epoch fix",
@@ -147,21 +147,21 @@ class TightlyCoupledNavigation(NavigationProblem):
         ),
         Actions(
             {
-                "robust": "noise as under `gain`, by r = 0.3 times the action (`noise_reach`), and what is done with single readings: "
-                "how noisy accelerometers are taken to be while they repeat their last reading exactly, 300 to the power of a "
+                "robust": "noise as under `gain`, by r = 0.3 times the action (`noise_reach`), and the treatment of single readings: "
+                "assumed noise of accelerometers while they repeat their last reading exactly, 300 to the power of a "
                 "positive action; and Huber's robust update of pseudoranges and of rates, beyond 1.345 standard deviations over a "
                 "positive action; **0 is the paper's algorithm**",
-                "gain": "what the standard deviation of the noise is taken to be, over the nominal one, for each "
+                "gain": "assumed standard deviation of the noise over the nominal one, for each "
                 "sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a "
                 "positive action, 3 to that of a negative one; under the paper's probabilities, for "
-                "faults that no weight can cure; **0 is the paper's algorithm**",
+                "faults that no weight can compensate; **0 is the paper's algorithm**",
                 "hypotheses": "factors r^a in the bank over motion and faults at every measurement: probability that a manoeuvre has "
-                "begun (r = 4), that one goes on (1.05), odds that the error of a pseudorange is another one (4), probability of a "
+                "begun (r = 4), that one continues (1.05), odds that the error of a pseudorange has jumped (4), probability of a "
                 "rate's highest noise level (1.5); process noise of the motion (2), variance of pseudoranges (2), of rates (2), of "
                 "accelerometers (4); **0 is the estimator `fault-hypotheses`**",
                 "evidence": "times `evidence_scale` nats, added to the log-posterior of the hypotheses; **0 is the "
                 "paper's algorithm**",
-                "mode": "the one hypothesis believed; the bank mixes on its weights, so this collapses it to one "
+                "mode": "the selected hypothesis; the bank mixes with its weights, so this collapses it to one "
                 "filter that switches its model",
                 "weights": "weights of the three filters, normalised; all zero is uniform",
             },
@@ -184,7 +184,7 @@ class TightlyCoupledNavigation(NavigationProblem):
     )
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
-        """Return the state that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a
+        """Return the state that steers the tracking loops, ``(17, N)``: the estimate, extrapolated as in a
         manoeuvre.
         """
         return gnss_ins.advance(mean, self.axis[:, :, SINGER], self.common.T, self.common.decay)

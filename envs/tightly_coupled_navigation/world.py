@@ -1,5 +1,6 @@
-"""The flight of TightlyCoupledNavigation and the sensors on board; equations in ``filters/gnss_ins.py``. Its course
-is a part of its own (:mod:`.course`).
+"""World of TightlyCoupledNavigation: flight and sensors on board; equations in ``filters/gnss_ins.py``.
+
+The motion of the user is in :mod:`.course`.
 """
 
 import math
@@ -10,7 +11,7 @@ import numpy
 from ...filters import gnss_ins
 from ...filters.ordered_sums import ordered_sum
 from ..contract.draws import Draws
-from ..contract.faults import Disturbances, undisturbed
+from ..contract.faults import Disturbances, draw_undisturbed
 from ..contract.filter import Initial
 from ..contract.observation import Array
 from ..contract.task import Task
@@ -21,58 +22,58 @@ from .parameters import DEGREE, SINGER, TightlyCoupledNavigationParameters
 from .problem import NavigationProblem
 
 KNOWN_AT_START = (1.0,) * 3 + (0.0,) + (1.0,) * 3 + (0.0,) + (1.0,) * 3 + (0.0,) * 6
-"""One for what is exact and known with errors, position, velocity and acceleration; clock and attitude errors
-are drawn and unknown."""
+"""Ones for states whose initial estimate is the truth plus an error (position, velocity, acceleration), zeros for clock
+and attitude errors, whose initial truth is drawn around zero."""
 OFF = 5.0
-"""Standard deviations from which an error of a pseudorange is a fault."""
+"""Error of a pseudorange in standard deviations above which it counts as a fault."""
 
 
 class Truth(NamedTuple):
-    """The user, and what its sensors remember; S satellites, m = 2 S + 6 readings."""
+    """The true state of the user and of the sensors; S satellites, m = 2 S + 6 readings."""
 
     step: Array
-    """Measurements so far, ``(N,)`` integers."""
+    """Number of measurements so far, ``(N,)`` integers."""
     legs: Legs
     state: Array
-    """``(17, N)``, in the order of filters.gnss_ins."""
+    """True state, ``(17, N)``, in the order of filters.gnss_ins."""
     mode: Array
-    """True hypothesis, ``(N,)`` integers."""
+    """Index of the true hypothesis, ``(N,)`` integers."""
     jumped: Array
-    """One where the acceleration has just taken the value with which the next leg begins, ``(N,)``."""
+    """One where the acceleration has just jumped to the initial value of the next leg, ``(N,)``."""
     noise_factor: Array
     """True standard deviation of each reading over the nominal one, ``(m, N)``."""
     range_error: Array
-    """What every pseudorange is off by beside its noise: multipath, ramp and coloured error, ``(S, N)``, m."""
+    """Error of every pseudorange beside its noise: multipath, ramp and coloured error, ``(S, N)``, m."""
     heading: Array
-    """Of the level aircraft, ``(N,)``, rad."""
+    """Heading of the level aircraft, ``(N,)``, rad."""
     disturbances: dict[str, Any]
-    """State of each by its name, see :mod:`.disturbances`."""
+    """State of each disturbance by its name, see :mod:`.disturbances`."""
 
 
 class Measurement(NamedTuple):
     """Readings of receiver and inertial system; S satellites, m = 2 S + 6 readings."""
 
     number: Array
-    """Of the measurement, counted from 1, ``(N,)`` integers; one takes ``sampling_interval`` seconds."""
+    """Number of the measurement, counted from 1, ``(N,)`` integers; the interval is ``sampling_interval`` seconds."""
     readings: Array
     """S pseudoranges, m; S pseudorange rates, m/s; accelerometers forward, right and down, m/s^2; differences of
     heading, pitch and roll from the attitude reference, rad; ``(m, N)``. Their nominal standard deviations are
     those of ``task.sensors``."""
     available: Array
-    """One where a reading is there, zero where it is not and its value means nothing, where an estimator gets
-    NaN, ``(m, N)``."""
+    """One where a reading is available, zero where it is not and its value is meaningless (NaN for an estimator), ``(m,
+    N)``."""
     ins_angles: Array
-    """Heading, pitch, roll shown by the inertial system, ``(3, N)``, rad."""
+    """Heading, pitch and roll by the inertial system, ``(3, N)``, rad."""
     cn0: Array
     """Carrier to noise density of each satellite, ``(S, N)``, dB-Hz."""
     satellite_position: Array
-    """From the ephemerides, east, north, up of the site, ``(3, S, N)``, m."""
+    """Satellite positions from the ephemerides, east, north, up of the site, ``(3, S, N)``, m."""
     satellite_velocity: Array
-    """``(3, S, N)``, m/s."""
+    """Satellite velocities from the ephemerides, ``(3, S, N)``, m/s."""
 
 
 class NavigationWorld(World[Task, Truth, Measurement]):
-    """An aircraft with a satellite receiver and an inertial system."""
+    """World of an aircraft with a satellite receiver and an inertial system."""
 
     task: NavigationProblem
     parameters: TightlyCoupledNavigationParameters
@@ -98,17 +99,17 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     # --- the episode
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Return the nominal deviations."""
+        """Return the nominal standard deviations of the readings, ``(m, N)``."""
         return self.task.sensor_sigma + 0.0 * measurement.readings
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Draw legs and disturbances; what is known of the start has errors."""
+        """Return the drawn truth (legs, disturbances, initial errors) and the initial estimate."""
         xp, p = self.xp, self.parameters
         zeros = xp.zeros_like(normals[0])
         legs, velocity, heading = self.course.begin(draws, zeros)
         states = self.disturbances.begin(draws, normals[gnss_ins.SIZE :], zeros)
         states = self.disturbances.complete(states, draws)
-        states = self.disturbances.quiet(states, undisturbed(draws, p))
+        states = self.disturbances.switch_off(states, draw_undisturbed(draws, p))
         between_houses = states["reflections"].urban > 0.0
         velocity = xp.where(between_houses, p.urban_speed * velocity, velocity)
         slower = xp.where(between_houses, p.urban_strength * legs.acceleration, legs.acceleration)
@@ -135,7 +136,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     # --- one measurement
 
     def advance(self, truth: Truth, noise: Array, feedback: Array | None) -> tuple[Truth, Measurement]:
-        """Move the user, and measure with noise and disturbances.
+        """Return the truth after one step, and the measurement with noise and disturbances.
 
         Args:
             truth: at the measurement before.
@@ -152,7 +153,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         exact, _ = gnss_ins.observe(state, position, velocity, ins_angles, p.gravity)
 
         further = noise[self.own_normals : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(k, p.sampling_interval, *further, feedback)
+        steps = self.disturbances.split_noise(k, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         white, ranges = noise[gnss_ins.SIZE : self.own_normals], task.sensors[0].readings
         ones = xp.ones_like(white)
@@ -175,7 +176,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return truth, measurement
 
     def _move(self, truth: Truth, k: Array, normals: Array) -> tuple[Array, Array, Array]:
-        """Return the state at step k, the hypothesis it follows, and whether its acceleration has jumped."""
+        """Return the state at step k, the hypothesis that it follows, and whether its acceleration has jumped."""
         xp, common, c = self.xp, self.task.common, self.clock_root
         moved = gnss_ins.advance(truth.state, self.task.axis[:, :, SINGER], common.T, common.decay)
         w = xp.reshape(normals[:9], (3, 3, *normals.shape[1:]))
@@ -190,13 +191,16 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     # --- judgement
 
     def error_cost(self, error: Array) -> Array:
-        """Return the squared position and velocity errors over those of a single-epoch fix."""
+        """Return the squared position and velocity errors over those of a single-epoch fix, ``(N,)``."""
         p, x, v = self.parameters, error[gnss_ins.POSITION], error[gnss_ins.VELOCITY]
         return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Time, true hypothesis, and one where a sensor fails: a rate that is noisier than stated, stuck
-        accelerometers, a pseudorange that is off by more than five standard deviations.
+        """Return the values to record at a measurement, by name: time, true hypothesis, and one where a sensor fails.
+
+        Failures are a rate noisier than stated, stuck accelerometers, and a pseudorange with an error above five
+        standard
+        deviations.
         """
         xp, p = self.xp, self.parameters
         seconds = p.sampling_interval * xp.astype(truth.step, truth.state.dtype)
@@ -210,9 +214,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the legs, what disturbances report, and what holds now: the true hypothesis, the noise of every
-        reading over the nominal one, and what pseudoranges are off by.
-        """
+        """Return the context by name: legs, disturbances, true hypothesis, and noise and errors of readings."""
         return {
             "leg_start": truth.legs.start,
             "leg_kind": truth.legs.kind,

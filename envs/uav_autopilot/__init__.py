@@ -1,4 +1,4 @@
-"""Environment UavAutopilot; begin with ``task.py``."""
+"""The environment UavAutopilot; ``task.py`` declares its parts."""
 
 ID = "filtergym/UavAutopilot-v0"
-"""Id of the environment, available without further imports."""
+"""Gymnasium id, readable without importing the task."""

@@ -1,4 +1,4 @@
-"""Banks of UavAutopilot: Kalman filters by equations (10) to (12), packed as in ``packed_covariance``."""
+"""Banks of UavAutopilot: Kalman filters by equations (10) to (12), with packed covariances."""
 
 import math
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ from ...filters import gaussian, packed_covariance
 from ...filters.ordered_sums import ordered_sum
 from ..contract.filter import Bank
 from ..contract.observation import (
-    KEPT_AS_LOG,
     LARGEST_LOG,
     SHARE,
     SIGNED_LOG,
+    STORED_AS_LOG,
     Array,
     Block,
     Compression,
@@ -33,11 +33,11 @@ MODES = ("nominal", "wide-band", "raw-sensors", "over-smoothed")
 FLOORED_LOG = Compression(
     "log of ", lambda value, xp: xp.log(xp.clip(value, 0.01, None)), numpy.exp, (math.log(0.01), LARGEST_LOG)
 )
-"""Logarithm of squares, with a floor of a hundredth of their expectation, because squares may be zero."""
+"""Compression by the logarithm, with a floor of a hundredth of the expected square, because squares may be zero."""
 
 
 class KalmanState(NamedTuple):
-    """State of N Kalman filters."""
+    """State of the Kalman filter."""
 
     mean: Array
     """Mean, predicted after ``predict`` and updated after ``act``, ``(n, N)``."""
@@ -66,7 +66,7 @@ class KalmanState(NamedTuple):
 
 
 class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
-    """Base of all controls: the observation blocks and the innovation statistics."""
+    """Base class of all banks: the observation blocks and the innovation statistics."""
 
     parameters: UavAutopilotParameters
     action_block: Any
@@ -83,7 +83,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the scaled blocks of filter and autopilot; sigmas are those of the filter before the action."""
+        """Observation blocks of filter and autopilot; sigmas are those of the filter before the action."""
         sensors, horizon = self.task.sensors, self.task.horizon
         unit = 1.0 / self.task.output_sigma
         return (
@@ -117,7 +117,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
             Block(
                 "control",
                 lambda _, measurement: unit * measurement.control,
-                "the control in force over the output sensor's sigma",
+                "the current control over the output sensor's sigma",
                 compression=SIGNED_LOG,
             ),
             Block(
@@ -131,10 +131,10 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
                 "log_trace",
                 lambda f, _: self.log_trace(f),
                 "the mean of the variances over those of the settled filter",
-                compression=KEPT_AS_LOG,
+                compression=STORED_AS_LOG,
             ),
             availability_block(
-                "1 where the sensor answered, 0 in a dropout", parts=sensors, over_interval="mean"
+                "1 where the sensor gave a reading, 0 in a dropout", parts=sensors, over_interval="mean"
             ),
             clock_block(self.xp, horizon),
             self.action_block,
@@ -142,7 +142,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Return the readings and the command without scaling."""
+        """Readings and command in their units, computed from the observation."""
         sigmas, unit = self.parameters.value("sensor_sigmas"), self.task.output_sigma
         return (
             Quantity(
@@ -160,11 +160,11 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def log_trace(self, state: Any) -> Array:
-        """Return the log of the trace of the predicted covariance, ``(N,)``."""
+        """Return the logarithm of the trace of the predicted covariance, ``(N,)``."""
         raise NotImplementedError
 
     def compare(self, state: Any, measurement: Measurement, readings: Array, S: Array) -> Any:
-        """Return the state with the innovations of readings, and their averages.
+        """Return the state with the innovations, NIS, log-likelihood and averages at a measurement filled in.
 
         Args:
             state: state before the measurement.
@@ -191,7 +191,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
-        """Return NIS and log-density of the readings, their number, and the innovation of the output over its sigma.
+        """Return the values to record at a measurement, by name: NIS, log-likelihood, normalised innovation.
 
         NIS and log-density are NaN in a dropout of all sensors. The innovation is that of the first sensor if the
         output is not measured.
@@ -208,7 +208,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
 
 
 class _KalmanBank(AutopilotBank):
-    """One Kalman filter; subclasses define the effect of an action on its noises."""
+    """Bank of one Kalman filter; subclasses define the effect of an action on its noises."""
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -225,16 +225,16 @@ class _KalmanBank(AutopilotBank):
         self.diagonal: list[int] = packed_covariance.diagonal(n)
 
     def scaled_noise(self, scale: Array, entries: list[int]) -> Array:
-        """Return the process noise under a scale ``(N,)`` at some packed entries, ``(entries, N)``."""
+        """Return the process noise times a factor ``(N,)`` at some entries of the packed matrix, ``(entries, N)``."""
         return scale * self.process_noise[entries]
 
     def log_trace(self, state: KalmanState) -> Array:
-        """Return the log of the trace of the predicted covariance under the last action, ``(N,)``."""
+        """Return the logarithm of the trace of the covariance predicted with the last action's noise, ``(N,)``."""
         variances = state.covariance[self.diagonal] + self.scaled_noise(state.scale, self.diagonal)
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
     def start(self, initial: Start) -> KalmanState:
-        """Start at the initial estimate, with the averages of a consistent filter."""
+        """Return the bank's state at the start of the track, with the averages of a consistent filter."""
         xp = self.xp
         zeros = 0.0 * self.task.readings_of(initial.mean)
         one = zeros[0] + 1.0
@@ -255,7 +255,7 @@ class _KalmanBank(AutopilotBank):
         )
 
     def predict(self, state: KalmanState, measurement: Measurement) -> KalmanState:
-        """Predict by equation (10), and compute the innovations with the process noise of the last action."""
+        """Return the state predicted by equation (10), with innovations for the process noise of the last action."""
         m = len(self.task.sensors)
         mean = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         covariance = self.xp.matmul(self.propagator, state.covariance)
@@ -265,21 +265,21 @@ class _KalmanBank(AutopilotBank):
         return compared._replace(mean=mean, covariance=covariance)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Return the action as observed, ``(A, N)``, and the factor on the process noise, ``(N,)``."""
+        """Return the action as observed, ``(A, N)``, and the factor that it sets on the process noise, ``(N,)``."""
         raise NotImplementedError
 
-    def sensor_variances(self, shown: Array) -> Any:
-        """Return the variance of each sensor's reading in the update, numbers or ``(m, N)``."""
+    def sensor_variances(self, action: Array) -> Any:
+        """Return the variance of each sensor's reading for the update, numbers or ``(m, N)``."""
         return self.task.sensor_variances
 
     def autopilot_estimate(
-        self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
+        self, update: packed_covariance.PackedUpdate, measurement: Measurement, action: Array
     ) -> tuple[Array, Array]:
-        """Return the estimate of the autopilot and its packed covariance."""
+        """Return the estimate that the autopilot uses, and its packed covariance."""
         return update.mean, update.covariance
 
     def act(self, state: KalmanState, measurement: Measurement, action: Array) -> KalmanState:
-        """Update by equations (12) and (11) with the noises of the action."""
+        """Return the state updated by equations (12) and (11) with the process and sensor noises of the action."""
         shown, scale = self.decode_action(action)
         update = packed_covariance.update_coordinates(
             state.mean,
@@ -300,29 +300,29 @@ class _KalmanBank(AutopilotBank):
         )
 
     def mean(self, state: KalmanState) -> Array:
-        """Return the estimate of the autopilot, ``(n, N)``."""
+        """Return the estimate that the autopilot uses, ``(n, N)``."""
         return state.estimate
 
     def covariance(self, state: KalmanState) -> Array:
-        """Return the reported covariance, ``(n, n, N)``."""
+        """Return the reported covariance of that estimate, ``(n, n, N)``."""
         return packed_covariance.unpack(state.estimate_covariance, len(self.task.components))
 
 
 class GainBank(_KalmanBank):
-    """Control ``gain``: the action scales the process noise."""
+    """Bank of the control ``gain``: the action scales the process noise."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
     action_block: Any = last_action_block(name="action")
     no_action: tuple[float, ...] = (0.0,)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Return the action and the factor ``10 ** (gain_decades a)``."""
+        """Return the action and the factor ``10 ** (gain_decades a)`` on the process noise."""
         xp = self.xp
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
 
     def covariance(self, state: KalmanState) -> Array:
-        """Return the covariance of the filter, ``(n, n, N)``, times the short average of the NIS where above one.
+        """Return the filter's covariance, ``(n, n, N)``, under an action inflated by the average NIS if above one.
 
         The factor applies only under nonzero actions, because only the innovations show whether the action fits the
         noise. Under the action zero it is the paper's filter with the paper's covariance.
@@ -332,7 +332,7 @@ class GainBank(_KalmanBank):
 
 
 class NoiseBank(_KalmanBank):
-    """Control ``noise``: the action scales the process noise and the noise of every sensor."""
+    """Bank of the control ``noise``: the action scales the process noise and the noise of every sensor."""
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -341,12 +341,12 @@ class NoiseBank(_KalmanBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return a box for the process noise, then each sensor."""
+        """Gymnasium box of one number for the process noise, then one for each sensor."""
         return gymnasium.spaces.Box(-1.0, 1.0, (1 + len(self.task.sensors),), numpy.float32)
 
     @property
     def action_block(self) -> Block:
-        """Return the block of the last action."""
+        """Observation block of the last action."""
         return last_action_block(("process", *self.task.sensors), name="action")
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
@@ -355,15 +355,18 @@ class NoiseBank(_KalmanBank):
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         return shown, xp.exp(shown[0] * (p.noise_reach * p.process_decades * math.log(10.0)))
 
-    def sensor_variances(self, shown: Array) -> Array:
+    def sensor_variances(self, action: Array) -> Array:
         """Return the nominal variances times ``10 ** (2 noise_reach sensor_decades a)``, ``(m, N)``."""
         p = self.parameters
-        scale = self.xp.exp(shown[1:] * (2.0 * p.noise_reach * p.sensor_decades * math.log(10.0)))
+        scale = self.xp.exp(action[1:] * (2.0 * p.noise_reach * p.sensor_decades * math.log(10.0)))
         return self.nominal_variances * scale
 
 
 class ModeBank(_KalmanBank):
-    """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, under which the filter also continues."""
+    """Bank of the control ``mode``: nominal, wide-band or over-smoothed filter, or raw sensor readings.
+
+    Under raw readings the filter continues to run.
+    """
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(len(MODES))
     action_block: Any = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES, SHARE)
@@ -379,22 +382,22 @@ class ModeBank(_KalmanBank):
         self.raw_covariance: Array = task.constant(packed_covariance.pack(raw)[:, None])
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Return the mode, and ``wide_band_scale`` in mode "wide-band", ``over_smoothed_scale`` in "over-smoothed"."""
+        """Return the selected mode (one-hot), and its factor on the process noise."""
         xp, p = self.xp, self.parameters
         shown = xp.stack([xp.astype(action == i, xp.float64) for i in range(len(MODES))])
         wide, smooth = (p.wide_band_scale - 1.0) * shown[1], (p.over_smoothed_scale - 1.0) * shown[3]
         return shown, 1.0 + (wide + smooth)
 
     def autopilot_estimate(
-        self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
+        self, update: packed_covariance.PackedUpdate, measurement: Measurement, action: Array
     ) -> tuple[Array, Array]:
-        """Return in mode "raw-sensors" the readings of measured coordinates and zero for the others."""
+        """Return the filter's estimate; in mode "raw-sensors" the readings, and zero for other coordinates."""
         xp, reading, measured = self.xp, measurement.reading, self.task.measured
         zero = xp.zeros_like(reading[0])
         rows = [
             reading[measured.index(i)] if i in measured else zero for i in range(len(self.task.components))
         ]
-        raw = shown[2] > 0.0
+        raw = action[2] > 0.0
         return (
             xp.where(raw, xp.stack(rows), update.mean),
             xp.where(raw, self.raw_covariance, update.covariance),

@@ -6,11 +6,11 @@ from ..contract.observation import Array
 from .disturbances import DISTURBANCES, RAISED
 
 SETTLING = 20.0
-"""Measurements that the loop needs to follow a new command."""
+"""Number of measurements that the loop needs to follow a new command."""
 
 
 def _has_new_command(moment: Moment) -> Array | None:
-    if not moment.knows("command_times"):
+    if not moment.has_context("command_times"):
         return None
     since = moment.measurement.number - moment.context["command_times"]
     recent: Array = moment.xp.any((since >= 0.0) & (since < SETTLING), axis=0)
@@ -18,11 +18,11 @@ def _has_new_command(moment: Moment) -> Array | None:
 
 
 def _is_gusty(moment: Moment) -> Array | None:
-    return moment.context["level"] >= RAISED if moment.knows("level") else None
+    return moment.context["level"] >= RAISED if moment.has_context("level") else None
 
 
 def _is_calm(moment: Moment) -> Array | None:
-    if not moment.knows("level", "sensor_level"):
+    if not moment.has_context("level", "sensor_level"):
         return None
     worst = moment.xp.max(moment.context["sensor_level"], axis=0)
     calm: Array = (moment.context["level"] < RAISED) & (worst < RAISED)

@@ -1,20 +1,20 @@
-"""Disturbances of the sensors of UavAutopilot, a class for each. A measurement reports dropouts only."""
+"""Disturbances of the sensors of UavAutopilot, one class each. A measurement reports dropouts only."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 from ..contract.causes import MISSED, Cause, Moment
-from ..contract.draws import Draws, StepSignal, within
+from ..contract.draws import Draws, StepSignal, is_within
 from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput
 from ..contract.observation import Array
 from .problem import AutopilotProblem
 
 RAISED = 2.0
-"""Factor on the nominal noise from which a noise counts as raised."""
+"""Factor on the nominal noise above which a noise counts as raised."""
 
 
 def _has_noisy_sensor(moment: Moment) -> Array | None:
-    if not moment.knows("sensor_level"):
+    if not moment.has_context("sensor_level"):
         return None
     noisy: Array = moment.xp.any(moment.context["sensor_level"] >= RAISED, axis=0)
     return noisy
@@ -28,14 +28,14 @@ def draw_steps(
     zero: Array,
     count: int | None = None,
 ) -> StepSignal:
-    """Draw the level in each part of the episode, and the first measurements of the parts."""
+    """Return a drawn step signal: its level in each part of the episode, and the first measurement of each part."""
     values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
     begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
     return StepSignal(draws.xp.stack(values), draws.xp.stack([zero, *begins])[1:])
 
 
 class _OfSensors(Disturbance):
-    """Base of disturbances of all m sensors, or of some."""
+    """Base class of disturbances of all m sensors, or of some."""
 
     def __init__(self, task: AutopilotProblem) -> None:
         super().__init__(task)
@@ -44,7 +44,7 @@ class _OfSensors(Disturbance):
         self.sigmas: Array = task.constant(task.parameters.value("sensor_sigmas"))[:, None]
 
     def chosen(self, named: tuple[str, ...] | None) -> Array:
-        """Return one for the disturbed sensors, otherwise zero, ``(m, 1)``."""
+        """Return a mask, one for the named sensors (None: all) and zero for the others, ``(m, 1)``."""
         return self.task.constant([[float(named is None or s in named)] for s in self.task.sensors])
 
 
@@ -58,7 +58,7 @@ class SensorLevels(NamedTuple):
 
 
 class NoisySensors(_OfSensors):
-    """White noise of sensors that differs from nominal and changes in the episode."""
+    """White noise of sensors that differs from nominal and changes during the episode."""
 
     name = "noisy_sensors"
     causes: ClassVar[tuple[Cause, ...]] = (
@@ -70,27 +70,27 @@ class NoisySensors(_OfSensors):
     )
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> SensorLevels:
-        """Draw the levels and the times of their changes."""
+        """Return the drawn factors on the sensors' noise and the times of their changes."""
         p, chosen = self.parameters, self.chosen(self.parameters.changing_sensors)
         levels = draw_steps(draws, "sensor", p.sensor_levels, p.sensor_times, zero, self.count)
         levels = levels._replace(values=1.0 + chosen * (levels.values - 1.0))
         return SensorLevels(levels, levels.values[0])
 
-    def quiet(self, state: SensorLevels, calm: Array) -> SensorLevels:
-        """Return the levels, with one in undisturbed episodes."""
-        values = self.xp.where(calm, 1.0, state.levels.values)
+    def switch_off(self, state: SensorLevels, undisturbed: Array) -> SensorLevels:
+        """Return the state with factors of one in the episodes where ``undisturbed``."""
+        values = self.xp.where(undisturbed, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
 
     def advance(self, state: SensorLevels, step: DisturbanceInput) -> SensorLevels:
-        """Set the levels of this measurement."""
+        """Return the state with the factors on the sensors' noise at this measurement."""
         return state._replace(level=state.levels.at(step.number, self.xp))
 
     def change_deviations(self, state: SensorLevels, deviations: Array) -> Array:
-        """Multiply the standard deviations by the levels."""
+        """Return the standard deviations times the factors on the sensors' noise."""
         return deviations * state.level
 
     def context(self, state: SensorLevels) -> dict[str, Array]:
-        """Return all levels, and the first measurements at which they apply."""
+        """Return the context: all factors on the noise, and the measurements at which they change, by name."""
         return {"sensor_levels": state.levels.values, "sensor_level_times": state.levels.times}
 
 
@@ -112,7 +112,7 @@ class Dropouts(_OfSensors):
     causes: ClassVar[tuple[Cause, ...]] = (MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Holds:
-        """Draw the first and last measurements of the dropouts."""
+        """Return the drawn first and last measurements of the sensors' dropouts."""
         xp, p = self.xp, self.parameters
         none = xp.stack([zero] * self.count)
         starts, stops = [none], [none]
@@ -124,17 +124,17 @@ class Dropouts(_OfSensors):
         return Holds(xp.stack(starts)[1:], xp.stack(stops)[1:], none)
 
     def change_measurement(self, state: Holds, measurement: Any, step: DisturbanceInput) -> tuple[Holds, Any]:
-        """Replace the reading of each sensor in a dropout by its last one."""
+        """Return the state, and the measurement with each sensor's last valid reading repeated during a dropout."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
-            out = within(step.number, (state.starts[i], state.stops[i]))
+            out = is_within(step.number, (state.starts[i], state.stops[i]))
             available = xp.where(out, 0.0, available)
         reading = xp.where(available > 0.0, measurement.reading, state.reading)
         measurement = measurement._replace(reading=reading, available=available)
         return state._replace(reading=reading), measurement
 
     def context(self, state: Holds) -> dict[str, Array]:
-        """Return the first measurements of the dropouts and after them."""
+        """Return the context: first measurements of the dropouts and those after them, by name."""
         return {"dropout_starts": state.starts, "dropout_stops": state.stops}
 
 
@@ -144,7 +144,7 @@ class SensorBias(_OfSensors):
     name = "bias"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Draw size and sign of the errors."""
+        """Return the drawn constant errors of the sensors, ``(m, N)``."""
         xp, limits = self.xp, self.parameters.sensor_bias
         if not limits[1]:
             return xp.stack([zero] * self.count)
@@ -152,21 +152,21 @@ class SensorBias(_OfSensors):
         size = draws.uniform("bias", limits, self.count)
         return self.sigmas * self.chosen(self.parameters.biased_sensors) * side * size
 
-    def quiet(self, state: Array, calm: Array) -> Array:
-        """Return the errors, with zero in undisturbed episodes."""
-        return self.xp.where(calm, 0.0, state)
+    def switch_off(self, state: Array, undisturbed: Array) -> Array:
+        """Return the constant errors, zero in the episodes where ``undisturbed``."""
+        return self.xp.where(undisturbed, 0.0, state)
 
     def change_reading(self, state: Array, reading: Array) -> tuple[Array, Array]:
-        """Add the errors to the readings."""
+        """Return the state, and the readings with the constant errors added."""
         return state, reading + state if self.parameters.sensor_bias[1] else reading
 
     def context(self, state: Array) -> dict[str, Array]:
-        """Return the errors."""
+        """Return the context: the sensors' constant errors, by name."""
         return {"sensor_bias": state}
 
 
 class SensorColour(ColouredErrors):
-    """Coloured errors of sensors, first-order Gauss-Markov processes."""
+    """Coloured errors of sensors: first-order Gauss-Markov processes."""
 
     def __init__(self, task: AutopilotProblem) -> None:
         p = task.parameters
@@ -174,7 +174,7 @@ class SensorColour(ColouredErrors):
         self.sigmas: Array = task.constant(p.value("sensor_sigmas"))[:, None]
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
-        """Draw standard deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
+        """Return the drawn standard deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
         p, none = self.parameters, self.xp.stack([zero] * self.count)
         if not self.normals:
             return none, none + 1.0
@@ -182,15 +182,15 @@ class SensorColour(ColouredErrors):
         return deviation, draws.log_uniform("correlation_time", p.sensor_correlation_time, self.count)
 
     def change_reading(self, state: ColouredErrorsState, reading: Array) -> tuple[ColouredErrorsState, Array]:
-        """Add the errors to the readings."""
+        """Return the state, and the readings with the coloured errors added."""
         return state, reading + state.level if self.normals else reading
 
     def context(self, state: ColouredErrorsState) -> dict[str, Array]:
-        """Return the errors at this measurement."""
+        """Return the context: the coloured errors at this measurement, by name."""
         return {"sensor_coloured": state.level}
 
 
 DISTURBANCES: tuple[type[Disturbance], ...] = (NoisySensors, SensorColour, SensorBias, Dropouts)
-"""Disturbances in the order of their action; add new ones last to keep episodes equal."""
+"""Disturbances in the order in which they act. New ones are appended, so that episodes do not change."""
 DRAWN_FIRST = (NoisySensors, Dropouts, SensorBias)
-"""Disturbances that are drawn before the others, in this order, to keep the random numbers of episodes."""
+"""Disturbances that are drawn before the others, in this order, which fixes the random numbers of episodes."""

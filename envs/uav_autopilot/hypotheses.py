@@ -1,4 +1,4 @@
-"""Control ``hypotheses``: the action sets factors of the estimator ``level-bank``; see ``level_bank.py``."""
+"""Bank of the control ``hypotheses``: the estimator ``level-bank``, whose settings the action multiplies."""
 
 import math
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from ..contract.observation import (
     entropy_block,
     expected_nis_block,
     last_action_block,
+    limited,
     log_density_block,
     predicted_block,
     probability_block,
-    within,
 )
 from .banks import AutopilotBank
 from .level_bank import LevelBank, Levels, grid
@@ -27,12 +27,12 @@ from .world import Measurement, Start
 
 
 class HypothesesState(NamedTuple):
-    """State of the bank over levels."""
+    """State of the bank over noise levels, with the values that the agent observes."""
 
     own: Levels
-    """State of the estimator, predicted between :meth:`HypothesesBank.predict` and the action."""
+    """State of the bank, predicted between :meth:`HypothesesBank.predict` and the action."""
     likelihood: Likelihood
-    """Likelihood of the readings by the estimator."""
+    """Likelihood of the readings under the bank's prediction."""
     action: Array
     """Last action, ``(3 + m, N)``."""
     innovation: Array
@@ -60,9 +60,9 @@ class HypothesesState(NamedTuple):
 
 
 class HypothesesBank(SettingsBank, AutopilotBank):
-    """Bank over levels with factors of the action on its weights and noises."""
+    """Bank of ``hypotheses``: the bank over noise levels with factors on its weights and noises."""
 
-    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = LevelBank
+    filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = LevelBank
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -78,12 +78,12 @@ class HypothesesBank(SettingsBank, AutopilotBank):
 
     @property
     def action_block(self) -> Block:
-        """Return the block of the last action."""
+        """Observation block of the last action."""
         return last_action_block(tuple(self.own.settings), name="action")
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of every filter, the log-density of the readings, and the probabilities of the levels."""
+        """Observation blocks of every filter, the log-density of the readings, and the probabilities of the levels."""
         xp, low, high = self.xp, *self.sensor_limits
         unit = math.prod(self.task.sensor_variances) ** 0.5 * (2.0 * math.pi) ** (
             0.5 * len(self.task.sensors)
@@ -102,17 +102,17 @@ class HypothesesBank(SettingsBank, AutopilotBank):
                 lambda f, _: xp.clip(f.sensor_levels, low, high),
                 "expected log of the factor on the sensor's sigma then",
                 self.task.sensors,
-                within(low, high),
+                limited(low, high),
             ),
             entropy_block(xp),
         )
 
     def log_trace(self, state: HypothesesState) -> Array:
-        """Return the log of the trace of the predicted covariance, including the spread of the hypotheses, ``(N,)``."""
+        """Return the logarithm of the trace of the predicted covariance with the spread of hypotheses, ``(N,)``."""
         return state.log_trace
 
     def start(self, initial: Start) -> HypothesesState:
-        """Start at the estimator's initial state, with the averages of a consistent filter."""
+        """Return the bank's state at the start of the track, with the averages of a consistent filter."""
         own = self.own.start(initial)
         zeros = 0.0 * self.task.readings_of(initial.mean)
         none = zeros[0]
@@ -136,21 +136,23 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         )
 
     def group(self, probability: Array) -> Array:
-        """Return the probabilities of the gusts' levels, ``(G, N)``, from those of the hypotheses, ``(H, N)``."""
+        """Return the probabilities of the gust levels, ``(G, N)``, from those of the hypotheses, ``(H, N)``."""
         each = len(self.names)
         return ordered_sum(probability[each * i : each * (i + 1)] for i in range(self.own.groups))
 
     def expect_levels(self, h: LevelHypotheses) -> Array:
-        """Return the expected logarithm of the factor on the deviation of each sensor, ``(m, N)``."""
+        """Return the expected logarithm of the factor on each sensor's standard deviation, ``(m, N)``."""
         of_each = [ordered_sum(q * level) for q, level in zip(h.sensors, self.log_levels, strict=True)]
         return self.xp.stack([ordered_sum(h.probability * levels) for levels in of_each])
 
     def has_reading(self, measurement: Measurement) -> Array:
-        """Return whether any sensor has a reading, ``(N,)``."""
+        """Return booleans ``(N,)``: whether any sensor has a reading."""
         return ordered_sum(measurement.available) > 0.0
 
-    def look(self, state: HypothesesState, found: Levels, measurement: Measurement) -> HypothesesState:
-        """Compute the joint innovation of all hypotheses, and the probabilities after the readings."""
+    def add_observed(
+        self, state: HypothesesState, result: Levels, measurement: Measurement
+    ) -> HypothesesState:
+        """Return the state with the joint innovation, and the probabilities after the readings, filled in."""
         xp, bank, rows, h = self.xp, self.own, self.own.rows, state.own.hypotheses
         whole = noise_levels.merge(h.mean, h.covariance, h.probability)
         P = packed_covariance.unpack(whole.covariance, bank.size)
@@ -170,18 +172,18 @@ class HypothesesBank(SettingsBank, AutopilotBank):
                 for a, noise in zip(rows, noises, strict=True)
             ]
         )
-        p = found.hypotheses.probability
+        p = result.hypotheses.probability
         n = len(self.task.components)
         compared: HypothesesState = self.compare(state, measurement, readings, S)
         return compared._replace(
-            likelihood=found.likelihood,
+            likelihood=result.likelihood,
             log_trace=xp.log(ordered_sum(self.trace_weights[i] * P[i, i] for i in range(n))),
             predicted=self.group(whole.shares),
             probabilities=self.group(p),
             entropy=-ordered_sum(p * imm.log_probabilities(p)) / math.log(p.shape[0]),
-            sensor_levels=self.expect_levels(found.hypotheses),
+            sensor_levels=self.expect_levels(result.hypotheses),
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return the metrics of the other filters, with likelihood and NIS by the estimator."""
+        """Return the records of the other banks, with the likelihood and NIS of the estimator, by name."""
         return {**super().records(state, measurement), **state.likelihood._asdict()}

@@ -35,7 +35,7 @@ CAUTION = 5.0
 
 
 class NetFilter(NamedTuple):
-    """Fields of :class:`~.banks.KalmanState` with the covariance of the gain."""
+    """State of the bank: the fields of :class:`~.banks.KalmanState` and the covariance of the gain."""
 
     mean: Array
     covariance: Array
@@ -55,7 +55,7 @@ class NetFilter(NamedTuple):
 
 
 class KalmanNetBank(NoiseBank):
-    """The paper's filter with noises and gain from the action."""
+    """Bank of ``kalman-net``: the paper's filter, whose noises and gain the action sets."""
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -63,17 +63,17 @@ class KalmanNetBank(NoiseBank):
         parts = {"disturbance": model.scaled_noise, "other": model.other_noise}
         parts = {name: Q for name, Q in parts.items() if Q.any()}
         self.noise_parts = [task.constant(packed_covariance.pack(Q)[:, None]) for Q in parts.values()]
-        self.answers: tuple[str, ...] = (
+        self.action_names: tuple[str, ...] = (
             *parts,
             *sensors,
             *(f"agility_{name}" for name in parts),
             *(f"caution_{s}" for s in sensors),
         )
-        self.no_action: tuple[float, ...] = (0.0,) * len(self.answers)
+        self.no_action: tuple[float, ...] = (0.0,) * len(self.action_names)
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Return the blocks of the bank without the last valid reading in a dropout, which estimators do not get."""
+        """Observation blocks of the bank, without the last valid reading in a dropout, which estimators do not get."""
         reading = Block(
             "reading",
             lambda _, measurement: measurement.available * measurement.reading / self.sensor_sigmas,
@@ -85,31 +85,31 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Return a box: a factor for each part of the process noise and each sensor, then one more of each for the
+        """Gymnasium box of a factor for each part of the process noise and each sensor, then one more each for the
         gain.
         """
-        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
     def action_block(self) -> Block:
-        """Return the block of the last output of the network."""
-        return last_action_block(self.answers, name="action")
+        """Observation block of the last output of the network."""
+        return last_action_block(self.action_names, name="action")
 
     def scaled_noise(self, scale: Array, entries: list[int] | slice) -> Array:
-        """Return the process noise with parts scaled by ``(L, N)`` at some packed entries, ``(entries, N)``."""
+        """Return the process noise with its parts times factors ``(L, N)`` at some packed entries, ``(entries, N)``."""
         total = scale[0] * self.noise_parts[0][entries]
         for factor, part in zip(scale[1:], self.noise_parts[1:], strict=True):
             total = total + factor * part[entries]
         return total
 
     def start(self, initial: Start) -> Any:
-        """Return the initial state of the paper's filter as a :class:`NetFilter`."""
+        """Return the paper's filter at the initial estimate, as a :class:`NetFilter`."""
         fields = super().start(initial)._asdict()
         fields["scale"] = self.xp.stack([fields["scale"]] * len(self.noise_parts))
         return NetFilter(**fields, gain_covariance=fields["covariance"])
 
     def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
-        """Update a :class:`NetFilter` with the gain of the network's output."""
+        """Return the state updated with the noises and the gain that the action sets."""
         xp, p, parts = self.xp, self.parameters, len(self.noise_parts)
         count = parts + len(self.task.sensors)
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)

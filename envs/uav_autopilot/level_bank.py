@@ -41,7 +41,7 @@ class Kind(NamedTuple):
     share: float = 1.0
     """Prior probability."""
     lag: float = 1.0
-    """Time constant of the actuator over the believed one; plant P has only kinds with 1."""
+    """Ratio of the actuator's time constant to that of the model; plant P has only kinds with 1."""
     error: float = 0.15
     """Standard deviation of the slow errors over the sensor's nominal one."""
     error_time: float = 1.0
@@ -51,7 +51,7 @@ class Kind(NamedTuple):
 
 
 class LevelPrior(NamedTuple):
-    """Prior of a bank over levels."""
+    """Prior of the bank over noise levels."""
 
     gusts: tuple[float, float] = (0.2, 5.0)
     """Limits of the disturbance's level, log-uniform."""
@@ -71,7 +71,7 @@ class LevelPrior(NamedTuple):
     leave: float = 1e-4
     """Probability before a measurement that noise as designed ends."""
     kept: float = 0.5
-    """Probability that a sensor's noise remains as designed at that end."""
+    """Probability that a sensor's noise remains as designed when noise as designed ends."""
     slow: tuple[str, ...] = ("rate",)
     """Sensors with slow errors."""
     kinds: tuple[Kind, ...] = (Kind(),)
@@ -97,13 +97,13 @@ that has a bias, and an actuator that is slower than designed; one of ten each."
 
 
 def grid(limits: tuple[float, float], points: int) -> numpy.ndarray:
-    """Return the midpoints of equal intervals of the logarithm."""
+    """Return the midpoints of intervals that divide the logarithm of a range evenly, ``(points,)``."""
     low, high = limits
     return numpy.asarray(low * (high / low) ** ((numpy.arange(points) + 0.5) / points))
 
 
 class Levels(NamedTuple):
-    """State of the bank over levels."""
+    """State of the bank over noise levels."""
 
     mean: Array
     """Mean of all hypotheses together, ``(n, N)``."""
@@ -114,14 +114,14 @@ class Levels(NamedTuple):
 
 
 def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
-    """Return the likelihood of the readings; NaN in a dropout of all sensors."""
+    """Return the :class:`Likelihood` of the readings; NaN in a dropout of all sensors."""
     count = ordered_sum(measurement.available)
     there = count > 0.0
     return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
 
 
 class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
-    """Gaussian sum over levels of gusts and sensors that switch at unknown times, merged like an IMM.
+    """Gaussian sum over noise levels of gusts and sensors that switch at unknown times, merged like an IMM.
 
     Args:
         task: the problem.
@@ -169,14 +169,14 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         chances = numpy.full(len(factors), 1.0 / len(factors))
         nearest = numpy.arange(len(factors)) == numpy.abs(numpy.log(factors)).argmin()
         kept = (1.0 - prior.kept) * chances + prior.kept * nearest
-        believed = numpy.concatenate(
+        level_shares = numpy.concatenate(
             [kept[:, None], numpy.repeat(chances[:, None], each - 1, axis=1)], axis=1
         )
         squared = numpy.repeat(factors[:, None] ** 2, each, axis=1)
         squared[:, 0] = 1.0
-        squared, believed = (numpy.tile(values, (1, self.groups)) for values in (squared, believed))
+        squared, level_shares = (numpy.tile(values, (1, self.groups)) for values in (squared, level_shares))
         self.levels: Array = constant(chances)[:, None, None]
-        self.believed: Array = constant(believed)[:, :, None]
+        self.level_shares: Array = constant(level_shares)[:, :, None]
         self.variances: list[Array] = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
         self.wide: list[float] = [R * prior.outlier_factor**2 for R in task.sensor_variances]
         settings = {"gusts": 1.1, "designed": 1.25, "process": 2.0}
@@ -184,45 +184,47 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         heights, designed = numpy.log(levels) / (math.log(levels[-1]) or 1.0), numpy.arange(each) == 0
         raised = numpy.tile([heights, designed.astype(float)], (1, self.groups))
         self.raised: Array = constant(raised)[:, :, None]
-        """Exponents of the first two factors in each weight, ``(2, H, 1)``."""
+        """Exponents of the first two factors in each hypothesis' weight, ``(2, H, 1)``."""
 
     def start(self, initial: Initial | Start) -> Levels:
-        """Return all hypotheses at the initial estimate."""
+        """Return the bank's state at the start of the track, all hypotheses at the initial estimate."""
         xp, none = self.xp, 0.0 * initial.mean[0]
         mean = xp.stack([*initial.mean, *[none] * (self.size - self.n)])
         hypotheses = LevelHypotheses(
             xp.stack([mean] * self.probability.shape[0], axis=1),
             self.start_covariance + none,
             self.probability + none,
-            tuple(self.believed + none for _ in self.rows),
+            tuple(self.level_shares + none for _ in self.rows),
         )
         return Levels(initial.mean, initial.covariance, Likelihood.unknown(none), hypotheses)
 
     def predict(self, state: Levels, measurement: Measurement) -> Levels:
-        """Apply the change of levels, and predict every hypothesis to the time of a measurement."""
+        """Return the hypotheses mixed for changes of noise levels, and predicted to the time of a measurement."""
         h = self.switch(state.hypotheses)
         mean, covariance = self.propagate(h, measurement)
         return state._replace(hypotheses=h._replace(mean=mean, covariance=covariance))
 
-    def heeds(self, measurement: Measurement) -> Array:
-        """Return where any sensor has a reading, ``(N,)``."""
+    def has_effect(self, measurement: Measurement) -> Array:
+        """Return one where any sensor has a reading, so that an action has an effect, zero elsewhere, ``(N,)``."""
         return self.xp.where(ordered_sum(measurement.available) > 0.0, 1.0, 0.0)
 
     def apply_factors(self, h: LevelHypotheses, logarithms: Array) -> LevelHypotheses:
-        """Multiply weights and process noise by factors, given as logarithms ``(3, N)``."""
+        """Return the hypotheses with weights and process noise multiplied by factors, given as logarithms ``(3,
+        N)``.
+        """
         xp = self.xp
         return h._replace(
             probability=xp.exp(ordered_sum(self.raised * logarithms[:2, None])) * h.probability,
             covariance=h.covariance + (xp.exp(logarithms[2]) - 1.0) * self.process,
         )
 
-    def update(self, state: Levels, given: FilterInput) -> Levels:
-        """Update with the readings one after the other, and combine the hypotheses."""
-        xp, n, measurement, predicted = self.xp, self.n, given.measurement, state.hypotheses
+    def update(self, state: Levels, inputs: FilterInput) -> Levels:
+        """Return the hypotheses updated with one reading after the other, and their combined estimate."""
+        xp, n, measurement, predicted = self.xp, self.n, inputs.measurement, state.hypotheses
         scaled = self.variances
-        if given.action is not None:
-            predicted = self.apply_factors(predicted, given.action[:3])
-            factors = xp.exp(given.action[3:])
+        if inputs.action is not None:
+            predicted = self.apply_factors(predicted, inputs.action[:3])
+            factors = xp.exp(inputs.action[3:])
             scaled = [factors[k] * variances for k, variances in enumerate(self.variances)]
         mean, covariance = predicted.mean, predicted.covariance
         log_density, nis, sensors = 0.0, 0.0, []
@@ -251,7 +253,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def switch(self, memory: LevelHypotheses) -> LevelHypotheses:
-        """Apply the change of levels in every kind."""
+        """Return the hypotheses of every kind mixed for changes of the levels."""
         xp, each = self.xp, self.change.shape[0]
         parts = [
             noise_levels.switch(
@@ -273,7 +275,7 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         )
 
     def propagate(self, h: LevelHypotheses, measurement: Measurement) -> tuple[Array, Array]:
-        """Predict every hypothesis by equations (10) and (12)."""
+        """Return the mean and covariance of every hypothesis predicted by equations (10) and (12)."""
         xp, u = self.xp, measurement.control
         mean = [
             xp.matmul(F, h.mean[:, j]) + B * u for j, (F, B) in enumerate(zip(self.F, self.B, strict=True))

@@ -9,30 +9,30 @@ from ..contract.live_input import LiveInput, LiveReader, Memory
 
 
 class SensorInput(LiveInput):
-    """Reader of sensor readings, command and control in force; a sensor in a dropout repeats its last reading."""
+    """Converter of sensor readings, command and control into measurements; a dropout repeats the last reading."""
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return the descriptions of readings, command and control with their units."""
+        """Return the names and descriptions of the values of a measurement, and of those at the start."""
         sensors = ", ".join(self.task.sensors)  # type: ignore[attr-defined]
         values = {
             "reading": f"of each sensor ({sensors}) in the unit of its coordinate; NaN in a dropout",
             "command": "in the unit of the output",
-            "control": "in force since the previous measurement: the value that was fed back",
+            "control": "control since the previous measurement: the value that was fed back",
         }
         return values, {"command": "at the start, in the unit of the output"}
 
-    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Start without readings, and with a command of zero unless given."""
-        initial, memory = super().start(time, {"command": 0.0, **given})
-        return initial, {**memory, "reading": self.same_of_all(0.0, self.measurement.reading.shape[:-1])}
+    def start(self, time: Any, initial_values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Return the initial estimate with the given command (default: zero), and the memory."""
+        initial, memory = super().start(time, {"command": 0.0, **initial_values})
+        return initial, {**memory, "reading": self.broadcast(0.0, self.measurement.reading.shape[:-1])}
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Return the measurement of the received readings and the memory."""
+        """Return the measurement of the received readings, and the memory for the next one."""
         measurement, after = super().measure(memory, time, values)
         return measurement, {**after, "reading": measurement.reading}
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
-        """Replace missing readings by the last ones."""
+        """Return the readings with missing ones replaced by the last ones."""
         return numpy.where(there, received, memory["reading"])
 
 

@@ -58,7 +58,7 @@ class UavAutopilotParameters(TaskParameters):
     """"P": the paper's double integrator. "U": the pitch channel of a small aircraft, ours, because the
     paper's model has neither actuator nor gusts."""
     sampling_interval: float | None = parameter(None, above=0.0, at_most=86400.0)
-    """T, s. P: 0.25 (paper). U: 0.02, ours: fast against the actuator."""
+    """Sampling interval T, s. P: 0.25 (paper). U: 0.02, ours: fast against the actuator."""
     horizon: int = parameter(600, at_least=1)
     """Measurements in an episode. Ours: some thirty settling times of either loop."""
 
@@ -121,7 +121,7 @@ class UavAutopilotParameters(TaskParameters):
     step_size: float = 0.0
     """Step of the command, in units of the output."""
     step_time: int = parameter(1, at_least=1)
-    """Measurement from which the step is in force."""
+    """First measurement with the step."""
     command_amplitude: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Range of the size of random manoeuvres, in units of the output; zero: none."""
     command_period: int = parameter(150, at_least=1)
@@ -238,7 +238,7 @@ class UavAutopilotParameters(TaskParameters):
             )
 
     def value(self, name: str) -> Any:
-        """Return the value of a constant, that of the plant if it is None."""
+        """Return the value of a parameter by its name; the plant's default value if it is None."""
         given = getattr(self, name)
         if given is not None:
             return given

@@ -1,4 +1,4 @@
-"""Plants of UavAutopilot and the design of the loop: autopilot, nominal filter, theory."""
+"""Plants of UavAutopilot and the design of the control loop: autopilot, nominal filter, theoretical cost."""
 
 import functools
 from typing import NamedTuple
@@ -24,7 +24,7 @@ class Plant(NamedTuple):
 
 
 def constant_rate(parameters: UavAutopilotParameters) -> Plant:
-    """Return the plant P: ``F = [[1, T], [0, 1]]``, "with the first derivative of the useful signal" (paper).
+    """Return the plant P, a double integrator: ``F = [[1, T], [0, 1]]`` (paper).
 
     Reading: the scan has "1 0,25 / F = 0 =1"; the "=" is a stray sign. ``B = [T^2/2, T]`` and noise that
     enters with the control are ours.
@@ -69,7 +69,7 @@ def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0)
 
 
 class Design(NamedTuple):
-    """Design of the loop, computed once: model and true plant, autopilot, filter, theory of the loop."""
+    """Design of the control loop: model and true plant, autopilot, filter, theoretical covariances and cost."""
 
     model: Plant
     """Plant of the filter and the autopilot."""
@@ -94,7 +94,7 @@ class Design(NamedTuple):
 
     @property
     def state_covariance(self) -> numpy.ndarray:
-        """Return the covariance of the state in the nominal loop without command, ``(n, n)``; requires SciPy."""
+        """Covariance of the state in the nominal loop without command, ``(n, n)``; requires SciPy."""
         n = len(self.weight)
         return linear_systems.stationary_covariance(*self.loop)[:n, :n]
 
@@ -108,7 +108,7 @@ MOST_CONDITION = 1e14
 
 
 def _check_digits(parameters: UavAutopilotParameters, ratios: numpy.ndarray) -> None:
-    """Raise ValueError if a sensor's variance vanishes in the rounding of the predicted one.
+    """Raise ValueError if a sensor's variance is lost in the rounding of the predicted variance.
 
     Args:
         parameters: parameters of the plant.
@@ -128,7 +128,7 @@ def _check_digits(parameters: UavAutopilotParameters, ratios: numpy.ndarray) -> 
 
 @functools.lru_cache(8)  # an evaluation makes the same task for every competitor, on numbers and on symbols
 def design(parameters: UavAutopilotParameters) -> Design:
-    """Design the loop; calls with the same parameters share the arrays.
+    """Return the design of the control loop for these parameters, from a cache.
 
     Raises:
         ValueError: if the plant diverges at once, L does not stabilise it, or the sensors do not determine the state.

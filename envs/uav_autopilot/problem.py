@@ -1,4 +1,4 @@
-"""The part of UavAutopilot that world, filters and picture use: design of the loop, sensors and output."""
+"""Base class of the task UavAutopilot, used by its world, filters and picture."""
 
 from ..contract.observation import Array
 from ..contract.task import Component, Task
@@ -7,12 +7,12 @@ from .plant import Design, design
 
 
 class AutopilotProblem(Task):
-    """Design of the loop: plant, sensors, output and autopilot."""
+    """Base class of the task: plant, sensors, output, autopilot and nominal filter."""
 
     parameters: UavAutopilotParameters
 
     def set_up(self) -> None:
-        """Design the loop."""
+        """Compute the design of the control loop, and the constants of sensors and output."""
         p = self.parameters
         self.design: Design = design(p)
         self.components: tuple[Component, ...] = COORDINATES[p.plant]
@@ -32,7 +32,7 @@ class AutopilotProblem(Task):
         self._L = self.constant(self.design.feedback)
 
     def _sampling_interval(self) -> float:
-        """Return the sampling interval, that of the plant if None, s."""
+        """Return the sampling interval, s, the plant's default if the parameter is None."""
         return float(self.parameters.value("sampling_interval"))
 
     def autopilot(self, estimate: Array, command: Array) -> Array:
@@ -40,5 +40,5 @@ class AutopilotProblem(Task):
         return self.design.feedforward * command - self.xp.matmul(self._L, estimate)[0]
 
     def readings_of(self, state: Array) -> Array:
-        """Return the measured coordinates ``(m, N)`` of a state ``(n, N)``."""
+        """Return the measured coordinates ``(m, N)`` of a state ``(n, N)``, without noise."""
         return self.xp.stack([state[i] for i in self.measured])

@@ -6,7 +6,7 @@ unmanned aircraft using optimal Kalman filter". Numbers in brackets are the pape
     truth       x(k+1) = F x(k) + B u(k) + s(k+1) C_s xi + C_o eta                   (8)
     sensors     z_i(k) = x_i(k) + f_i(k) sigma_i v_i                                 (9)
     prediction  x'(k+1) = F x(k|k) + B u(k),  P' = F P F^T + g Q                     (10), (12)
-    update      with the Kalman gain of P', for the sensors that answered            (11), (12)
+    update      with the Kalman gain of P', for the available sensors                (11), (12)
     autopilot   u(k) = N r(k) - L x(k|k)
 
 ``s`` is the level of the disturbance and ``f`` that of the sensor noise, both 1 in the filter's model; the
@@ -14,7 +14,7 @@ action sets ``g``. The command r shifts the equilibrium: output r, everything el
 hold without control because they integrate.
 
 Reading: (6) prints the feedback without the command, with which a unit command ends far from one; the prediction
-takes the control in force, ``B U`` of (8) and (10), command included. Reading: the noise printed in (10) has mean zero and is unknown, so it is dropped.
+uses the current control, ``B U`` of (8) and (10), command included. Reading: the noise printed in (10) has mean zero and is unknown, so it is dropped.
 """
 
 from typing import Any, ClassVar
@@ -37,19 +37,19 @@ from .world import AircraftWorld, Measurement, Start
 
 
 def _picture(model: Model) -> Any:
-    """Return the class of the picture; imported here, because it imports matplotlib."""
+    """Return the object that draws an episode; imported here, because it needs matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Return the control that follows from the estimate, which is fed back."""
+    """Return the control that the autopilot computes from the estimate, by name."""
     return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 
 class UavAutopilot(AutopilotProblem):
-    """Steer the Kalman filter that feeds the autopilot of a small unmanned aircraft.
+    """Autopilot of a small unmanned aircraft: steer the Kalman filter in its control loop.
 
     ## Description
 
@@ -75,7 +75,7 @@ class UavAutopilot(AutopilotProblem):
 
     For each sensor the innovation over its sigma, its short average, the logarithm of the short average of
     its square, the reading, and its availability; the log NIS per reading and that of its short average;
-    the command, the control in force, the log trace of the covariance, the time, the last action.
+    the command, the current control, the log trace of the covariance, the time, the last action.
     Innovations, command, control and readings are compressed by ``sign(x) log(1 + |x|)`` in units of one
     sigma of a sensor; the logarithms of squares stop at 0.01. Sigmas are those of the filter before the action: its last covariance, predicted
     with the Q of the last action.
@@ -144,14 +144,14 @@ class UavAutopilot(AutopilotProblem):
             {
                 "noise": "the process noise Q of the filter is scaled by 10^(1.5 r a) (`process_decades`), the standard deviation of "
                 "each sensor by 10^(0.8 r a) (`sensor_decades`), r = 0.2 (`noise_reach`), in the update by the measurement that "
-                "was just shown; **0 is the paper's filter**",
+                "was just observed; **0 is the paper's filter**",
                 "gain": "the process noise Q of the filter is scaled by 10^(a/2) (`gain_decades` = 0.5) in the "
-                "update by the measurement that was just shown; **0 is the paper's filter**",
+                "update by the measurement that was just observed; **0 is the paper's filter**",
                 "hypotheses": "factors r^a in the bank over levels at this measurement: probability of the highest level of the "
                 "gusts (r = 1.1), that all noise is as designed (1.25), the process noise (2), the variance of each sensor (1.5); "
                 "**0 is the estimator `level-bank`**",
                 "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
-                "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
+                "during dropouts), zero for coordinates without a sensor; the filter continues; 3 over-smoothed, Q over 100",
             },
             {
                 "noise": ("noise_reach", "process_decades", "sensor_decades"),
@@ -169,7 +169,7 @@ class UavAutopilot(AutopilotProblem):
     )
 
     def feedback(self, mean: Array, covariance: Array, measurement: Measurement | Start) -> Array:
-        """Report the control that follows from an estimate, ``(N,)``."""
+        """Return the control that the autopilot computes from an estimate, ``(N,)``."""
         return self.autopilot(mean, measurement.command)
 
 

@@ -1,4 +1,4 @@
-"""Aircraft of UavAutopilot, its disturbances and its sensors; equations (8) and (9)."""
+"""World of UavAutopilot: the aircraft, its disturbances and its sensors; equations (8) and (9)."""
 
 import math
 from typing import Any, NamedTuple
@@ -8,7 +8,7 @@ import numpy
 from ...filters import linear_systems
 from ...filters.linear_systems import Regulator
 from ..contract.draws import Draws, StepSignal
-from ..contract.faults import Disturbances, undisturbed
+from ..contract.faults import Disturbances, draw_undisturbed
 from ..contract.observation import Array
 from ..contract.world import World
 from .disturbances import DISTURBANCES, DRAWN_FIRST, draw_steps
@@ -21,10 +21,10 @@ to be finite."""
 
 
 class Truth(NamedTuple):
-    """State of the aircraft, its noise levels and commands."""
+    """The true state of the aircraft, its noise levels and commands."""
 
     number: Array
-    """Measurements so far, ``(N,)``."""
+    """Number of measurements so far, ``(N,)``."""
     state: Array
     """State in the units of the task's components, ``(n, N)``."""
     command: Array
@@ -60,20 +60,20 @@ class Measurement(NamedTuple):
     """
 
     number: Array
-    """Measurements since the start, ``(N,)``; one comes every ``sampling_interval`` seconds."""
+    """Number of measurements since the start, ``(N,)``; one comes every ``sampling_interval`` seconds."""
     reading: Array
     """Reading of each sensor, in the unit of its coordinate, ``(m, N)``; in a dropout the last valid one, zero before
     the first. An estimator gets NaN in a dropout."""
     available: Array
     """1 where a sensor gave a reading, 0 in a dropout, ``(m, N)``."""
     command: Array
-    """r at this measurement, in the unit of the output, ``(N,)``."""
+    """Command r at this measurement, in the unit of the output, ``(N,)``."""
     control: Array
     """Control u since the previous measurement, as fed back, m/s^2 (plant P) or deg (U), ``(N,)``."""
 
 
 class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
-    """An aircraft under the control that is fed back, with gusts and sensors."""
+    """World of an aircraft under the control that is fed back, with gusts and sensors."""
 
     parameters: UavAutopilotParameters
     received_field = "reading"
@@ -106,11 +106,11 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         self.manoeuvres: int = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Return the nominal standard deviations of the sensors."""
+        """Return the nominal standard deviations of the sensors, ``(m, N)``."""
         return self.task.constant(self.parameters.value("sensor_sigmas"))[:, None] + 0.0 * measurement.reading
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
-        """Draw levels, commands and disturbances of the episode, and the initial state."""
+        """Return the drawn truth (noise levels, commands, disturbances, initial state) and the initial estimate."""
         xp, p, size = self.xp, self.parameters, len(self.task.components)
         state = self.initial_sigmas * normals[:size]
         zero = xp.zeros_like(state[0])
@@ -118,7 +118,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         levels = draw_steps(draws, "disturbance", p.disturbance_levels, p.disturbance_times, zero)
         states = self.disturbances.begin(draws, normals[size:], zero)
         states = self.disturbances.complete(states, draws)
-        calm = undisturbed(draws, p)
+        calm = draw_undisturbed(draws, p)
         if calm is not None:
             levels = levels._replace(values=xp.where(calm, 1.0, levels.values))
         if p.plant == "U":
@@ -131,16 +131,17 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
             sensor_level=xp.ones_like(xp.stack([zero] * len(self.task.sensors))),
             commands=commands,
             levels=levels,
-            disturbances=self.disturbances.quiet(states, calm),
+            disturbances=self.disturbances.switch_off(states, calm),
         )
         covariance = xp.broadcast_to(self.initial_covariance, (*self.initial_covariance.shape[:2], len(zero)))
         return truth, Start(xp.zeros_like(state), covariance, zero)
 
     def _commands(self, draws: Draws, zero: Array) -> StepSignal:
-        """Draw the command.
+        """Return the drawn command signal, a step or random manoeuvres.
 
-        In each period of random manoeuvres, at a random time, a step to a new level or a doublet
-        about the present one, with equal probability.
+        Each period of random manoeuvres has, at a random time, a step to a new level or a doublet about the present
+        one, with
+        equal probability.
         """
         xp, p = self.xp, self.parameters
         if p.step_size:
@@ -163,7 +164,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return StepSignal(xp.stack(values), xp.stack(times)[1:])
 
     def advance(self, truth: Truth, noise: Array, feedback: Array) -> tuple[Truth, Measurement]:
-        """Move the aircraft by one interval under the control, and make the measurement.
+        """Return the truth after one interval under the control that is fed back, and the measurement.
 
         Args:
             truth: truth at the previous measurement.
@@ -179,7 +180,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         state = xp.matmul(self.F, truth.state) + self.B * feedback + disturbance
         state = xp.clip(state, -FARTHEST, FARTHEST)
         further = noise[self.own_normals : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(
+        steps = self.disturbances.split_noise(
             number, self.parameters.value("sampling_interval"), *further, feedback
         )
         states = self.disturbances.advance(truth.disturbances, steps)
@@ -200,7 +201,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return truth, measurement
 
     def component_readings(self, measurement: Measurement) -> Array:
-        """Return the readings of coordinates with a sensor."""
+        """Return the readings of the coordinates with a sensor, ``(n, N)``; NaN for the others."""
         sensors = list(self.task.sensors)
         reading, nothing = self.mask_missing(measurement).reading, measurement.command * math.nan
         rows = [nothing] * len(self.task.components)
@@ -210,7 +211,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return self.xp.stack(rows)
 
     def cost(self, truth: Truth, mean: Array) -> Array:
-        """Return the weighted squares of deviation from the command's equilibrium and of the control, ``(N,)``."""
+        """Return the weighted squares of the deviation from the command's equilibrium and of the control, ``(N,)``."""
         task = self.task
         control = task.autopilot(mean, truth.command)
         total = task.design.control_weight * control * control
@@ -220,12 +221,12 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return total * (1.0 / task.cost_unit)
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
-        """Return the loss of the control from an estimate against the optimal one from the true state, ``(N,)``.
+        """Return the loss of the control from an estimate against the optimal control from the true state, ``(N,)``.
 
         ``(R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation (see :class:`.Regulator`). Of two filters
         the sums over an episode differ on average by the difference of their costs, including the value ``x^T S x`` of
         their final states. The loss excludes the costs of noise and command under any control and their variance, so
-        that the value of an action shows sooner.
+        that the effect of an action is visible sooner.
         """
         if self.optimal is None:
             return self.cost(truth, mean)
@@ -237,7 +238,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return (float(self.optimal.regret[0, 0]) / task.cost_unit) * lost * lost
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the output and the command, in the unit of the output."""
+        """Return the values to record at a measurement, by name: output and command."""
         return {
             **self.disturbances.records(truth.disturbances),
             "output": truth.state[self.task.output],
@@ -245,7 +246,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return levels, commands and dropouts with the measurements of their steps, and the other sensor errors."""
+        """Return the context by name: noise levels, commands, dropouts with their times, and sensor errors."""
         return {
             "levels": truth.levels.values,
             "level_times": truth.levels.times,

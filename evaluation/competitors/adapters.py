@@ -1,7 +1,7 @@
-"""Adapters for estimators of a single track, which the evaluation runs as if for many episodes side by side.
+"""Adapters that run an estimator of a single track for many episodes in parallel.
 
-There is one object for each episode, and each is updated in turn, which is slow. An estimator in a process of its own
-may also import this module (:data:`.isolation.SHARED`), so it imports nothing else of the package.
+There is one estimator object for each episode, and each is updated in turn, which is slow. An estimator in a separate
+process can also import this module (:data:`.isolation.SHARED`), so it imports nothing else of the package.
 """
 
 import inspect
@@ -20,10 +20,7 @@ Array = Any
 
 
 def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
-    """Select entries of the last axis of nested tuples and dictionaries of arrays, as new arrays.
-
-    One number selects one entry, without that axis.
-    """
+    """Return lanes (entries of the last axis) of nested arrays, as copies; an integer removes the axis."""
     if part is None:
         return None
     if isinstance(part, dict):
@@ -35,9 +32,7 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
 
 
 def takes_problem(maker: Any) -> bool:
-    """Return whether a class or function takes the problem: its first argument has no default, or is named task or
-    model.
-    """
+    """Return whether a maker's first argument is the task or model: it has no default, or that name."""
     try:
         first = next(iter(inspect.signature(maker).parameters.values()), None)
     except ValueError:  # for a compiled class
@@ -46,13 +41,13 @@ def takes_problem(maker: Any) -> bool:
 
 
 READINGS = ("z", "zk", "y", "meas", "measurement", "obs", "observation")
-"""Names of the first argument of ``update`` of a single-track filter, whose object contains its state."""
+"""Usual names of the first argument of ``update`` in filters of a single track whose state is in the object."""
 
 
-def check_update_order(found: Any) -> None:
-    """Raise ValueError if the arguments of ``update`` have the memory after the measurement, or no memory."""
+def check_update_order(estimator: Any) -> None:
+    """Raise ValueError if an estimator's ``update`` takes the memory after the measurement, or no memory."""
     try:
-        names = [name for name in inspect.signature(found.update).parameters if name != "self"]
+        names = [name for name in inspect.signature(estimator.update).parameters if name != "self"]
     except (AttributeError, TypeError, ValueError):  # without one, or compiled
         return
     if "memory" in names[1:]:
@@ -69,9 +64,9 @@ def check_update_order(found: Any) -> None:
 
 
 class SingleTrackEstimator(ABC):
-    """Base of single-track estimators: an :class:`.Estimator` with an object for each episode.
+    """Base class of estimators of a single track; it runs one track object for each episode.
 
-    Subclasses define how a track begins, how a measurement updates it and what it estimates. They may change a track in
+    Subclasses define :meth:`begin`, :meth:`step` and :meth:`estimate`. They may change a track in
     place. Those with random numbers must seed them for each track, so that an episode does not depend on the others.
 
     Args:
@@ -83,8 +78,9 @@ class SingleTrackEstimator(ABC):
 
     kind: ClassVar[Literal["estimator"]] = "estimator"
     state: Sequence[str] = ()
-    """Names of the numbers of the estimator's state, in order: the task's components in any order, and any others.
-    Default: the task's components in their order."""
+    """Names of the components of the estimator's state vector, in its order: those of the task in any order, and any
+    others. Default: the task's components.
+    """
 
     def __init__(self, task: "Task") -> None:
         self.task = task
@@ -100,19 +96,19 @@ class SingleTrackEstimator(ABC):
 
     @abstractmethod
     def begin(self, initial: Any) -> Any:
-        """Begin a track.
+        """Return an object for a new track, such as a filter, set to the initial estimate.
 
         Args:
-            initial: the initial estimate, without the axis of episodes; ``mean`` ``(n,)`` and ``covariance``
+            initial: initial estimate of the track, without the axis of episodes; ``mean`` ``(n,)`` and ``covariance``
                 ``(n, n)`` are those of ``state``, zero for numbers that are no component of the task.
         """
 
     @abstractmethod
     def step(self, track: Any, measurement: Any) -> Any:
-        """Predict to the time of a measurement and update with it.
+        """Predict a track to the time of a measurement and update it with the measurement.
 
         Args:
-            track: as returned by :meth:`begin` or the last call.
+            track: the track object that :meth:`begin` or the last call returned.
             measurement: the task's ``Measurement``, without the axis of episodes.
 
         Returns:
@@ -121,13 +117,13 @@ class SingleTrackEstimator(ABC):
 
     @abstractmethod
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """Return the mean, n numbers, and covariance, ``(n, n)``, of ``state``."""
+        """Return the mean, n numbers, and the covariance, ``(n, n)``, of a track's ``state``."""
 
     def reading(self, measurement: Any) -> tuple[Array, Array]:
-        """Return the measurement of a linear function of the state, ``(m,)`` or None, and its covariance, ``(m, m)``.
+        """Return the measured vector, ``(m,)`` or None, and its noise covariance, ``(m, m)``.
 
-        By default the position, for tasks whose measurement has ``position`` and ``variance``; None where it is not
-        ``available``.
+        It must be a linear function of the state. By default it is the position, for tasks whose measurement has
+        ``position`` and ``variance``; None where it is not ``available``.
 
         Raises:
             ValueError: if the measurement lacks these fields.
@@ -141,7 +137,7 @@ class SingleTrackEstimator(ABC):
         return None if missed else measurement.position, numpy.diag(measurement.variance)
 
     def start(self, initial: Any, N: int) -> list[Any]:
-        """Begin the tracks; see :meth:`.Estimator.start`."""
+        """Return a list of N new tracks; see :meth:`.Estimator.start`."""
         tracks = []
         for lane in range(N):
             own = select_lanes(initial, lane)
@@ -153,7 +149,7 @@ class SingleTrackEstimator(ABC):
         return tracks
 
     def update(self, memory: list[Any], measurement: Any) -> tuple[Array, Array, list[Any]]:
-        """Update every track in turn; see :meth:`.Estimator.update`."""
+        """Update every track; return means ``(C, N)``, covariances ``(C, C, N)`` and the tracks."""
         tracks, estimates = [], []
         for lane, track in enumerate(memory):
             moved = self.step(track, select_lanes(measurement, lane))
@@ -174,17 +170,15 @@ class SingleTrackEstimator(ABC):
 
 
 class FilterpyEstimator(SingleTrackEstimator):
-    """Base of estimators by filters of filterpy: KalmanFilter, ExtendedKalmanFilter, UnscentedKalmanFilter,
-    IMMEstimator.
+    """Base class of estimators by a filter of filterpy: Kalman, extended, unscented or IMM.
 
-    Subclasses return in :meth:`begin` a filter whose ``x`` and ``P`` are at the start of the track, of an IMMEstimator
-    those of each of its filters. For measurements at irregular times subclasses define :meth:`predict`. Where a
-    measurement is more than :meth:`reading` and the filter's H, such as with a control or in an ExtendedKalmanFilter,
-    they define :meth:`step` in filterpy's own calls.
+    Subclasses return in :meth:`begin` a filter with ``x`` and ``P`` set to the initial estimate, also in each filter of
+    an IMMEstimator. For measurements at irregular times they define :meth:`predict`. Where an update needs more than
+    :meth:`reading` and the filter's H, as with a control or in an ExtendedKalmanFilter, they define :meth:`step`.
     """
 
     def step(self, track: Any, measurement: Any) -> None:
-        """Predict, and update with the measurement and its covariance; without a measurement only predict."""
+        """Predict, and update with the measurement and its covariance; a missing measurement is only predicted."""
         z, R = self.reading(measurement)
         self.predict(track, getattr(measurement, "interval", None))
         for model in getattr(track, "filters", [track]):
@@ -198,14 +192,14 @@ class FilterpyEstimator(SingleTrackEstimator):
             track._compute_state_estimate()
 
     def predict(self, track: Any, interval: float | None) -> None:
-        """Predict to a measurement, here over ``sampling_interval``, which the filter's F and Q are for.
+        """Predict a filter to the time of a measurement; by default over the constant ``sampling_interval``.
 
         Args:
             track: filter of filterpy.
-            interval: s since the measurement before; None where the measurement does not contain it.
+            interval: time since the previous measurement, s; None where the measurement does not contain it.
 
         Raises:
-            ValueError: for another interval: a subclass sets F and Q for it first, or ``dt`` of an unscented filter.
+            ValueError: for another interval: a subclass must set F and Q for it, or ``dt`` of an unscented filter.
         """
         usual = getattr(self.task.parameters, "sampling_interval", None)
         if interval is not None and usual is not None and not math.isclose(interval, usual, rel_tol=1e-9):
@@ -216,5 +210,5 @@ class FilterpyEstimator(SingleTrackEstimator):
         track.predict()
 
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """Return ``x`` and ``P``."""
+        """Return the mean ``x`` and the covariance ``P`` of a filter."""
         return track.x, track.P

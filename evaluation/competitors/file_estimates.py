@@ -1,8 +1,8 @@
-"""Estimates in a file as a competitor: those of any other program on the same measurements.
+"""Estimates in a file as a competitor: those of another program on the same measurements.
 
 A row of the file belongs to a measurement by its track and its time. A measurement without a row has the estimate of
-the last row before it, as a user of that program would have, and is counted; before the first row the initial estimate
-applies. Soon after the last row of a track the episode is lost.
+the last row before it, and counts as missing; before the first row the initial estimate applies. Soon after the last
+row of a track the episode is lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Filter, FilterInput, Stated
+from ...envs.contract.filter import Filter, FilterInput, ReportedParts
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.logs.flight_tables import clock_seconds, describe_time
@@ -20,15 +20,17 @@ from ..storage.estimate_tables import EstimateTable, read_estimates
 from .kinds import Competitor
 
 SAME_TIME = 1e-3
-"""Largest difference of the times of a row and its measurement, s; at most a quarter of the time between two."""
+"""Largest difference of the times of a row and its measurement, s; no more than a quarter of the sampling interval."""
 ENDED = 10
-"""Sampling intervals after the last row of a track, after which it is lost: some programs estimate less often."""
+"""Number of sampling intervals after the last row of a track, after which it is lost: some programs estimate less
+often.
+"""
 LEAST_SHARE = 0.5
-"""Least share of measurements with a row: with fewer the times belong to another clock or another log."""
+"""Least share of measurements with a row; with fewer the times must belong to another clock or another log."""
 SINCE_FIRST = "since its first measurement"
-"""Name in errors of the clock that starts with a log."""
+"""Name of the clock that starts with the first measurement of a log, in error messages."""
 SHOWN = 5
-"""Number of names of tracks in an error."""
+"""Maximal number of track names in an error message."""
 
 
 class FileEstimates:
@@ -44,11 +46,11 @@ class FileEstimates:
         self.path = path
 
     def of_tracks(self, task: Task, tracks: Mapping[int, str]) -> "TrackEstimates":
-        """Read the file for the tracks of an evaluation.
+        """Read the file; return its estimates for the tracks of an evaluation.
 
         Args:
-            task: on NumPy arrays.
-            tracks: name of each by the seed of its episode.
+            task: task of the evaluation, on NumPy arrays.
+            tracks: name of each track, by the seed of its episode.
 
         Raises:
             ValueError: if it cannot be read, has other tracks or another clock, or lacks components that the cost
@@ -72,21 +74,21 @@ class FileEstimates:
 
 
 class TrackEstimates(NamedTuple):
-    """Estimates of a file for the tracks of an evaluation; plain data for any process."""
+    """Estimates of a file for the tracks of an evaluation, as plain data for any process."""
 
     table: EstimateTable
     tracks: Mapping[int, str]
     times: Mapping[str, numpy.ndarray] | None
-    """Times of the measurements of a recording by its tracks, s by the clock of the file; None for a simulation."""
+    """Times of a recording's measurements by track, s by the clock of the file; None for a simulation."""
     kind: str = "estimator"
 
     def of_episodes(self, task: Task, seeds: Sequence[int]) -> "FileTrack":
-        """Return the filter for the episodes of these seeds."""
+        """Return a filter that returns the file's estimates, for the episodes with these seeds."""
         return FileTrack(task, self, [self.tracks[seed] for seed in seeds])
 
 
 def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, numpy.ndarray] | None:
-    """Return the times of the measurements of a recording by the clock of the estimates, of each track.
+    """Return the times of a recording's measurements by track, s by the clock of the estimates; None in a simulation.
 
     Seconds may count from the first measurement of the log, or be those of the log: the clock with which most
     measurements have a row applies.
@@ -137,7 +139,7 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
 
 
 def _tolerance(task: Task) -> float:
-    """Return the largest difference of the times of a row and its measurement, s."""
+    """Return the largest permitted difference of the times of a row and its measurement, s."""
     return min(SAME_TIME, 0.25 * _usual_interval(task))
 
 
@@ -146,8 +148,9 @@ def _usual_interval(task: Task) -> float:
 
 
 def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
-    """Raise ValueError where most rows are beyond the episodes of a simulation, whose intervals are at most twice the
-    usual one.
+    """Raise ValueError if most rows are outside the times of a simulated episode.
+
+    Its intervals are at most twice the usual one.
     """
     end = (task.horizon + 1) * _usual_interval(task)
     if numpy.mean((table.time >= 0.0) & (table.time <= 2.0 * end)) < LEAST_SHARE:
@@ -163,7 +166,7 @@ def _span(times: Sequence[numpy.ndarray], clock: str) -> str:
 
 
 def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], tolerance: float) -> float:
-    """Return the share of the measurements of all tracks that have a row."""
+    """Return the share of the measurements of all tracks that have a row of the file."""
     found = total = 0
     for track, time in times.items():
         rows = numpy.sort(table.time if {*table.track} == {""} else table.time[table.track == track])
@@ -174,14 +177,14 @@ def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], toler
 
 
 class FileState(NamedTuple):
-    """Positions of the episodes in the file."""
+    """State of a :class:`FileTrack`: the present row of the file for each episode."""
 
     measurements: int
     """Number of measurements so far."""
     seconds: numpy.ndarray
     """Time of the last measurement, s, ``(N,)``."""
     row: numpy.ndarray
-    """Row of the file with the estimate, ``(N,)``; -1 before the first."""
+    """Index of the row with the present estimate, ``(N,)``; -1 before the first."""
     missing: numpy.ndarray
     """One where the file has no row for this measurement, ``(N,)``."""
     over: numpy.ndarray
@@ -190,22 +193,22 @@ class FileState(NamedTuple):
 
 
 class FileTrack(Filter[Task, Any, FileState]):
-    """A filter whose estimates are the rows of a file.
+    """Filter whose estimates are the rows of a file.
 
     Args:
         task: the estimation problem.
-        given: estimates of the file.
+        estimates: estimates of the file.
         names: name of the track of each episode.
     """
 
     in_python = True
 
-    def __init__(self, task: Task, given: TrackEstimates, names: Sequence[str]) -> None:
+    def __init__(self, task: Task, estimates: TrackEstimates, names: Sequence[str]) -> None:
         super().__init__(task)
-        table = given.table
-        self.given = given
+        table = estimates.table
+        self.estimates = estimates
         self.names: list[str] = list(names)
-        self.stated: Stated | None = Stated(table.known, table.deviations)
+        self.stated: ReportedParts | None = ReportedParts(table.known, table.deviations)
         held = {name: numpy.flatnonzero(table.track == name) for name in {*names}}
         if {*table.track.tolist()} == {""}:
             held = {name: numpy.arange(len(table.time)) for name in held}
@@ -223,31 +226,31 @@ class FileTrack(Filter[Task, Any, FileState]):
         self._interval, self._tolerance = _usual_interval(task), _tolerance(task)
 
     def start(self, initial: Any) -> FileState:
-        """Return the state before the first measurement."""
+        """Return the state before the first row."""
         width = initial.mean.shape[-1]
         none = numpy.zeros(width)
         return FileState(0, none, numpy.full(width, -1), none, none, initial)
 
-    def update(self, state: FileState, given: FilterInput) -> FileState:
-        """Find the row of each episode: the newest that is not later than the measurement."""
-        width = given.measurement[0].shape[-1]
+    def update(self, state: FileState, inputs: FilterInput) -> FileState:
+        """Return the state with each episode's newest row that is not later than the measurement."""
+        width = inputs.measurement[0].shape[-1]
         lane = numpy.minimum(numpy.arange(width), len(self.names) - 1)
-        seconds = self._times(state, given.measurement)
+        seconds = self._times(state, inputs.measurement)
         at = numpy.clip(seconds - self._begin + self._tolerance, 0.0, self._span - 0.5)
         found = numpy.searchsorted(self._keys, at + lane * self._span, side="right") - 1
         there = found >= self._first[lane]
         row = numpy.where(there, self._order[numpy.maximum(found, 0)], -1) if len(self._order) else state.row
-        fresh = there & (self.given.table.time[row] >= seconds - self._tolerance)
+        fresh = there & (self.estimates.table.time[row] >= seconds - self._tolerance)
         over = seconds > numpy.array(self._last)[lane] + (ENDED - 0.5) * self._interval
         return FileState(state.measurements + 1, seconds, row, 1.0 - fresh, 1.0 * over, state.initial)
 
     def _times(self, state: FileState, measurement: Any) -> numpy.ndarray:
-        """Return the times of the measurements, s by the clock of the file."""
+        """Return the times of the measurements in the episodes, s by the clock of the file, ``(N,)``."""
         width = measurement[0].shape[-1]
-        if self.given.times is None:
+        if self.estimates.times is None:
             interval = getattr(measurement, "interval", None)
             return state.seconds + (self._interval if interval is None else interval)
-        each = [self.given.times[name] for name in self.names]
+        each = [self.estimates.times[name] for name in self.names]
         now = [times[min(state.measurements, len(times) - 1)] for times in each]
         # Beyond the end of a shorter recording its last measurement is repeated.
         now = [
@@ -257,26 +260,26 @@ class FileTrack(Filter[Task, Any, FileState]):
         return numpy.array(now)[numpy.minimum(numpy.arange(width), len(now) - 1)]
 
     def mean(self, state: FileState) -> Array:
-        """Return the mean in the row."""
-        unknown = ~numpy.array(self.given.table.known)[:, None]
+        """Return the mean in the present row, ``(C, N)``; before the first row the initial one."""
+        unknown = ~numpy.array(self.estimates.table.known)[:, None]
         initial = numpy.where(unknown, numpy.nan, state.initial.mean)
-        return numpy.where(state.row >= 0, self.given.table.mean[:, state.row], initial)
+        return numpy.where(state.row >= 0, self.estimates.table.mean[:, state.row], initial)
 
     def covariance(self, state: FileState) -> Array:
-        """Return the covariance in the row; NaN where the file states none."""
-        unknown = ~numpy.logical_and.outer(*2 * [self.given.table.deviations])[:, :, None]
+        """Return the covariance in the present row, ``(C, C, N)``; NaN where the file contains none."""
+        unknown = ~numpy.logical_and.outer(*2 * [self.estimates.table.deviations])[:, :, None]
         initial = numpy.where(unknown, numpy.nan, state.initial.covariance)
-        return numpy.where(state.row >= 0, self.given.table.covariance[..., state.row], initial)
+        return numpy.where(state.row >= 0, self.estimates.table.covariance[..., state.row], initial)
 
     def records(self, state: FileState, measurement: Any) -> dict[str, Array]:
-        """Return the file's numbers about the measurement, and whether it has a row for it."""
+        """Return the likelihood statistics of the row by name, and whether it is missing or the track has ended."""
         numbers = {
             name: numpy.where(state.missing > 0.0, numpy.nan, values[state.row])
-            for name, values in self.given.table.likelihood.items()
+            for name, values in self.estimates.table.likelihood.items()
         }
         return {**numbers, "missing": state.missing, "lost": state.over * NO_ROW}
 
 
 def find_estimates(name: str, path: str, problem: Any, find: Any) -> Competitor:
-    """Return the competitor of ``file:PATH``."""
+    """Return the competitor for the name ``file:PATH``, with the estimates of that file."""
     return Competitor(name, FileEstimates(Path(path).absolute()))

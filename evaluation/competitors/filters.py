@@ -1,7 +1,7 @@
-"""Adapters that put an estimator, a reference or a bound in the place of a task's bank.
+"""Adapters that run an estimator, a reference or a bound as the filter of a model.
 
-Shipped estimators are filters. :func:`as_filter` makes a filter from a user's estimator, which is compiled like a bank
-if it is declared ``traceable``. Other estimators run as Python code between compiled steps of the world, and their
+Shipped estimators are filters. :func:`as_filter` makes a filter from a user's estimator. It is compiled like a bank if
+it is declared ``traceable``. Other estimators run as Python code between compiled steps of the world, and their
 memory may be any object.
 """
 
@@ -14,60 +14,60 @@ import numpy
 
 from ...compiler.namespace import NotTraceable
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, FilterInput, Likelihood, State, Stated
+from ...envs.contract.filter import Filter, FilterInput, Likelihood, ReportedParts, State
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
-from ...envs.engine.compiled import warn_of
+from ...envs.engine.compiled import warn_not_compiled
 from ...filters.small_matrices import cholesky
 from .adapters import select_lanes
 from .kinds import INFORMED_KINDS, Kind, check_competitor, compilation_key, is_program, make_competitor
 
 AFTER_MISSED = 5.0
-"""Number among :data:`..storage.dataset.FAULTS` of the reason that a missed measurement explains."""
+"""Number among :data:`..storage.dataset.FAULTS` for an estimate that is not finite after a missed measurement."""
 TRUTH_FREE_KINDS: tuple[Kind, ...] = ("estimator", "smoother")
-"""Kinds that use only the initial estimate and the measurements."""
+"""Kinds of competitors that use only the initial estimate and the measurements."""
 
 
 class AdaptedState(NamedTuple):
     """State of a user's estimator, reference or bound."""
 
     mean: Array
-    """Mean of the components, ``(C, N)``; of a bound its limit."""
+    """Mean of the components, ``(C, N)``; for a bound its limit of the mean square error."""
     covariance: Array
     """Covariance of the components, ``(C, C, N)``; None for a bound."""
     memory: Any
-    """Memory of the estimator, or None where Python code stores it."""
+    """Memory of the estimator; None where Python code stores it."""
     likelihood: Likelihood
     """Log-likelihood of the last measurement; NaN where the estimator returns none."""
 
 
 class Adapter(Filter[Task, Any, AdaptedState]):
-    """A user's estimator as a filter, see :class:`.kinds.Estimator`.
+    """Filter that calls a user's estimator, see :class:`.kinds.Estimator`.
 
     Args:
         task: the estimation problem.
-        own: the estimator, made for the task.
+        estimator: the estimator, made for the task.
     """
 
-    def __init__(self, task: Task, own: Any) -> None:
+    def __init__(self, task: Task, estimator: Any) -> None:
         super().__init__(task)
-        self.own = own
-        self.in_python: bool = not getattr(own, "traceable", False)
+        self.own = estimator
+        self.in_python: bool = not getattr(estimator, "traceable", False)
         self.has_likelihood: bool = False
         """Whether the estimator has ever returned a log-likelihood."""
 
     def start(self, initial: Any) -> AdaptedState:
-        """Start from the initial estimate."""
+        """Start the estimator with the initial estimate; return the state."""
         return self.first(initial, self.own.start(initial, initial.mean.shape[-1]))
 
     def first(self, initial: Any, memory: Any) -> AdaptedState:
-        """Return the state before the first measurement."""
+        """Return the filter's state before the first measurement, with the initial estimate and a memory."""
         return AdaptedState(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
-        """Update the estimator."""
-        answer = self.call_update(given, state.memory)
+    def update(self, state: AdaptedState, inputs: FilterInput) -> AdaptedState:
+        """Call the estimator's ``update`` with the measurement; return the state with its estimate."""
+        answer = self.call_update(inputs, state.memory)
         if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
             count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
             raise TypeError(
@@ -83,65 +83,65 @@ class Adapter(Filter[Task, Any, AdaptedState]):
 
     @property
     def fault(self) -> int:
-        """Number among ``FAULTS`` of the reason for a missing response, as of a program; 0: none."""
+        """Number among ``FAULTS`` of the reason why the program returned no estimate; 0 without a fault."""
         return getattr(self.own, "fault", 0)
 
-    def call_update(self, given: FilterInput, memory: Any) -> Any:
-        """Call the estimator's ``update``."""
-        return self.own.update(memory, given.measurement)
+    def call_update(self, inputs: FilterInput, memory: Any) -> Any:
+        """Return the result of the estimator's ``update``: mean, covariance, memory, and optionally likelihood."""
+        return self.own.update(memory, inputs.measurement)
 
     def smooth(self, measurements: Sequence[Any], states: Sequence[AdaptedState]) -> tuple[Array, Array]:
-        """Smooth the track by the smoother's method ``smooth``."""
+        """Return the smoothed means ``(C, K, N)`` and covariances ``(C, C, K, N)``, from the smoother's ``smooth``."""
         answer: tuple[Array, Array] = self.own.smooth(measurements, [state.memory for state in states])
         return answer
 
 
 class ReferenceAdapter(Adapter):
-    """A user's reference as a filter, see :class:`.kinds.Reference`."""
+    """Filter that calls a user's reference, with the truth, see :class:`.kinds.Reference`."""
 
-    def __init__(self, task: Task, own: Any) -> None:
-        super().__init__(task, own)
-        self.knows: str = getattr(own, "knows", "") or "the truth"
+    def __init__(self, task: Task, reference: Any) -> None:
+        super().__init__(task, reference)
+        self.knows: str = getattr(reference, "knows", "") or "the truth"
 
-    def initialise(self, given: FilterInput) -> AdaptedState:
-        """Start from the initial estimate, with the truth."""
-        return self.first(given.measurement, self.own.start(given.measurement, given.truth))
+    def initialise(self, inputs: FilterInput) -> AdaptedState:
+        """Start the reference with the initial estimate and the truth; return the state."""
+        return self.first(inputs.measurement, self.own.start(inputs.measurement, inputs.truth))
 
-    def call_update(self, given: FilterInput, memory: Any) -> Any:
-        """Call the reference's ``update`` with the truth."""
-        return self.own.update(memory, given.measurement, given.truth)
+    def call_update(self, inputs: FilterInput, memory: Any) -> Any:
+        """Return the result of the reference's ``update``, called with the truth."""
+        return self.own.update(memory, inputs.measurement, inputs.truth)
 
 
 class BoundAdapter(ReferenceAdapter):
-    """A bound as a filter whose mean is the limit, see :class:`.kinds.Bound`."""
+    """Filter that calls a user's bound; its mean is the limit of the mean square error, see :class:`.kinds.Bound`."""
 
     def first(self, initial: Any, memory: Any) -> AdaptedState:
-        """Return the state before the first measurement, with an infinite limit."""
+        """Return the state before the first measurement, with a limit of zero."""
         return AdaptedState(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
 
-    def call_update(self, given: FilterInput, memory: Any) -> Any:
-        """Call the bound's ``update``; there is no covariance."""
-        limit, memory = super().call_update(given, memory)
+    def call_update(self, inputs: FilterInput, memory: Any) -> Any:
+        """Return the bound's limit, None in place of a covariance, and its memory."""
+        limit, memory = super().call_update(inputs, memory)
         return limit, None, memory
 
 
-def as_filter(task: Task, own: Any, kind: Kind = "estimator") -> Filter[Any, Any, Any]:
-    """Return an estimator, reference or bound as a filter: itself, if it is one."""
-    if isinstance(own, Filter):
-        return own
+def as_filter(task: Task, competitor: Any, kind: Kind = "estimator") -> Filter[Any, Any, Any]:
+    """Return a filter that calls a user's estimator, reference or bound; a filter is returned unchanged."""
+    if isinstance(competitor, Filter):
+        return competitor
     adapters = {"reference": ReferenceAdapter, "bound": BoundAdapter}
-    return adapters.get(kind, Adapter)(task, own)
+    return adapters.get(kind, Adapter)(task, competitor)
 
 
 class PythonFilter(Filter[Task, Any, AdaptedState]):
-    """A filter that runs in Python: this object stores its state, which may be anything, and checks its estimates.
+    """Wrapper of a filter that runs in Python: it stores the filter's state and checks its estimates.
 
     Args:
         task: the estimation problem.
-        own: the filter; None beside traced steps.
-        name: kind and name, in errors.
-        count: number of episodes; lanes beyond repeat the last of them. None: all lanes as they are.
-        stated: the reported quantities, where ``own`` is None.
+        wrapped: the filter; None while the steps of the world are traced.
+        name: kind and name of the competitor, for error messages.
+        count: number of episodes; further lanes repeat the last episode. None: all lanes are used as they are.
+        stated: components that the filter reports, where ``wrapped`` is None.
     """
 
     in_python = True
@@ -149,59 +149,59 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
     def __init__(
         self,
         task: Task,
-        own: Any = None,
+        wrapped: Any = None,
         name: str = "",
         count: int | None = None,
-        stated: Stated | None = None,
+        stated: ReportedParts | None = None,
     ) -> None:
         super().__init__(task)
-        self.own = own
+        self.own = wrapped
         self.name = name
         self.count = count
-        self.stated: Stated | None = getattr(own, "stated", stated)
+        self.stated: ReportedParts | None = getattr(wrapped, "stated", stated)
         self.memory: Any = None
         self.step_number: int = 0
         self.extra: Mapping[str, Array] = {}
-        """Log-likelihood returned with its last estimate."""
-        self.knows: str = getattr(own, "knows", "")
+        """Records of the last measurement by name, such as the log-likelihood."""
+        self.knows: str = getattr(wrapped, "knows", "")
 
     @property
     def fault(self) -> int:
-        """Number among ``FAULTS`` of the reason for a program's missing response; 0: none."""
+        """Number among ``FAULTS`` of the reason why the program returned no estimate; 0 without a fault."""
         return self.own.fault if isinstance(self.own, Adapter) else 0
 
-    def _repeat_last(self, given: FilterInput) -> FilterInput:
-        """Return the copies, which may be changed in place."""
+    def _repeat_last(self, inputs: FilterInput) -> FilterInput:
+        """Return the inputs with the last episode repeated in further lanes, as copies that may be changed."""
         if self.count is None:
-            return given
-        width = given.measurement[0].shape[-1]
+            return inputs
+        width = inputs.measurement[0].shape[-1]
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
-        return given._replace(measurement=select_lanes(given.measurement, lanes))
+        return inputs._replace(measurement=select_lanes(inputs.measurement, lanes))
 
-    def initialise(self, given: FilterInput) -> AdaptedState:
-        """Start the filter and store its state."""
+    def initialise(self, inputs: FilterInput) -> AdaptedState:
+        """Start the wrapped filter with the initial estimate; return a state without its memory, stored here."""
         with explain_errors(f"{self.name} failed at the start of the track"):
-            self.memory = self.own.initialise(self._repeat_last(given))
-        initial = given.measurement
+            self.memory = self.own.initialise(self._repeat_last(inputs))
+        initial = inputs.measurement
         return AdaptedState(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
 
     def start(self, initial: Any) -> AdaptedState:
-        """Start from the initial estimate, without the truth."""
+        """Start the wrapped filter with the initial estimate, without the truth; return the state."""
         return self.initialise(FilterInput(initial))
 
-    def update(self, state: AdaptedState, given: FilterInput) -> AdaptedState:
-        """Update the filter and check its estimate.
+    def update(self, state: AdaptedState, inputs: FilterInput) -> AdaptedState:
+        """Update the wrapped filter with a measurement; return the state with its checked estimate.
 
         Raises:
-            ValueError: if its estimate is no array of the right shape.
+            ValueError: if its estimate is no array of the required shape.
         """
         self.step_number += 1
-        given = self._repeat_last(given)
+        inputs = self._repeat_last(inputs)
         with explain_errors(f"{self.name} failed at measurement {self.step_number}"):
-            self.memory = after = self.own.step(self.memory, given)
+            self.memory = after = self.own.step(self.memory, inputs)
             mean, covariance = self.own.mean(after), self.own.covariance(after)
-            self.extra = self.own.records(after, given.measurement)
-        C, width = len(self.task.components), given.measurement[0].shape[-1]
+            self.extra = self.own.records(after, inputs.measurement)
+        C, width = len(self.task.components), inputs.measurement[0].shape[-1]
         # Copies, since the estimator may change its own arrays; in their layout, on which rounding in matrix products
         # depends.
         mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
@@ -216,12 +216,12 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         return AdaptedState(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
 
     def feedback(self, state: AdaptedState, measurement: Any) -> Array | None:
-        """Return the feedback that a program has reported."""
+        """Return the feedback to the world that a program has written; None for any other filter."""
         own: Any = self.own.own if isinstance(self.own, Adapter) else None
         return own.feedback if is_program(own) else None
 
     def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
-        """Return an array of the estimate as float64; raise ValueError if it has another shape."""
+        """Return an array of the estimate as float64; raise ValueError if it has another shape or type."""
         where = f"{self.name}: the {word} at measurement {self.step_number}"
         try:
             given = numpy.asanyarray(values)
@@ -242,50 +242,51 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
 
 
 class Checked(NamedTuple):
-    """State of a filter whose estimates are checked."""
+    """State of a :class:`CheckedFilter`."""
 
     own: Any
     """State of the filter."""
     mean: Array
     """Last valid mean, ``(C, N)``; before the first the initial estimate."""
     covariance: Array
-    """``(C, C, N)``."""
+    """Last valid covariance, ``(C, C, N)``."""
     fault: Array
     """Number among ``FAULTS`` of the reason why the episode is lost, from 1 on; 0 where it is not, ``(N,)``."""
     missed: Array
-    """One where a measurement was not received in full so far, ``(N,)``."""
+    """One from the first measurement on that was not received in full, before zero, ``(N,)``."""
     missing: Array = None
-    """One where it has no estimate at this measurement and repeats its last one, ``(N,)``; None for filters that always
-    have."""
+    """One where the file of estimates has no row at this measurement, ``(N,)``; None for filters that always have an
+    estimate.
+    """
 
 
 class CheckedFilter(Filter[Task, Any, Checked]):
-    """A competing filter in the loop: missing measurements are masked, and its estimates are checked.
+    """Wrapper of a competing filter: it masks missing measurements and checks the estimates.
 
     An episode in which an estimate is not finite, or its covariance is invalid, is lost from that measurement on: the
     last valid estimate, or else the initial one, is repeated to the end. Any estimator could return that estimate
     itself, so losing an episode is no advantage.
     """
 
-    def __init__(self, task: Task, own: Filter[Any, Any, Any]) -> None:
+    def __init__(self, task: Task, wrapped: Filter[Any, Any, Any]) -> None:
         super().__init__(task)
-        self.own = own
-        self.in_python: bool = own.in_python
-        self.stated: Stated | None = own.stated
+        self.own = wrapped
+        self.in_python: bool = wrapped.in_python
+        self.stated: ReportedParts | None = wrapped.stated
 
     def start(self, initial: Any) -> Checked:
-        """Start from the initial estimate."""
+        """Return the state of the filter, started with the initial estimate."""
         zero = 0.0 * initial.mean[0]
         missing = None if self.stated is None else zero
         return Checked(self.own.start(initial), initial.mean, initial.covariance, zero, zero, missing)
 
     def predict(self, state: Checked, measurement: Any) -> Checked:
-        """Predict in the filter."""
+        """Return the state with the filter predicted to the time of the measurement."""
         return state._replace(own=self.own.predict(state.own, self.task.world.mask_missing(measurement)))
 
-    def update(self, state: Checked, given: FilterInput) -> Checked:
-        """Update the filter, check its estimate, and store the last valid one."""
-        received = self.task.world.mask_missing(given.measurement)
+    def update(self, state: Checked, inputs: FilterInput) -> Checked:
+        """Update the filter with the masked measurement and check its estimate; return the state."""
+        received = self.task.world.mask_missing(inputs.measurement)
         own = self.own.update(state.own, FilterInput(received))
         mean, covariance = self.own.mean(own), self.own.covariance(own)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
@@ -299,7 +300,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed, missing)
 
     def _stated(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Return the mean and covariance with valid numbers in place of components that the filter never reports."""
+        """Return mean and covariance with valid numbers for the components that the filter never reports."""
         if self.stated is None:
             return mean, covariance
         known, deviations = map(numpy.array, self.stated)
@@ -307,15 +308,15 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         apart = numpy.eye(len(known))[:, :, None]
         return numpy.where(known[:, None], mean, 0.0), numpy.where(both, covariance, apart)
 
-    def _held(self, lost: Array, last: Array, answer: Array) -> Array:
-        """Return the last valid estimate where the episode is lost."""
+    def _held(self, lost: Array, last: Array, estimate: Array) -> Array:
+        """Return the estimate, replaced by the last valid one where the episode is lost."""
         if self.in_python:  # a copy retains its layout, on which rounding in matrix products depends
-            answer[..., lost] = last[..., lost]
-            return answer
-        return self.xp.where(lost, last, answer)
+            estimate[..., lost] = last[..., lost]
+            return estimate
+        return self.xp.where(lost, last, estimate)
 
     def feedback(self, state: Checked, measurement: Any) -> Array | None:
-        """Return a program's feedback where it is a number and the episode not lost; elsewhere that of the estimate."""
+        """Return a program's feedback; where it is not finite or the episode is lost, that of the estimate."""
         own = self.own.feedback(state.own, measurement) if isinstance(self.own, PythonFilter) else None
         if own is None:
             return None
@@ -323,14 +324,14 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         return numpy.where(usable, own, self.task.feedback(state.mean, state.covariance, measurement))
 
     def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
-        """Return the log-likelihood of the measurement, and the reason why the episode is lost."""
+        """Return the likelihood statistics of the measurement by name, and the number of the reason for a loss."""
         likelihood = Likelihood.of_records(self.own.records(state.own, measurement)).fill_unknown(state.fault)
         missing = {} if state.missing is None else {"missing": state.missing}
         return {**likelihood._asdict(), "lost": state.fault, **missing}
 
 
 def is_lacking(received: Any, xp: Any) -> Array:
-    """Return whether a measurement contains NaN, ``(N,)``."""
+    """Return a boolean mask ``(N,)`` of lanes whose measurement contains NaN."""
     lacking: Any = False
     for _, values in named_arrays(received):
         axes = tuple(range(len(values.shape) - 1))
@@ -339,14 +340,16 @@ def is_lacking(received: Any, xp: Any) -> Array:
     return lacking
 
 
-def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp: Any) -> Array:
-    """Return the number of the fault of an estimate, or of an earlier one.
+def find_fault(mean: Array, covariance: Array, earlier_fault: Array, any_missing: Array, xp: Any) -> Array:
+    """Return the number of the fault of each estimate, ``(N,)``: not finite, not symmetric, not positive definite.
+
+    An earlier fault has priority.
 
     Args:
-        mean: ``(C, N)``.
-        covariance: ``(C, C, N)``.
-        before: number of the reason why the episode was lost earlier, ``(N,)``.
-        missed: above zero where a measurement was missing so far, ``(N,)``.
+        mean: means, ``(C, N)``.
+        covariance: covariances, ``(C, C, N)``.
+        earlier_fault: number of the reason why the episode was lost earlier, ``(N,)``; zero where it was not.
+        any_missing: above zero where a measurement was missing so far, ``(N,)``.
         xp: array namespace.
 
     Returns:
@@ -367,13 +370,13 @@ def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp:
     fault = xp.where(definite, fault, 3.0)
     fault = xp.where(finite[1], fault, 2.0)
     fault = xp.where(finite[0], fault, 1.0)
-    unreceived = (missed > 0.0) & ((fault == 1.0) | (fault == 2.0))
+    unreceived = (any_missing > 0.0) & ((fault == 1.0) | (fault == 2.0))
     fault = xp.where(unreceived, AFTER_MISSED, fault)
-    return xp.where(before > 0.0, before, fault)
+    return xp.where(earlier_fault > 0.0, earlier_fault, fault)
 
 
 class AroundBank(Filter[Task, Any, State]):
-    """A filter in the loop whose estimate is that of a bank; its state, a NamedTuple, has the bank's as ``bank``.
+    """Filter that contains a bank and returns its estimate; its state, a NamedTuple, has the field ``bank``.
 
     Attributes:
         bank: the bank whose estimate closes the loop.
@@ -382,24 +385,24 @@ class AroundBank(Filter[Task, Any, State]):
     bank: Any
 
     def predict(self, state: Any, measurement: Any) -> Any:
-        """Predict with the bank."""
+        """Return the state with the bank predicted to the time of the measurement."""
         return state._replace(bank=self.bank.predict(state.bank, measurement))
 
     def mean(self, state: Any) -> Array:
-        """Return the mean of the bank."""
+        """Return the mean of the bank's estimate, ``(C, N)``."""
         return self.bank.mean(state.bank)
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of the bank."""
+        """Return the covariance of the bank's estimate, ``(C, C, N)``."""
         return self.bank.covariance(state.bank)
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """Return the feedback of the bank."""
+        """Return the bank's feedback to the world."""
         return self.bank.feedback(state.bank, measurement)
 
 
 class LimitState(NamedTuple):
-    """State of a bound in the loop."""
+    """State of a :class:`BoundFilter`."""
 
     bank: Any
     """State of the bank, whose estimate closes the loop."""
@@ -408,61 +411,63 @@ class LimitState(NamedTuple):
 
 
 class BoundFilter(AroundBank[LimitState]):
-    """A bound in the loop beside a bank under the action zero.
+    """Filter that computes a bound while a bank with the action zero closes the loop.
 
     Args:
         task: the estimation problem.
-        own: the bound as a filter.
+        bound: the bound as a filter.
         bank: the bank whose estimate closes the loop.
     """
 
-    def __init__(self, task: Task, own: Filter[Any, Any, Any], bank: Any) -> None:
+    def __init__(self, task: Task, bound: Filter[Any, Any, Any], bank: Any) -> None:
         super().__init__(task)
-        self.own = own
+        self.own = bound
         self.bank = bank
-        self.in_python: bool = own.in_python
-        self.knows: str = own.knows or "the truth"
+        self.in_python: bool = bound.in_python
+        self.knows: str = bound.knows or "the truth"
 
-    def initialise(self, given: FilterInput) -> LimitState:
-        """Start from the initial estimate, with the truth."""
-        return LimitState(self.bank.start(given.measurement), self.own.initialise(given))
+    def initialise(self, inputs: FilterInput) -> LimitState:
+        """Return the state at the start of bank and bound; the bound receives the truth."""
+        return LimitState(self.bank.start(inputs.measurement), self.own.initialise(inputs))
 
     def start(self, initial: Any) -> LimitState:
-        """Start from the initial estimate, without the truth."""
+        """Return the state at the start of bank and bound, without the truth."""
         return self.initialise(FilterInput(initial))
 
-    def update(self, state: LimitState, given: FilterInput) -> LimitState:
-        """Update the bank, and compute the limit at this measurement."""
-        own = self.own.update(state.own, given)
+    def update(self, state: LimitState, inputs: FilterInput) -> LimitState:
+        """Update the bank with the action zero, and the bound; return the state."""
+        own = self.own.update(state.own, inputs)
         space, N = self.bank.action_space, self.own.mean(own).shape[-1]
         dtype = self.xp.int64 if isinstance(space, gymnasium.spaces.Discrete) else self.xp.float64
         neutral = self.xp.zeros((*(space.shape or ()), N), dtype=dtype)
-        return LimitState(self.bank.act(state.bank, given.measurement, neutral), own)
+        return LimitState(self.bank.act(state.bank, inputs.measurement, neutral), own)
 
     def records(self, state: LimitState, measurement: Any) -> dict[str, Array]:
-        """Return the limit."""
+        """Return the limit of the mean square error, ``(C, N)``, as ``mean_square``."""
         return {"mean_square": self.own.mean(state.own)}
 
 
-def wrap_for_loop(kind: Kind, model: Model, own: Filter[Any, Any, Any]) -> Filter[Any, Any, Any]:
-    """Return the filter for a loop: a competitor with checks, a bound beside the bank, a reference unchanged."""
+def wrap_for_loop(
+    kind: Kind, model: Model, competitor_filter: Filter[Any, Any, Any]
+) -> Filter[Any, Any, Any]:
+    """Return an estimator's filter with checks, a bound's with a bank that closes the loop, a reference's unchanged."""
     if kind == "bound":
-        return BoundFilter(model.task, own, model.filter)
-    return CheckedFilter(model.task, own) if kind in TRUTH_FREE_KINDS else own
+        return BoundFilter(model.task, competitor_filter, model.filter)
+    return CheckedFilter(model.task, competitor_filter) if kind in TRUTH_FREE_KINDS else competitor_filter
 
 
 @dataclass(frozen=True)
 class _Maker:
-    """Maker of a competitor's filter for a model; equal makers are traced once."""
+    """Function that makes a competitor's filter for a model; equal makers are traced once."""
 
     kind: Kind
     maker: Any
     """Maker of a competitor that can be traced; None for one that runs in Python."""
-    stated: Stated | None = None
-    """Reported quantities of a competitor that runs in Python."""
+    stated: ReportedParts | None = None
+    """Components that a competitor in Python reports."""
 
     def __call__(self, model: Model) -> Filter[Any, Any, Any]:
-        """Make the filter, on any arrays."""
+        """Return the competitor's filter for a model on arrays of any kind."""
         task = model.task
         own = (
             PythonFilter(task, stated=self.stated)
@@ -482,19 +487,19 @@ def _can_be_traced(maker: Any, own: Filter[Any, Any, Any]) -> bool:
     return True
 
 
-def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
-    """Check that a reference or a bound declares every disturbance of the world.
+def check_knowledge(name: str, competitor: Any, kind: Kind, task: Task) -> None:
+    """Raise ValueError unless a reference or bound lists every disturbance of the world in ``disturbances``.
 
     Args:
-        name: its name in errors.
-        own: reference or bound, see :class:`.kinds.Reference`.
+        name: its name, for error messages.
+        competitor: reference or bound, see :class:`.kinds.Reference`.
         kind: its kind.
         task: task of the world.
 
     Raises:
-        ValueError: if it does not: a new disturbance could make it worse than estimators without that knowledge.
+        ValueError: if one is missing: a new disturbance could make it worse than estimators without that knowledge.
     """
-    known = getattr(own, "disturbances", ())
+    known = getattr(competitor, "disturbances", ())
     for part in task.world.disturbances.parts if known is not None else ():
         if part.name not in known:
             raise ValueError(
@@ -506,15 +511,15 @@ def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
 def close_loop(
     model: Model, competitor: Any, kind: Kind, name: str, count: int, last: int | None = None
 ) -> Model:
-    """Return a model whose filter is a competitor.
+    """Return a model whose filter is a competitor: an estimator, smoother, reference or bound.
 
     Args:
         model: task with a bank.
         competitor: estimator, smoother, reference or bound, or a class or function that makes it.
-        kind: its kind.
-        name: its name in errors.
+        kind: kind of the competitor.
+        name: its name, for error messages.
         count: number of episodes.
-        last: number of their last measurement; None: unknown.
+        last: number of the last measurement of the episodes; None: unknown.
 
     Raises:
         ValueError: if it cannot be made, lacks a method of its kind, or is a reference that does not declare every
@@ -531,7 +536,7 @@ def close_loop(
         try:
             return model.with_filter(_Maker(kind, compilation_key(competitor)))
         except NotTraceable as error:
-            warn_of(f"{name!r} of {model.task.id}", error)
+            warn_not_compiled(f"{name!r} of {model.task.id}", error)
     looped = model.with_filter(_Maker(kind, None, own.stated))
     held = PythonFilter(model.task, own, f"{kind} {name!r}", count if kind in TRUTH_FREE_KINDS else None)
     looped.filter = wrap_for_loop(kind, model, held)

@@ -1,4 +1,4 @@
-"""Entry point of a sandboxed process, for a program or for a Python estimator.
+"""Script of a sandboxed process, which runs a program or a Python estimator.
 
 :mod:`.program_process` starts this file with the interpreter's ``-I -S``, the limit of memory in bytes, and the words
 of a program (docs/programs.md). The program is executed in a PID namespace: it sees no other process, and all its
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
     from typing import Any, BinaryIO
 
 LANES = 8
-"""The number of episodes is filled up to a multiple of this, as in the package: rounding depends on it."""
+"""Number of lanes is a multiple of this, as in the package, since rounding depends on it."""
 READ, LIST = 1 << 2, 1 << 3
 """Rights of Landlock to read a file and to list a folder."""
 RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
-"""Number of rights over files, by the version of Landlock; versions beyond the last have as many as the last."""
+"""Bit masks of all rights over files, by the version of Landlock; later versions have those of the last."""
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
-"""System calls."""
+"""Numbers of Landlock's system calls."""
 NEW_USER, NEW_PID, NEW_OTHERS = 0x10000000, 0x20000000, 0x48000000
-"""Namespaces of unshare(2); the last are those of the network and of IPC."""
+"""Flags of unshare(2) for new namespaces: users; processes; network and IPC."""
 KILL, TERMINATE = 9, 15
-"""Signals."""
+"""Numbers of the signals."""
 END_WITH_PARENT, SET_FILTER, ADOPT, NO_NEW_PRIVILEGES = 1, 22, 36, 38
-"""Of prctl(2)."""
+"""Options of prctl(2)."""
 MACHINES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
-"""Column of the table below, and number of the architecture, by the name of a machine."""
+"""Column of the table of system calls, and number of the architecture, by the name of a machine."""
 CALLS = """
 read 0 63, write 1 64, readv 19 65, writev 20 66, pread64 17 67, lseek 8 62, close 3 57, close_range 436 436,
 dup 32 23, dup2 33 -, dup3 292 24, pipe 22 -, pipe2 293 59, poll 7 -, ppoll 271 73, select 23 -, pselect6 270 72,
@@ -60,16 +60,15 @@ clock_gettime 228 113, clock_getres 229 114, clock_nanosleep 230 115, nanosleep 
 getrandom 318 278, rt_sigaction 13 134, rt_sigprocmask 14 135, rt_sigreturn 15 139, sigaltstack 131 132,
 restart_syscall 219 128, kill 62 129, tgkill 234 131, exit 60 93, exit_group 231 94
 """
-"""System calls that an estimator may make, with their numbers on both machines: reading, memory, threads, time,
-exit."""
+"""System calls that an estimator may make, with their numbers on both machines: files, memory, threads, time, exit."""
 ANY, WRITING, THREAD = 0xFFFFFFFF, os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0x10000
-"""Bits of arguments: all, to open a file for writing, and to begin a thread instead of a process."""
+"""Bit masks of arguments: all bits; those that open a file for writing; that for a thread instead of a process."""
 FORBIDDEN, MISSING, PERMITTED = 0x50001, 0x50026, 0x7FFF0000
 """Return values of a seccomp filter: EPERM, ENOSYS, and allow."""
 
 
 def enter_namespaces(libc: Any, wanted: int) -> bool:
-    """Enter namespaces of this process alone, and return whether the system permits it.
+    """Move this process into new namespaces; return whether the system permits it.
 
     A process without the privilege enters a namespace of users first.
 
@@ -93,8 +92,11 @@ def enter_namespaces(libc: Any, wanted: int) -> bool:
     return True
 
 
-def leave_to_child(libc: Any, apart: bool) -> None:
-    """Continue as a child process; the parent waits for it, ends its remaining children, and exits with its status."""
+def continue_in_child(libc: Any, apart: bool) -> None:
+    """Fork and continue in the child; the parent waits for it and exits with its status.
+
+    The parent ends its other children before.
+    """
     libc.prctl(ADOPT, 1, 0, 0, 0)
     if (child := os.fork()) == 0:
         libc.prctl(END_WITH_PARENT, KILL, 0, 0, 0)
@@ -113,14 +115,14 @@ def leave_to_child(libc: Any, apart: bool) -> None:
         os._exit(128 - code if code < 0 else code)
     end_children()
     if 0 < (number := -code if code < 0 else code - 128) < 32:
-        limit_own("RLIMIT_CORE", 0)
+        limit_resource("RLIMIT_CORE", 0)
         libc.signal(number, None)
         os.kill(os.getpid(), number)
     os._exit(code)
 
 
-def limit_own(name: str, most: int) -> None:
-    """Limit a resource of this process, unless a lower limit is in force."""
+def limit_resource(name: str, most: int) -> None:
+    """Set the limit of a resource of this process, unless it is lower already."""
     import resource
 
     kind = getattr(resource, name)
@@ -129,7 +131,7 @@ def limit_own(name: str, most: int) -> None:
 
 
 def end_children() -> int:
-    """End the children of this process, and theirs, which become its own; returns zero."""
+    """Kill all descendants of this process; return zero."""
     own = os.getpid()
     while True:
         try:
@@ -146,7 +148,7 @@ def end_children() -> int:
 
 
 def landlock_version() -> int:
-    """Return the version of Landlock that this system has; zero or less: none."""
+    """Return the version of Landlock that this system supports; zero or less: none."""
     if sys.platform != "linux":
         return 0
     version: int = ctypes.CDLL(None, use_errno=True).syscall(CREATE_RULESET, None, ctypes.c_size_t(0), 1)
@@ -154,13 +156,13 @@ def landlock_version() -> int:
 
 
 def restrict_files(libc: Any, version: int, readable: list[str], listable: list[str]) -> None:
-    """Restrict this process by Landlock to reading some files and writing none.
+    """Restrict this process by Landlock to reading some files and writing no file.
 
     Args:
         libc: the C library.
         version: version of Landlock.
-        readable: files and folders that may be read, with everything below them.
-        listable: folders of which the names may be read, with those of all folders below them.
+        readable: files and folders that may be read, with all below them.
+        listable: folders whose lists of names may be read, with those of all folders below them.
     """
     rights = RIGHTS[min(version, max(RIGHTS))]
     # Files; to bind and to connect, from version 4 on; abstract sockets and signals, from 6 on.
@@ -183,7 +185,7 @@ def restrict_files(libc: Any, version: int, readable: list[str], listable: list[
 
 
 def filter_calls(libc: Any) -> bool:
-    """Restrict this process permanently to the system calls of the table, and return whether the system supports it."""
+    """Permit this process only the system calls of the table (seccomp); return whether the system supports it."""
     import struct
 
     column, machine = MACHINES.get(os.uname().machine, (0, 0))
@@ -219,13 +221,13 @@ def filter_calls(libc: Any) -> bool:
     return bool(libc.prctl(SET_FILTER, 2, struct.pack("HP", len(code), ctypes.addressof(content)), 0, 0) == 0)
 
 
-def wall(readable: list[str], listable: list[str], apart: bool) -> str:
-    """Restrict this process permanently, and return one sentence on what remains possible; empty if nothing does.
+def restrict_process(readable: list[str], listable: list[str], apart: bool) -> str:
+    """Restrict this process permanently; return a sentence on the remaining gaps, empty if there are none.
 
     Args:
-        readable: files and folders that may be read, with everything below them.
-        listable: folders of which the names may be read, with those of all folders below them.
-        apart: whether the process is in namespaces of its own.
+        readable: files and folders that may be read, with all below them.
+        listable: folders whose lists of names may be read, with those of all folders below them.
+        apart: whether the process is in its own namespaces.
     """
     version, filtered = landlock_version(), False
     if sys.platform == "linux":
@@ -235,7 +237,7 @@ def wall(readable: list[str], listable: list[str], apart: bool) -> str:
             restrict_files(libc, version, readable, listable)
         filtered = filter_calls(libc)
         if not (apart or filtered):
-            limit_own("RLIMIT_NPROC", 0)
+            limit_resource("RLIMIT_NPROC", 0)
     missing = {"Landlock": version > 0, "a filter of system calls": filtered, "namespaces": apart or filtered}
     gaps = {
         "read any file, the package's among them": version > 0,
@@ -252,7 +254,7 @@ def wall(readable: list[str], listable: list[str], apart: bool) -> str:
 
 
 class SharedModules:
-    """Finder and loader of the modules that a request contains as text, and of the packages around them.
+    """Finder and loader of modules whose source texts are in the request, and of the packages that contain them.
 
     Args:
         texts: source texts by the names of modules.
@@ -265,21 +267,21 @@ class SharedModules:
         self.new: Any = ModuleSpec
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Find a module that is shared, or a package around one."""
+        """Return the spec of a module in the request, or of a package that contains one; else None."""
         around = any(shared.startswith(name + ".") for shared in self.texts)
         return self.new(name, self, is_package=around) if around or name in self.texts else None
 
     def create_module(self, spec: ModuleSpec) -> None:
-        """Return None: Python makes the module."""
+        """Return None, so that Python makes the module."""
 
     def exec_module(self, module: ModuleType) -> None:
-        """Run the text of a module; that of a package is empty."""
+        """Execute the source text of a module; that of a package is empty."""
         name = module.__name__
         exec(compile(self.texts.get(name, ""), name, "exec", dont_inherit=True), module.__dict__)
 
 
-def nested(values: dict[str, Any], name: str) -> Any:
-    """Return a NamedTuple of arrays by their names, whose dots lead into further ones."""
+def nested_tuple(values: dict[str, Any], name: str) -> Any:
+    """Return a NamedTuple of arrays from a mapping by name; dots in names separate nested NamedTuples."""
     from collections import namedtuple
 
     parts: dict[str, Any] = {}
@@ -289,23 +291,25 @@ def nested(values: dict[str, Any], name: str) -> Any:
             parts.setdefault(first, {})[rest] = value
         else:
             parts[first] = value
-    held = {key: nested(value, key) if isinstance(value, dict) else value for key, value in parts.items()}
+    held = {
+        key: nested_tuple(value, key) if isinstance(value, dict) else value for key, value in parts.items()
+    }
     return namedtuple(name.capitalize(), list(held))(**held)
 
 
 class Parameters:
-    """The constants of the task."""
+    """The task's constants as attributes."""
 
     def __init__(self, **values: Any) -> None:
         self.__dict__.update(values)
 
     def value(self, name: str) -> Any:
-        """Return the value of a constant."""
+        """Return the value of a constant by its name."""
         return getattr(self, name)
 
 
 def make_task(hello: dict[str, Any], numpy: ModuleType) -> Any:
-    """Return the object that the constructor of an estimator receives in place of the task."""
+    """Return an object with the task's constants and components, which an estimator receives instead of the task."""
     from types import SimpleNamespace
 
     parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in hello["parameters"].items()}
@@ -321,7 +325,7 @@ def make_task(hello: dict[str, Any], numpy: ModuleType) -> Any:
 
 
 class Frames:
-    """Reader of the frames that a hello announces."""
+    """Reader of binary messages (frames) with the layout that the hello describes."""
 
     def __init__(self, hello: dict[str, Any], numpy: ModuleType, channel: BinaryIO) -> None:
         self.hello = hello
@@ -349,11 +353,11 @@ class Frames:
             part = rows[place : place + count].reshape(*shape, self.lanes)
             values[own["name"]] = numpy.array(part, dtype=own["type"], order="C")
             place += count
-        return nested(values, name)
+        return nested_tuple(values, name)
 
 
-def load(request: dict[str, Any]) -> Any:
-    """Return the class that a request names."""
+def load_estimator(request: dict[str, Any]) -> Any:
+    """Execute the estimator's source text in a request; return the class that the request names."""
     from types import ModuleType
 
     module = ModuleType(request["module"])
@@ -368,18 +372,18 @@ def load(request: dict[str, Any]) -> Any:
     return found
 
 
-def make(found: Any, task: Any) -> Any:
-    """Make an estimator of its class, with the task if the constructor takes an argument."""
+def make_estimator(cls: Any, task: Any) -> Any:
+    """Return an estimator of a class, made with the task if the constructor takes an argument."""
     from filtergym.evaluation.competitors.adapters import check_update_order, takes_problem
 
-    check_update_order(found)
-    if not isinstance(found, type):
-        return found
-    return found(task) if takes_problem(found) else found()
+    check_update_order(cls)
+    if not isinstance(cls, type):
+        return cls
+    return cls(task) if takes_problem(cls) else cls()
 
 
 def run_program(words: list[str]) -> None:
-    """Replace this process by a program."""
+    """Replace this process by a program, with exec."""
     for number in (13, 25):  # SIGPIPE and SIGXFSZ, which Python ignores
         ctypes.CDLL(None).signal(number, None)
     try:
@@ -390,38 +394,38 @@ def run_program(words: list[str]) -> None:
 
 
 def main(memory: str, *words: str) -> None:
-    """Run a program or one estimator.
+    """Run a program or one estimator in a sandbox.
 
     Args:
         memory: limit of address space in bytes; 0: none. Only Linux applies it.
-        words: of the program.
+        words: the program and its arguments; without any an estimator is run.
     """
     apart = False
     if sys.platform == "linux":
         if int(memory):
-            limit_own("RLIMIT_AS", int(memory))
+            limit_resource("RLIMIT_AS", int(memory))
         libc = ctypes.CDLL(None, use_errno=True)
         apart = enter_namespaces(libc, NEW_PID if words else NEW_PID | NEW_OTHERS)
         libc.prctl(END_WITH_PARENT, TERMINATE, 0, 0, 0)
         for _ in range(1 + apart):  # the first one of a namespace only waits
-            leave_to_child(libc, apart)
-    run_program([*words]) if words else serve(apart)
+            continue_in_child(libc, apart)
+    run_program([*words]) if words else serve_estimator(apart)
 
 
-def serve(apart: bool) -> None:
-    """Run one estimator, inside or outside namespaces of its own."""
+def serve_estimator(apart: bool) -> None:
+    """Run one estimator: read measurements from standard input, and write estimates to standard output."""
     import json
 
     questions, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # an estimator's prints go to standard error, not into the answers
     request, hello = json.loads(questions.readline()), json.loads(questions.readline())
-    gaps = wall(request["readable"], request["listable"], apart)
+    gaps = restrict_process(request["readable"], request["listable"], apart)
     sys.path[:] = request["path"]
     sys.meta_path.insert(0, SharedModules(request["shared"]))
     import numpy
 
     try:
-        own = make(load(request), make_task(hello, numpy))
+        own = make_estimator(load_estimator(request), make_task(hello, numpy))
     except Exception as error:  # a module is a program: it can raise anything
         response: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
     else:

@@ -1,4 +1,4 @@
-"""Python estimators in a process of their own, which receives the measurements and nothing else.
+"""Python estimators in a sandboxed process, which receives only the measurements.
 
 This module composes the request for :mod:`.isolated_estimator`: the text of the estimator, which this process never
 executes, the paths that the other process may read (Python's library, the installed packages but this one, and the
@@ -20,11 +20,11 @@ from .kinds import Competitor
 from .programs import LIMITS, Program
 
 ISOLATED = "isolated:"
-"""Prefix of ``module:Class`` for an estimator in a process of its own."""
+"""Prefix of the name ``module:Class`` of an estimator that runs in its own process."""
 SHARED = ("adapters", "evaluation.competitors.adapters", "evaluation.competitors.stone_soup")
-"""Modules of this package that an isolated estimator may import: they contain no world and no seed."""
+"""Modules of this package that an isolated estimator can import: they contain neither the world nor a seed."""
 INIT = "__init__.py"
-"""Name of the file in each folder of this package."""
+"""Name of the file in the folder of each package."""
 SYSTEM = (
     "/lib",
     "/lib64",
@@ -35,13 +35,15 @@ SYSTEM = (
     "/dev/null",
     "/dev/urandom",
 )
-"""Files and folders that libraries read."""
+"""Files and folders of the system that libraries read."""
 ONE_THREAD = tuple((name, "1") for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"))
-"""Variables for one thread: no thread starts before the restrictions, and products round as in this process."""
+"""Environment variables for one thread: no thread starts before the restrictions, and matrix products round as in this
+process.
+"""
 
 
 def isolate_estimator(name: str) -> Program:
-    """Return the program that runs the estimator of a user's module in a process of its own.
+    """Return a program that runs the estimator class of a user's module in a sandboxed process.
 
     Args:
         name: ``module:Class``, of a module in one file.
@@ -61,13 +63,13 @@ def isolate_estimator(name: str) -> Program:
 
 
 def isolate_source(text: str, attribute: str, name: str, file: Path | None = None) -> Program:
-    """Return the program that runs the estimator of a source text in a process of its own.
+    """Return a program that runs the estimator class of a source text in a sandboxed process.
 
     Args:
         text: source text of its module.
         attribute: name of its class.
-        name: its name in errors.
-        file: file of the text, if there is one; its folder may be read.
+        name: name of the competitor, for error messages.
+        file: file of the text, if there is one; the process can read its folder.
     """
     folder = [] if file is None else [str(file.parent.absolute())]
     libraries = _libraries()
@@ -98,7 +100,7 @@ def isolate_source(text: str, attribute: str, name: str, file: Path | None = Non
 
 
 def _libraries() -> list[str]:
-    """Return the folders of Python's library and of installed packages, in the order in which they are searched."""
+    """Return the paths of Python's library and of installed packages, in the order of the search."""
     own = [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
     extensions = [str(Path(place) / "lib-dynload") for place in own]
     packages = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
@@ -106,14 +108,14 @@ def _libraries() -> list[str]:
 
 
 def _shared_modules() -> dict[str, str]:
-    """Return the texts of the modules that an isolated estimator may import, by their names."""
+    """Return the source texts of the modules that an isolated estimator can import, by their names."""
     package = __name__.partition(".")[0]
     specs = [find_spec(f"{package}.{name}") for name in SHARED]
     return {spec.name: Path(str(spec.origin)).read_text(encoding="utf-8") for spec in specs if spec}
 
 
 def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
-    """Yield a folder, or where it contains forbidden paths, all other paths in it, at any depth."""
+    """Yield the paths below a folder without forbidden ones; the folder itself if it contains none."""
     real = place.resolve()
     if not real.exists() or any(real.is_relative_to(other) for other in forbidden):
         return
@@ -125,5 +127,5 @@ def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
 
 
 def find_isolated(name: str, inner: str, problem: Any, find: Any) -> Competitor:
-    """Return the competitor of ``isolated:module:Class``."""
+    """Return the competitor for the name ``isolated:module:Class``."""
     return Competitor(name, isolate_estimator(inner))

@@ -1,4 +1,4 @@
-"""Protocols and bases of policies, estimators, smoothers, references and bounds.
+"""Protocols and base classes of policies, estimators, smoothers, references and bounds.
 
 A **policy** observes and returns actions; learned or classical, it has Stable-Baselines3's method ``predict``. An
 **estimator** receives what a policy's filters receive, the initial estimate and every measurement, and returns mean and
@@ -24,15 +24,15 @@ from .adapters import check_update_order, takes_problem
 
 Kind = Literal["policy", "estimator", "smoother", "reference", "bound"]
 RANKED: tuple[Kind, ...] = ("policy", "estimator")
-"""Kinds that are ranked: they know nothing hidden, and nothing before it is measured."""
+"""Kinds of competitors that are ranked: they use only the measurements so far."""
 INFORMED_KINDS: tuple[Kind, ...] = ("reference", "bound")
-"""Kinds that may know more than is measured; their attribute ``knows`` describes it."""
+"""Kinds of competitors that can use the truth; their attribute ``knows`` describes what they use."""
 NOT_CAUSAL = "Not causal, with later measurements"
 """Words before the names of smoothers in every report."""
 
 
 class Competitor(NamedTuple):
-    """A competitor by its name in a problem."""
+    """Name and maker of a competitor in an evaluation."""
 
     name: str
     maker: Any
@@ -40,27 +40,31 @@ class Competitor(NamedTuple):
     learned: bool = False
     """Whether it was trained."""
     identity: str | None = None
-    """Words that change whenever the maker does; None where such a change cannot be recognised."""
+    """Text that changes whenever the maker does; None where a change cannot be recognised."""
     log: Any = None
-    """How the log was read that the competitor was fitted to (:class:`.envs.contract.log_format.LogSetup`), or None."""
+    """Settings with which the log was read that the competitor was fitted to
+    (:class:`.envs.contract.log_format.LogSetup`), or None.
+    """
 
 
 class CompetitorFiles(NamedTuple):
-    """Functions that find and load competitors stored in files and folders."""
+    """Functions that find and load competitors from files and folders."""
 
     find: Callable[[str, Any, bool, Callable[[str, str], Competitor]], Competitor | None]
-    """The competitor of a name in a problem, or None. Also takes whether to load files that can execute code, and a
-    function that returns the shipped competitor of a name; its second argument names the thing in errors."""
+    """Function that returns the competitor of a name in a problem, or None. Its other arguments: whether files that
+    can execute code are loaded, and a function that returns a shipped competitor by its name and a description for
+    errors.
+    """
     endings: Sequence[str]
-    """Endings of the names of such files."""
+    """Endings of the names of files of competitors."""
     names: Callable[[str], list[str]] = lambda id: []
-    """Names of the shipped competitors of a Gymnasium id."""
+    """Function from a Gymnasium id to the names of the environment's shipped competitors."""
     adopt: Callable[[Any], Any] = lambda found: found
-    """Wraps an object of a known library in its adapter, and returns other objects unchanged."""
+    """Function that wraps an object of a known library in its adapter, and returns other objects unchanged."""
 
 
 def kind_of(competitor: Any) -> Kind:
-    """Return the kind of a competitor, or of the competitors that a maker makes."""
+    """Return the kind of a competitor, or of the competitors that a maker makes, as a string."""
     estimates = _has(competitor, "start", "update") and (
         is_filter(competitor) or not hasattr(competitor, "predict")
     )
@@ -68,14 +72,14 @@ def kind_of(competitor: Any) -> Kind:
 
 
 def is_filter(competitor: Any) -> bool:
-    """Return whether it is a filter, or makes one; :func:`.filters.as_filter` wraps other estimators in a filter."""
+    """Return whether a competitor is a :class:`.Filter`, or its maker makes one."""
     made = getattr(competitor, "func", competitor)
     return issubclass(made if isinstance(made, type) else type(made), Filter)
 
 
-def is_program(found: Any) -> bool:
-    """Return whether it computes in a process of its own, which reports its time."""
-    return getattr(found, "is_program", False) is True
+def is_program(competitor: Any) -> bool:
+    """Return whether a competitor runs a program in a separate process, which reports its own processor time."""
+    return getattr(competitor, "is_program", False) is True
 
 
 def _has(found: Any, *methods: str) -> bool:
@@ -83,12 +87,12 @@ def _has(found: Any, *methods: str) -> bool:
 
 
 def make_competitor(maker: Any, problem: Task | Model) -> Any:
-    """Make a competitor for a problem.
+    """Return the competitor that a maker makes for a problem; an object that is no maker is returned unchanged.
 
     Args:
         maker: a class or function that takes the problem, or nothing; or the competitor itself. One whose first
             argument has a default is called without arguments, unless that argument is named ``task`` or ``model``.
-        problem: for a policy the model that it acts in, for any other kind the task.
+        problem: the model for a policy, the task for any other kind.
     """
     if not callable(maker):
         return maker
@@ -96,47 +100,44 @@ def make_competitor(maker: Any, problem: Task | Model) -> Any:
 
 
 def is_made_for_episodes(competitor: Any) -> bool:
-    """Return whether a competitor, such as one from a file, is made for given episodes.
-
-    Such a competitor has ``of_episodes(task, seeds)``, which makes the competitor for the episodes of these seeds.
-    """
+    """Return whether a competitor, such as a file of estimates, has ``of_episodes(task, seeds)``."""
     return _has(competitor, "of_episodes")
 
 
-def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
-    """Check that an object that a user has named or made can compete, and return it; it is not called yet.
+def check_competitor(name: str, competitor: Any, kind: Kind | None = None) -> Any:
+    """Return a user's competitor unchanged, after a check that it has the methods of its kind.
 
     Args:
         name: its name in the table of results.
-        found: a competitor, or a class of one.
-        kind: as which it must compete; default: its own.
+        competitor: a competitor, or its class.
+        kind: required kind; default: its own.
 
     Raises:
         ValueError: if it lacks a method of its kind: ``predict``, or ``start`` and ``update``, and ``smooth`` of a
             smoother; or if its ``update`` takes the memory after the measurement.
     """
-    kind = kind or kind_of(found)
+    kind = kind or kind_of(competitor)
     methods = {"policy": ("predict",), "smoother": ("start", "update", "smooth")}.get(
         kind, ("start", "update")
     )
-    if kind not in get_args(Kind) or not _has(found, *methods):
+    if kind not in get_args(Kind) or not _has(competitor, *methods):
         too = ", a smoother smooth too" if kind == "smoother" else ""
         raise ValueError(
             f"{name!r} is no competitor: a policy has a method predict, an estimator the methods start and update{too}"
         )
     try:
-        check_update_order(found)
+        check_update_order(competitor)
     except ValueError as error:
         raise ValueError(f"{name!r}: {error}") from None
-    return found
+    return competitor
 
 
 def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
-    """Copy the spaces of an inner model to the policy around it, so that both are called alike.
+    """Copy the spaces of an inner model to the policy that wraps it.
 
     Args:
         outer: the policy.
-        inner: for example a model of Stable-Baselines3.
+        inner: the model that it calls, for example one of Stable-Baselines3.
         further: other attributes to copy where the inner model has them.
     """
     for name in ("observation_space", "action_space", *further):
@@ -145,7 +146,7 @@ def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
 
 
 class Policy:
-    """Base of the classical policies, batch first: observations and actions are ``(N, ...)``, as in Gymnasium.
+    """Base class of classical policies; observations and actions are ``(N, ...)``, batch first, as in Gymnasium.
 
     A policy is made for a model, and deterministic unless documented otherwise. Filters have the batch last; where a
     policy acts inside a filter, :mod:`.steered_filter` transposes the axes.
@@ -156,7 +157,7 @@ class Policy:
 
     kind: ClassVar[Kind] = "policy"
     control: ClassVar[str]
-    """The control that the policy's actions are meant for."""
+    """Name of the control for which the policy's actions are made."""
     traceable: ClassVar[bool] = False
     """Whether :meth:`act` is compiled where the steps of the model are: it computes with NumPy alone, no value decides
     what is executed, its memory is nested tuples of arrays, batch first, of which only the values depend on the
@@ -167,12 +168,7 @@ class Policy:
         self.task: Any = model.task
 
     def begin(self, seeds: Sequence[int]) -> Any:
-        """Return the memory at the start of the episodes with these seeds, for the first :meth:`predict` of an
-        evaluation.
-
-        A policy with random numbers draws them from the seeds, so that an episode does not depend on the others beside
-        it.
-        """
+        """Return the policy's memory at the start of episodes; random numbers must be drawn from their seeds."""
         return None
 
     def predict(
@@ -182,16 +178,16 @@ class Policy:
         episode_start: numpy.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[numpy.ndarray, Any]:
-        """Choose actions.
+        """Return the actions for a batch of observations, and the memory for the next call.
 
         Args:
             observation: ``(N, len(model.fields))``, or one observation without the batch axis.
-            state: as returned by the last call; None at the first.
-            episode_start: ``(N,)`` booleans, true where a new episode begins.
+            state: memory that the last call returned; None at the first call.
+            episode_start: mask of new episodes, ``(N,)`` booleans.
             deterministic: as in Stable-Baselines3; classical policies ignore it.
 
         Returns:
-            Actions, batch first, and the state for the next call.
+            Actions, batch first, and the memory for the next call.
         """
         single = observation.ndim == 1
         batch = observation[None] if single else observation
@@ -202,22 +198,23 @@ class Policy:
         return (action[0] if single else action), state
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the actions of a batch and the memory; ``start`` is true where memory must be reset."""
+        """Return the actions of a batch and the memory; ``start`` marks the episodes whose memory must be reset."""
         raise NotImplementedError
 
 
 def compilation_key(maker: Any) -> Any:
-    """Return the key of compiled code in its cache: the maker of the competitor; for a function, which may make a
-    different one next time, a new object.
+    """Return the key under which a competitor's compiled code is cached.
+
+    It is the maker; for a function, which may make another competitor next time, a new object.
     """
     return functools.partial(maker) if isinstance(maker, types.FunctionType) else maker
 
 
 def is_traceable(policy: Any) -> bool:
-    """Return whether a policy declares that its methods can be traced.
+    """Return whether a policy declares that its methods can be traced and compiled.
 
-    The declaration must stand in the object, or in the class that defines the methods or one derived from it: it does
-    not hold for methods that a subclass replaces.
+    The declaration must be in the object, or in the class that defines the methods or one derived from it: it does
+    not apply to methods that a subclass replaces.
     """
     own = getattr(policy, "__dict__", {})
     if "traceable" in own:
@@ -231,14 +228,13 @@ def is_traceable(policy: Any) -> bool:
 
 
 class FunctionPolicy(Policy):
-    """Policy that computes its actions by a function of the observation, to evaluate an agent of any library.
+    """Policy that calls a function of the observation, to evaluate an agent of any library.
 
     Args:
-        function: takes observations ``(N, fields)`` and returns actions, batch first, as an array or a tensor on the
-            CPU.
-        control: the control that the actions are for; default: the environment's first.
+        function: function from observations ``(N, fields)`` to actions, batch first, an array or a tensor on the CPU.
+        control: name of the control of the actions; default: the environment's first.
         task_keywords: parameters of the task that the policy requires, such as :attr:`.SteppingPolicy.task_keywords` of
-            the policy that it copies; default: only those of the evaluation.
+            an agent; default: only those of the evaluation.
     """
 
     def __init__(
@@ -253,18 +249,18 @@ class FunctionPolicy(Policy):
             self.control = control  # type: ignore[misc]  # of the function, not of the class
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Call the function."""
+        """Return the function's actions for a batch of observations; it has no memory."""
         return host_array(self.function(observation)), None
 
 
 class ConstantPolicy(Policy):
-    """Policy with one constant action."""
+    """Policy that always returns the same action."""
 
     traceable = True
     action: tuple[float, ...]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Repeat the action for every episode."""
+        """Return the constant action for every episode, ``(N, A)``; it has no memory."""
         return numpy.tile(1.0 * numpy.asarray(self.action), (len(observation), 1)), None
 
 
@@ -273,12 +269,12 @@ DRAWN_AT_ONCE = 32
 
 
 class RandomActions:
-    """Random actions of episodes side by side, drawn by one generator for each episode.
+    """Random actions of parallel episodes, with a random generator for each episode.
 
     Several decisions are drawn in one call; the numbers equal those of one draw after another.
 
     Args:
-        generators: one for each episode.
+        generators: random generators, one for each episode.
         space: Gymnasium space of one action.
     """
 
@@ -287,7 +283,7 @@ class RandomActions:
         self._drawn: list[numpy.ndarray] = []
 
     def next(self) -> numpy.ndarray:
-        """Return the actions of the next decision, one row for each episode."""
+        """Return the random actions of the next decision, one row for each episode."""
         if not self._drawn:
             space = self._space
             each: list[numpy.ndarray]
@@ -301,7 +297,7 @@ class RandomActions:
 
 
 class RandomPolicy(Policy):
-    """Policy of uniformly random actions; every policy should have a lower cost."""
+    """Policy of uniformly random actions."""
 
     seed = 0
 
@@ -310,24 +306,24 @@ class RandomPolicy(Policy):
         self.control: str = model.control  # type: ignore[misc]  # it suits every control
 
     def begin(self, seeds: Sequence[int]) -> RandomActions:
-        """Make a generator for every episode from the policy's seed and the episode's."""
+        """Return the random actions of the episodes, with a generator for each, seeded by policy and episode."""
         generators = [numpy.random.default_rng([self.seed, seed]) for seed in seeds]
         return RandomActions(generators, self.model.action_space)
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Draw actions from the action space, each row by the generator of its episode."""
+        """Return random actions of the action space, each row by the generator of its episode."""
         actions = self.begin(range(len(observation))) if state is None else state
         return actions.next(), actions
 
 
 class Estimator(Protocol):
-    """Protocol of a user's estimator, batch last: any object with these two methods, for arrays ``(..., N)``.
+    """Protocol of a user's estimator: any object with these two methods, for arrays ``(..., N)`` of N episodes.
 
     A class is made for the task if its constructor takes an argument: ``task.parameters`` contains every constant,
     ``task.components`` the estimated components with their units. Nothing else of the task is needed.
 
-    N episodes are estimated side by side. N is a multiple of eight: the last episode is
-    repeated to fill up, so that rounding in matrix products does not depend on the number of episodes.
+    N is a multiple of eight: the last episode is repeated in further lanes (parallel episodes), so that rounding in
+    matrix products does not depend on the number of episodes.
     """
 
     kind: ClassVar[Kind] = "estimator"
@@ -337,7 +333,7 @@ class Estimator(Protocol):
     stores nothing. Other estimators run as Python code."""
 
     def start(self, initial: Any, N: int) -> Any:
-        """Return the memory at the start of the track.
+        """Return the estimator's memory at the start of N episodes.
 
         Args:
             initial: the initial estimate given to every filter: :class:`~filtergym.envs.contract.filter.Initial` or a
@@ -346,11 +342,11 @@ class Estimator(Protocol):
         """
 
     def update(self, memory: Any, measurement: Any) -> tuple[Array, Array, Any]:
-        """Return the estimate after a measurement.
+        """Return mean, covariance and memory after a measurement, for N episodes.
 
         Args:
-            memory: as returned by the last call.
-            measurement: the task's ``Measurement``, arrays with N as their last axis; not to be changed in place.
+            memory: memory that the last call or :meth:`start` returned.
+            measurement: the task's ``Measurement``, arrays with N as their last axis; do not change them in place.
 
         Returns:
             Mean ``(C, N)`` and covariance ``(C, C, N)`` of the task's components in their units, and the memory. A
@@ -361,20 +357,20 @@ class Estimator(Protocol):
 
 
 class Smoother(Estimator, Protocol):
-    """Protocol of an estimator that estimates each time with all measurements, or with those of some scans later.
+    """Protocol of an estimator that estimates each time with later measurements, too.
 
     It runs forward like any estimator, and :meth:`smooth` then receives all its memories. It declares ``kind =
-    "smoother"``; without that declaration an estimator with a method ``smooth`` is evaluated by its causal estimates. A
+    "smoother"``; without it an estimator with a method ``smooth`` is evaluated by its causal estimates. A
     closed loop, where the estimate decides what is measured next, raises an error for a smoother.
     """
 
     kind: ClassVar[Kind] = "smoother"
 
     def smooth(self, measurements: Sequence[Any], memories: Sequence[Any]) -> tuple[Array, Array]:
-        """Return the smoothed estimates, after the last measurement.
+        """Return the smoothed means and covariances at all measurements, after the last one.
 
         Args:
-            measurements: the K measurements that :meth:`update` was given, in their order.
+            measurements: the K measurements that :meth:`update` received, in their order.
             memories: K + 1 memories returned by :meth:`start` and every :meth:`update`. A memory that is changed in
                 place contains only its last state.
 
@@ -385,35 +381,34 @@ class Smoother(Estimator, Protocol):
 
 
 class Reference(Protocol):
-    """An estimator that runs on the episode's measurements and may know what no competitor does.
+    """Protocol of an estimator that can use the truth, to show what remains to be gained.
 
-    It starts from the initial estimate of every filter. In a closed loop it flies a truth of its own, on the same
-    noise.
+    It starts from the initial estimate given to every filter. In a closed loop it has its own truth, on the same noise.
     """
 
     kind: ClassVar[Kind] = "reference"
     knows: ClassVar[str]
-    """Hidden knowledge that it has, in words; printed in every report."""
+    """Description of the truth that it uses, for reports."""
     disturbances: ClassVar[Collection[str] | None] = ()
-    """Names of the world's disturbances that it knows or ignores on purpose; None: it uses no sensors."""
+    """Names of the world's disturbances that it uses or ignores on purpose; None: it uses no sensors."""
 
     def __init__(self, task: Task) -> None: ...
 
     def start(self, initial: Any, truth: Any) -> Any:
-        """Return the memory at the start of the track.
+        """Return the reference's memory at the start of N episodes.
 
         Args:
             initial: the initial estimate given to every filter.
-            truth: at that time.
+            truth: the true state at the start.
         """
 
     def update(self, memory: Any, measurement: Any, truth: Any) -> tuple[Array, Array, Any]:
-        """Return mean ``(C, N)``, covariance ``(C, C, N)`` and memory after a measurement, as an estimator."""
+        """Return mean ``(C, N)``, covariance ``(C, C, N)`` and memory after a measurement, with the present truth."""
         ...
 
 
 class Bound(Protocol):
-    """A computed limit of the mean square error."""
+    """Protocol of a computed lower bound of the mean square error."""
 
     kind: ClassVar[Kind] = "bound"
     knows: ClassVar[str]
@@ -422,7 +417,7 @@ class Bound(Protocol):
     def __init__(self, task: Task) -> None: ...
 
     def start(self, initial: Any, truth: Any) -> Any:
-        """Return the memory at the start of the track; arguments as of :meth:`Reference.start`."""
+        """Return the bound's memory at the start of N episodes; arguments as of :meth:`Reference.start`."""
 
     def update(self, memory: Any, measurement: Any, truth: Any) -> tuple[Array, Any]:
         """Return the bound of the mean square error of ``task.components``, ``(C, N)``, and the memory."""

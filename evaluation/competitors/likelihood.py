@@ -1,6 +1,6 @@
-"""Likelihood of recorded measurements as a function of an estimator's parameters.
+"""Log-likelihood of recorded measurements as a function of an estimator's parameters, for fitting them.
 
-A recording is cut into windows, which run side by side. A window begins some measurements before those that count, so
+A recording is cut into windows, which run in parallel. A window begins some measurements before those that count, so
 that the effect of the initial estimate has decayed. Lanes are windows times candidates: an estimator whose parameters
 may be arrays ``(N,)`` runs all candidates at once, compiled where it can be traced. So a gradient by finite differences
 costs one run. A long run processes its measurements in stretches, so that its memory does not grow with their number.
@@ -25,56 +25,55 @@ from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.data.recorded_world import fill_arrays, measure_once
 from ...envs.data.recording import Recording
-from ...envs.engine.compiled import AVAILABLE, warn_of
+from ...envs.engine.compiled import AVAILABLE, warn_not_compiled
 from .filters import as_filter
 
 Apply = Callable[[Mapping[str, Any]], tuple[dict[str, Any], Callable[[Task], Any]]]
-"""Function from parameters to keywords of the task and the estimator's maker, see
-:class:`~..baselines.table.Tunable`."""
+"""Function from parameters to task keywords and the estimator's maker, see :class:`~..baselines.table.Tunable`."""
 
 
 STRETCH_NUMBERS = 1 << 19
-"""Lanes times measurements in one stretch: 4 MB for each number of a measurement."""
+"""Number of lanes times measurements in one stretch: 4 MB for each number of a measurement."""
 
 
 class Span(NamedTuple):
-    """Measurements of a recording whose likelihood counts."""
+    """Measurements of a recording that count in the likelihood: episode, first and last measurement."""
 
     episode: int
     first: int
-    """Number of the first one, from 0 on."""
+    """Number of the first measurement, from 0 on."""
     last: int
-    """Number after the last one."""
+    """Number after the last measurement."""
 
 
 class Windows(NamedTuple):
-    """W windows of a recording side by side, the longest of T measurements."""
+    """W windows of a recording as arrays, the longest of T measurements."""
 
     initial: Any
     """Initial estimate of each window, the task's NamedTuple of arrays ``(..., W)``."""
     measurements: Any
     """The task's ``Measurement`` of arrays ``(T, ..., W)``."""
     counts: numpy.ndarray
-    """Whether a measurement's likelihood counts, ``(T, W)``."""
+    """Mask of the measurements that count in the likelihood, ``(T, W)``."""
     tiles: dict[int, tuple[Any, Any]]
-    """Initial estimates and measurements repeated for several candidates, for the last number of candidates."""
+    """Cache of the initial estimates and measurements repeated for several candidates, by their number."""
 
     def measurement(self, k: int) -> Any:
-        """Return the measurement k of each window, the task's ``Measurement`` of arrays ``(..., W)``."""
+        """Return measurement number k of every window, the task's ``Measurement`` of arrays ``(..., W)``."""
         return map_arrays(lambda array: array[k], self.measurements)
 
 
 def cut_windows(
     recording: Recording, task: Task, spans: Sequence[Span], warm_up: int, every: int = 1
 ) -> Windows:
-    """Cut a recording into windows, each with an initial estimate from its own first measurements.
+    """Return windows of a recording, each with an initial estimate from its own first measurements.
 
     Args:
         recording: recording of the task.
-        task: on NumPy arrays; its log format defines the start of a track. Without one, or where a window begins with
-            the recording, the recording's own initial estimate applies.
-        spans: measurements whose likelihood counts.
-        warm_up: number of measurements before those that count, where there are as many.
+        task: task on NumPy arrays; its log format defines the start of a track. Without one, or where a window begins
+            with the recording, the recording's own initial estimate applies.
+        spans: measurements that count in the likelihood.
+        warm_up: number of measurements to process before those that count, where there are as many.
         every: of measurements with a field ``available``, one in ``every`` is received, the others are missing.
     """
     template, like = measure_once(type(task)(task.parameters), recording.measurements)
@@ -105,7 +104,7 @@ def cut_windows(
 
 
 def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
-    """Return a selection of the available measurements, ``(T, W)``: the first, then one in ``every``."""
+    """Return the mask of available measurements, ``(T, W)``, thinned to the first, then one in ``every``."""
     kept = numpy.zeros_like(available)
     since = numpy.full(available.shape[1], every)
     for row, values in zip(kept, available, strict=True):
@@ -116,7 +115,7 @@ def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
 
 
 def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[Mapping[str, Any], int]:
-    """Return the initial estimate of a window, and the number of its first measurement."""
+    """Return the initial estimate of a window by name, and the number of its first measurement."""
     own = {name: values[span.episode] for name, values in recording.initial.items()}
     log_format = find_companion(task, LogFormat)
     if log_format is None or span.first <= warm_up:
@@ -146,7 +145,7 @@ def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[
 
 
 def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
-    """Repeat the last measurement up to a length; repetitions never count."""
+    """Return values padded to a length with the last measurement; padding never counts in the likelihood."""
     missing = length - len(values)
     return values if missing == 0 else numpy.concatenate([values, numpy.repeat(values[-1:], missing, axis=0)])
 
@@ -154,7 +153,7 @@ def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
 def _update(
     task: Task, names: tuple[str, ...], apply: Apply, values: Array, measurement: Any, memory: Any
 ) -> tuple[Any, Array]:
-    """Return the memory after a measurement, and its log-likelihood; parameters ``(P, N)``."""
+    """Return an estimator's memory after a measurement, and its log-likelihood ``(N,)``, for parameters ``(P, N)``."""
     own = apply({name: values[i] for i, name in enumerate(names)})[1](task)
     return _step(as_filter(task, own), measurement, memory)
 
@@ -166,14 +165,14 @@ def _step(filter: Filter[Any, Any, Any], measurement: Any, state: Any) -> tuple[
 
 
 class WindowLikelihood:
-    """Log-likelihood of the measurements of windows, for many candidates at once.
+    """Function from an estimator's parameters to the log-likelihood of a recording, for many candidates at once.
 
     Args:
-        task: on NumPy arrays, without a recording.
+        task: task on NumPy arrays, without a recording.
         windows: windows of a recording.
         start: values of the parameters with a finite likelihood, by name.
-        apply: function from parameters to the estimator's maker.
-        in_lanes: whether every parameter may be an array ``(N,)``; else candidates run one after another.
+        apply: function from parameters to the task's keywords and the estimator's maker.
+        in_lanes: whether every parameter can be an array ``(N,)``; otherwise candidates run one after another.
 
     Attributes:
         names: names of the parameters.
@@ -205,21 +204,22 @@ class WindowLikelihood:
         self.windows = windows
         known = numpy.concatenate([~numpy.isnan(found[:, :, 0]) for found in self._stretches(self._start)])
         if not known.any():
-            raise ValueError("the estimator does not say how likely measurements were: return it from update")
+            raise ValueError(
+                "the estimator returns no log-likelihood of the measurements: return it from update"
+            )
         self._counts = windows.counts & known
         self.count: int = int(self._counts.sum())
         if not self.count:
             raise ValueError("the recording has no measurement that counts")
 
     def on(self, windows: Windows) -> "WindowLikelihood":
-        """Return the likelihood on other windows, without tracing and compiling it again; errors as of the class."""
+        """Return the same likelihood function for other windows, without compiling it again."""
         other = copy.copy(self)
         other._take(windows)
         return other
 
     def __call__(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood of all measurements that count, nats, ``(C,)``; minus infinity where it is not
-        finite.
+        """Return the log-likelihood of all measurements that count, nats, ``(C,)``; -inf where it is not finite.
 
         Args:
             values: parameters, candidates last, ``(P, C)``.
@@ -236,7 +236,7 @@ class WindowLikelihood:
     def gradient(
         self, values: numpy.ndarray, step: float = 1e-4, of: Sequence[int] | numpy.ndarray | None = None
     ) -> tuple[float, numpy.ndarray]:
-        """Return the log-likelihood of a candidate, and its gradient by central differences, in one run.
+        """Return the log-likelihood of a candidate, and its gradient by central differences, from one run.
 
         Args:
             values: parameters, ``(P,)``.
@@ -251,7 +251,7 @@ class WindowLikelihood:
         return float(found[0]), (found[1 : 1 + count] - found[1 + count :]) / (2.0 * step)
 
     def _stretches(self, values: numpy.ndarray) -> Iterator[numpy.ndarray]:
-        """Yield the log-likelihood of every measurement, ``(rows, W, C)``, in stretches of the T rows."""
+        """Yield the log-likelihoods of all measurements, ``(rows, W, C)``, in successive parts of the T rows."""
         count, W = values.shape[1], self._counts.shape[1]
         width = round_up_lanes(count * W)
         given = numpy.ascontiguousarray(values[:, numpy.minimum(numpy.arange(width) // W, count - 1)])
@@ -266,9 +266,9 @@ class WindowLikelihood:
     def _run(
         self, values: numpy.ndarray, initial: Any, measurements: Any, memory: Any
     ) -> tuple[numpy.ndarray, Any]:
-        """Run all lanes through some measurements, ``(rows, lanes)``, and return the memory after them.
+        """Run all lanes through some measurements; return their log-likelihoods ``(rows, lanes)`` and the memory.
 
-        A memory of None begins at the start.
+        With a memory of None the estimator starts from ``initial``.
         """
         found = numpy.empty((len(leaves(measurements)[0]), initial.mean.shape[-1]))
         given = values if self.in_lanes else values[:, 0]
@@ -280,7 +280,7 @@ class WindowLikelihood:
             try:
                 return found, self._run_compiled(self._compiled, values, measurements, memory, found)
             except NotTraceable as error:
-                warn_of(type(own).__name__, error)
+                warn_not_compiled(type(own).__name__, error)
                 self._compiled = None
         for k in range(len(found)):
             memory, log_likelihood = _step(own, map_arrays(lambda array: array[k], measurements), memory)  # noqa: B023
@@ -295,9 +295,7 @@ class WindowLikelihood:
         memory: Any,
         found: numpy.ndarray,
     ) -> Any:
-        """Run all lanes in compiled code between two alternating memories, write the results, and return the last
-        memory.
-        """
+        """Run all lanes in compiled code with two alternating memories; write to ``found`` and return the memory."""
         program = function.specialise(values, map_arrays(lambda array: array[0], measurements), memory)
         lanes, inner = found.shape[1], len(program.outputs) - 1
         memories = [[empty_lanes(leaf.shape, lanes) for leaf in program.outputs[:inner]] for _ in range(2)]
@@ -320,7 +318,7 @@ class WindowLikelihood:
         return map_arrays(lambda array: next(after).astype(array.dtype), memory)
 
     def _tile_windows(self, count: int, first: int, rows: int) -> tuple[Any, Any]:
-        """Return the initial estimates and first measurements repeated for the candidates, ``(rows, ..., lanes)``."""
+        """Return initial estimates and a stretch of measurements, repeated for each candidate, ``(..., lanes)``."""
         tiles = self.windows.tiles
         if count in tiles:
             return tiles[count]

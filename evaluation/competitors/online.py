@@ -1,6 +1,6 @@
-"""A filter in a user's loop, which takes measurements one by one and returns estimates.
+"""Filter for real-time use, which takes measurements one by one and returns estimates.
 
-It is the filter of an evaluation, run by the same code: the same measurements give the same bits.
+The same code runs it in an evaluation: the same measurements give the same bits.
 """
 
 import copy
@@ -32,22 +32,22 @@ from .steered_filter import compile_policy, trace_policy
 from .stepping import CompiledUpdate, MeasurementMemory, ModelUpdate, SteppingPolicy
 
 LEAST_INTERVAL = 1e-6
-"""Share of the sampling interval: measurements that are closer in time belong to the same moment."""
+"""Share of the sampling interval; measurements that are closer in time count as simultaneous."""
 MOST_MISSED = 1000
-"""Number of scans without a measurement after which a new track must start."""
+"""Maximal number of successive scans without a measurement; after more a new track must start."""
 REPORTED = ("nis", "nis_degrees", "log_likelihood", "mode_probability", "lost")
-"""Names of the quantities that a filter may report with its estimate."""
+"""Names of the statistics that a filter may report with its estimate."""
 
 
 class OnlineFilter:
-    """A filter that processes measurements as they arrive.
+    """Filter that processes measurements as they arrive.
 
     Args:
-        model: task, a feed in its world's place, with the bank of the competitor's control.
+        model: model with the bank of the competitor's control; its world takes measurements from outside.
         competitor: policy or estimator, or its maker.
-        name: its name in errors.
-        tracks: number of tracks side by side.
-        watch: compares the inputs of a network inside with those of its training; None without a network.
+        name: name of the competitor, for error messages.
+        tracks: number of parallel tracks.
+        watch: comparison of a network's inputs with those of its training; None without a network.
         lag: number of measurements, or time, by which a measurement may be late; see :meth:`update`. Each measurement
             within the lag is stored with the states of the filter and of the policy or estimator.
 
@@ -107,22 +107,22 @@ class OnlineFilter:
         )
         usual = getattr(self.task.parameters, "sampling_interval", None) or self.task.interval
         self._usual = None if usual is None else float(usual)
-        """Interval of measurements, s; None: any."""
+        """Usual interval of measurements, s; None: they have none."""
         self._least = 0.0 if usual is None else max(LEAST_INTERVAL, self.model.filter.least_interval) * usual
         self._scan_interval = getattr(self.task.recording, "scan_interval", None)
         of_tracks = f"{tracks} track{'s' * (tracks > 1)}"
         version = f"filtergym {importlib.metadata.version('filtergym')}"
         self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
         self._state: OnlineState | None = None
-        self._valid: Estimate | None = None  # the last estimate without a lost track
-        """Last valid states, without those of the filter and of a traced policy, which the update stores."""
+        self._valid: Estimate | None = None
+        """Last estimate without a lost track."""
 
     def __repr__(self) -> str:
         takes = ", ".join(f"{name} ({text})" for name, text in self.input.values.items())
         return f"<OnlineFilter {self.name!r} of {self.task.id}; update takes {takes}>"
 
     def __reduce__(self) -> Any:
-        """Raise an error: a filter runs machine code of this process and cannot be copied."""
+        """Raise TypeError: a filter runs machine code of this process and cannot be copied."""
         raise TypeError(
             "a running filter cannot be copied or pickled: make another with filtergym.online, and restore the state "
             "that save of this one returns"
@@ -133,16 +133,16 @@ class OnlineFilter:
     def start(
         self, mean: Any = None, covariance: Any = None, time: Any = 0.0, *, tracks: Any = None, **values: Any
     ) -> None:
-        """Start the track.
+        """Start the track, or all parallel tracks, with an initial estimate.
 
         Args:
             mean: initial estimate, ``(C,)``, or of several tracks ``(C, N)``.
-            covariance: of its error, ``(C, C)`` or ``(C, C, N)``.
-            time: s, a number or ``(N,)``; a number too large for seconds since 1970 is milli-, micro- or nanoseconds
-                since then, as in a log.
+            covariance: covariance of its error, ``(C, C)`` or ``(C, C, N)``.
+            time: time of the initial estimate, s, a number or ``(N,)``; a number too large for seconds since 1970 is
+                milli-, micro- or nanoseconds since then, as in a log.
             tracks: numbers of the tracks to restart while the others continue; default: all. Measurements from before
                 the restart cannot arrive late any more, for any track.
-            **values: other values at the start that the environment takes, see ``input.start_values``.
+            **values: other initial values that the environment requires, see ``input.start_values``.
 
         Raises:
             ValueError: for values that are missing, unknown, or of another shape.
@@ -163,10 +163,10 @@ class OnlineFilter:
         return OnlineState(state, memory, policy, numpy.ones(self.tracks, dtype=bool))
 
     def start_from(self, first: dict[str, Any], second: dict[str, Any]) -> None:
-        """Start the track from its first two measurements, as that of a log starts.
+        """Start the track with an estimate from its first two measurements.
 
         Args:
-            first: ``time`` and values of the sensors, as of :meth:`update`.
+            first: ``time`` and values of the sensors of the first measurement, as in :meth:`update`.
             second: ``time`` and values of the sensors of the second measurement.
 
         Raises:
@@ -186,14 +186,14 @@ class OnlineFilter:
         self.start(**self.input.start_from(first, second), time=second["time"])
 
     def update(self, time: Any = None, **values: Any) -> Estimate:
-        """Update with a measurement; one of the same time as the last is fused with it, where the sensors allow it.
+        """Update the filter with a measurement and return the estimate.
 
-        With a ``lag``, a measurement may be older than the last: the filter goes back to its time, and processes the
-        later measurements again. At the time of another measurement it supplies the values that that one lacks, or else
-        is fused with it.
+        A measurement of the same time as the last is fused with it, where the sensors allow it. With a ``lag``, a
+        measurement may be older than the last: the filter goes back to its time, and processes the later measurements
+        again. At the time of another measurement it adds the missing values of that one, or else is fused with it.
 
         Args:
-            time: s, a number or ``(N,)``; default: one sampling interval after the last.
+            time: time in s, a number or ``(N,)``; default: one sampling interval after the last.
             **values: values of the sensors, by the names of ``input.values``; a missing value is None, NaN or left out.
                 Numbers, or arrays of one track; for several tracks with N last.
 
@@ -212,11 +212,11 @@ class OnlineFilter:
 
     @property
     def too_late(self) -> int:
-        """Number of measurements since the start that were rejected because they were older than ``lag``."""
+        """Number of measurements since the start that were rejected since they were older than ``lag``."""
         return self._running().too_late
 
     def _take(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Update with a measurement that is not older than the last."""
+        """Update the filter with a measurement that is not older than the last, and return the estimate."""
         before = self._running()
         last = before.input["time"]
         if _any((at >= SINCE_1970) & (last < SINCE_1970)):
@@ -251,7 +251,7 @@ class OnlineFilter:
         return found
 
     def _take_late(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Update with a late measurement at its time, and again with the later ones."""
+        """Update with a late measurement at its own time, then again with the later ones; return the estimate."""
         state = self._running()
         taken = state.history.taken
         oldest = taken[0].before.input["time"] if taken else state.input["time"]
@@ -283,7 +283,7 @@ class OnlineFilter:
             raise
 
     def _remember(self, one: Taken) -> None:
-        """Store a measurement, and drop those that are older than ``lag``."""
+        """Store a processed measurement for later repetition, and drop those older than ``lag``."""
         state = self._running()
         taken = (*state.history.taken, one)
         if isinstance(self._lag, timedelta):
@@ -294,10 +294,7 @@ class OnlineFilter:
         self._state = state._replace(history=History(taken))
 
     def _missed_scans(self, last: Any, at: Any) -> list[Any]:
-        """Return the times of the scans without a detection since the last measurement, as in a log that is read.
-
-        Only a filter that was advised for a log has such scans.
-        """
+        """Return the times of scans without a detection since the last measurement, for a log with scans."""
         interval = self._scan_interval
         scans = int(max(numpy.rint((at - last) / interval).max(), 1))
         if scans > MOST_MISSED:
@@ -308,7 +305,7 @@ class OnlineFilter:
         return [last + (at - last) * number / scans for number in range(1, scans)]
 
     def _step(self, at: Any, values: Mapping[str, Any]) -> Estimate:
-        """Advance to a time and update with the values received."""
+        """Predict to a time, update with the values received and return the estimate."""
         measurement, memory = self.input.measure(self._running().input, at, values)
         found = self._estimate(at, self._advance(measurement, memory))
         if any(found.lost):
@@ -317,7 +314,7 @@ class OnlineFilter:
         return found
 
     def _explain(self, found: Estimate, measurement: Any) -> Any:
-        """Return the reasons why tracks are lost, with the task's explanation from their last valid estimates."""
+        """Return the reasons why tracks are lost, with the task's explanation from the last valid estimates."""
         near = self._valid if self._is_policy else found
         if near is None:
             return found.lost
@@ -335,13 +332,13 @@ class OnlineFilter:
         return self._each(words)
 
     def _received_of(self, measurement: Any, track: numpy.ndarray) -> Any:
-        """Return the values that a track has received, in arrays ``(..., 1)`` of the task's types."""
+        """Return the measurement of one track in arrays ``(..., 1)`` of the task's types."""
         memory = MeasurementMemory(self.input.measurement, self.tracks)
         memory.put(measurement)
         return select_lanes(memory.copy(), track)
 
     def _advance(self, measurement: Any, memory: Any) -> dict[str, Any]:
-        """Update with a measurement of the task, and report in arrays ``(..., N)``, for one track ``(...)``."""
+        """Update with the task's measurement; return the report in arrays ``(..., N)``, for one track ``(...)``."""
         before: Any = self._running()
         update = self._update
         # Equal to _replace, which takes longer than the filter: other input, one more measurement.
@@ -357,17 +354,17 @@ class OnlineFilter:
         return update.report()
 
     def _look(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
-        """Compare the inputs of a network, ``(N, fields)``, with those of its training."""
+        """Compare a network's inputs, ``(N, fields)``, with those of its training; return the state."""
         if self.watch is not None and state.fresh is not None:
             self.watch.look(observation, state.fresh)
         return state._replace(fresh=numpy.zeros(self.tracks, dtype=bool))
 
     def predict(self, time: Any = None, **values: Any) -> Estimate:
-        """Return the prediction to a time without a measurement; the state of the filter does not change.
+        """Return the predicted estimate at a time without a measurement; the filter does not change.
 
         Args:
-            time: s, a number or ``(N,)``; default: one sampling interval after the last.
-            **values: values that need no receiver, such as inertial data, where the environment requires them.
+            time: time in s, a number or ``(N,)``; default: one sampling interval after the last.
+            **values: values of inertial sensors, where the environment requires them.
 
         Raises:
             ValueError: for values or a time that :meth:`update` rejects.
@@ -381,7 +378,7 @@ class OnlineFilter:
             self._resume(kept)
 
     def save(self) -> OnlineState:
-        """Return the complete state, from which this or another process can continue."""
+        """Return the complete state of the filter, with which this or another process can continue."""
         return copy.deepcopy(self._snapshot()._replace(owner=self._owner))
 
     def _snapshot(self) -> OnlineState:
@@ -393,7 +390,7 @@ class OnlineFilter:
         return copy.deepcopy(state._replace(python=None if own is None else (own.memory, own.step_number)))
 
     def restore(self, state: OnlineState) -> None:
-        """Continue from a state of :meth:`save`.
+        """Set the filter to a state that :meth:`save` has returned.
 
         Raises:
             ValueError: for any other object, for a changed state from which the filter cannot continue, and for a state
@@ -422,9 +419,7 @@ class OnlineFilter:
             ) from None
 
     def _try(self, state: OnlineState) -> None:
-        """Check a state by updating with a measurement; raises any error. A filter in Python, which may have hidden
-        state, is skipped.
-        """
+        """Check a state by an update with an example measurement, which may raise any error."""
         taken = state.history.taken
         first_track = lambda array: array[..., [0] * self.tracks]  # noqa: E731
         begun = self._begin(map_arrays(first_track, self.input.initial), {})
@@ -456,7 +451,7 @@ class OnlineFilter:
             self.input.measure(memory, memory["time"] + self._default_interval(), {})
 
     def _resume(self, state: OnlineState) -> None:
-        """Continue from a snapshot, which does not change."""
+        """Set the filter to a state from ``_snapshot``, which is not changed."""
         state = copy.deepcopy(state) if self._is_in_python else state
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step_number = state.python
@@ -471,7 +466,7 @@ class OnlineFilter:
     # --- one measurement
 
     def _decide(self, state: OnlineState, inputs: numpy.ndarray) -> OnlineState:
-        """Choose an action where a decision is due, from the observation ``(width, fields)``."""
+        """Choose an action from the observation ``(width, fields)`` where a decision is due; return the state."""
         assert self._policy is not None
         number, observation = state.measurements - 1, inputs.T
         if number:
@@ -505,7 +500,7 @@ class OnlineFilter:
         return self._state
 
     def _times(self, time: Any) -> Any:
-        """Return times in s, ``(N,)``, for one track a float.
+        """Return a time argument as seconds, an array ``(N,)``, or for one track a float.
 
         Raises:
             ValueError: for a time that is not finite, or of another shape.
@@ -524,7 +519,7 @@ class OnlineFilter:
         return self._usual
 
     def _time_of(self, time: Any) -> Any:
-        """Return the time of a measurement, s, ``(N,)``, for one track a float."""
+        """Return the time of a measurement, s, ``(N,)`` or a float; by default one interval after the last."""
         if time is None:
             return self._running().input["time"] + self._default_interval()
         if self.tracks == 1 and isinstance(time, float | int) and 0.0 <= time < SINCE_1970:
@@ -532,7 +527,7 @@ class OnlineFilter:
         return self._times(time)
 
     def _refuse_interval(self, at: Any) -> None:
-        """Raise ValueError for times closer than the sampling of any sensor, or than the gains of the filter allow."""
+        """Raise ValueError for measurements that are too close in time, with the permitted interval."""
         last, share = self._running().input["time"], self.model.filter.least_interval
         why = f": the gains of {self.name!r} are made for {self._usual:g} s and make speeds of noise below"
         raise ValueError(
@@ -558,7 +553,7 @@ class OnlineFilter:
             )
 
     def _padded(self, part: Any) -> Any:
-        """Repeat the last track up to a multiple of eight: rounding in matrix products must not depend on N."""
+        """Return arrays with the last track repeated up to a multiple of eight, which fixes rounding."""
         return map_arrays(lambda array: numpy.ascontiguousarray(array[..., self._pad]), part)
 
     def _check_restart(self) -> None:
@@ -570,8 +565,8 @@ class OnlineFilter:
                 "each with its own filter"
             )
 
-    def _merge(self, begun: OnlineState, tracks: Any) -> OnlineState:
-        """Merge the states of restarted tracks with those of the others."""
+    def _merge(self, new: OnlineState, tracks: Any) -> OnlineState:
+        """Return the state with restarted tracks from ``new`` and the other tracks unchanged."""
         chosen = numpy.zeros(self.tracks, dtype=bool)
         try:
             numbers = numpy.asarray(tracks)
@@ -588,11 +583,11 @@ class OnlineFilter:
                 f"tracks are numbers from 0 to {self.tracks - 1}, got {quote_shortened(tracks)}"
             ) from None
         old, padded = self._snapshot(), chosen[self._pad]
-        policy = old.policy if self._policy else select_nested(padded, begun.policy, old.policy)
-        one_track = begun.input if chosen[0] else old.input
+        policy = old.policy if self._policy else select_nested(padded, new.policy, old.policy)
+        one_track = new.input if chosen[0] else old.input
         return old._replace(
-            filter=select_nested(padded, begun.filter, old.filter),
-            input=one_track if self.tracks == 1 else select_nested(chosen, begun.input, old.input),
+            filter=select_nested(padded, new.filter, old.filter),
+            input=one_track if self.tracks == 1 else select_nested(chosen, new.input, old.input),
             policy=policy,
             fresh=chosen | old.fresh,
             history=History(),
@@ -604,7 +599,7 @@ def _shapes(part: Any) -> list[tuple[int, ...]]:
 
 
 def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return the estimate, and the filter's statistics of the measurement."""
+    """Return mean, covariance and statistics of the measurement of a model's filter, by name."""
     records = model.filter.records(episode.filter, episode.measurement)
     mean, covariance = model.filter.mean(episode.filter), model.filter.covariance(episode.filter)
     known = {name: records[name] for name in REPORTED if name in records}
@@ -615,7 +610,7 @@ def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
-    """Return the numbers of the faults of estimates, see :func:`.filters.find_fault`, ``(N,)``."""
+    """Return the numbers of the faults of estimates, ``(N,)``, see :func:`.filters.find_fault`."""
     nothing = numpy.zeros(mean.shape[-1])
     return numpy.asarray(find_fault(mean, covariance, nothing, nothing, numpy))
 
@@ -625,12 +620,12 @@ def _any(condition: Any) -> bool:
 
 
 def _plain(values: Any) -> Any:
-    """Return a number where all are equal."""
+    """Return an array as a float if all its values are equal, else unchanged."""
     return values if values.__class__ is float or (values != values[0]).any() else float(values[0])
 
 
 def _check_lag(lag: Any) -> int | timedelta:
-    """Return the lag, or raise ValueError if it is neither a number of measurements nor a time."""
+    """Return the lag, after a check that it is a number of measurements or a time."""
     if not isinstance(lag, timedelta):
         return check_integer("lag", lag, 0)
     if lag < timedelta(0):
@@ -639,7 +634,7 @@ def _check_lag(lag: Any) -> int | timedelta:
 
 
 def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return a measurement completed by another of the same time; None where it is complete, or they differ."""
+    """Return a measurement completed by another of the same time; None if nothing is added, or they differ."""
     both, new = dict(given), False
     for name, value in late.items():
         first, second = _numbers(given.get(name)), _numbers(value)
@@ -656,7 +651,7 @@ def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _numbers(value: Any) -> numpy.ndarray:
-    """Return the value of a sensor as numbers; NaN where it is no number, which the environment reports."""
+    """Return the value of a sensor as an array; NaN if it is no number, which the environment reports later."""
     try:
         return read_numbers("it", numpy.nan if value is None else value)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Estimate of a running filter after a measurement, and the filter's complete state."""
+"""Estimate and complete state of a filter in real-time use."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,26 +10,27 @@ from ...envs.engine.programs import Report
 
 
 class Watch(Protocol):
-    """Functions that compare the inputs of a network with those of its training."""
+    """Protocol of a comparison of a network's inputs with those of its training."""
 
     memory: Any
-    """Memory of the inputs so far."""
+    """Statistics of the inputs so far."""
     observe: Report | None
-    """Function of model and episode that returns the inputs of an estimator's network, ``(fields, N)``; None: the
-    network is a policy, whose inputs are the observations."""
+    """Function of model and episode that returns the inputs ``(fields, N)`` of an estimator's network; None: the
+    network is a policy, and its inputs are the observations.
+    """
 
     def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
-        """Update the memory with inputs ``(N, fields)``; ``start`` where the track has just begun."""
+        """Add inputs ``(N, fields)`` to the memory; ``start`` marks the tracks that have just begun."""
         ...
 
     def describe(self) -> list[str]:
-        """Return a description of unusual inputs for each track; empty where there are none."""
+        """Return a description of unusual inputs for each track; empty for usual inputs."""
         ...
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of a filter after a measurement; C components, and for N tracks side by side a last axis of N."""
+    """Estimate of C components after a measurement; for N parallel tracks arrays have a last axis of N."""
 
     time: Any
     """Time, s."""
@@ -42,18 +43,19 @@ class Estimate:
     covariance: numpy.ndarray
     """Covariance of the components, ``(C, C)``."""
     nis: Any = None
-    """Normalised innovation squared of the measurement; NaN where none was received. This and the following are None
-    where the filter does not report them."""
+    """Normalised innovation squared of the measurement; NaN where none was received. This and the next three are None
+    if the filter does not report them.
+    """
     nis_degrees: Any = None
-    """Degrees of freedom of ``nis``: its mean, if the filter is consistent."""
+    """Degrees of freedom of ``nis``: its mean for a consistent filter."""
     log_likelihood: Any = None
     """Log-density of the measurement under its prediction, nats."""
     mode_probability: Any = None
     """Probabilities of the hypotheses, ``(M,)``."""
     lost: Any = ""
-    """Reason why an estimator's track is lost; a list for several tracks."""
+    """Reason why a track is lost, as text, or empty; a list for several tracks."""
     departure: Any = ""
-    """Difference of a network's inputs from those of its training; a list for several tracks."""
+    """Description of a network's unusual inputs, or empty; a list for several tracks."""
 
     @property
     def sigma(self) -> numpy.ndarray:
@@ -72,19 +74,19 @@ class Estimate:
 
 
 class Taken(NamedTuple):
-    """A measurement that the filter has processed."""
+    """A measurement that an online filter has processed, for repetition after a late one."""
 
     time: numpy.ndarray
     """Time, s, ``(N,)``."""
     values: Mapping[str, Any]
-    """Values of the sensors."""
+    """Values of the sensors by name."""
     before: "OnlineState"
     """State before the measurement, without a history."""
 
 
 @dataclass(frozen=True)
 class History:
-    """The last measurements in the order of their times. Nothing in it ever changes, so that copies share it."""
+    """The last measurements of an online filter in the order of their times; immutable, so that copies share it."""
 
     taken: tuple[Taken, ...] = ()
 
@@ -93,32 +95,29 @@ class History:
 
 
 class OnlineState(NamedTuple):
-    """Complete state of a running filter; it can be pickled.
-
-    ``owner`` identifies the filter: environment and its interface, filter, tracks, version of the package.
-    """
+    """Complete state of an online filter; it can be pickled."""
 
     filter: Any
     """State of the filter, arrays ``(..., N)``."""
     input: Any
-    """Memory of the measurements before: ``time`` and other values."""
+    """Values of earlier measurements that the next one needs: ``time`` and others."""
     policy: Any = None
     """Memory of a policy."""
     fresh: numpy.ndarray | None = None
-    """True for tracks that have just begun, for the policy, ``(N,)``."""
+    """Mask of tracks that have just begun, for the policy, ``(N,)``."""
     measurements: int = 0
     """Number of measurements so far."""
     action: Any = None
-    """Action in force, where one holds for several measurements."""
+    """Present action, where one applies to several measurements."""
     total: Any = 0.0
-    """Sums since the last decision of the fields observed as means."""
+    """Sums since the last decision of the fields that are observed as means."""
     python: Any = None
     """Memory of an estimator that runs in Python."""
     watch: Any = None
-    """Memory of the watch."""
+    """Memory of the comparison of a network's inputs."""
     owner: tuple[str, ...] = ()
-    """Identity of the filter; no other filter accepts the state."""
+    """Identity of the filter; other filters reject the state."""
     history: History = History()
-    """Measurements that must be processed again after a late one, for a filter with a lag."""
+    """Measurements to process again after a late one, for a filter with a lag."""
     too_late: int = 0
     """Number of measurements so far that were older than the history."""

@@ -1,4 +1,4 @@
-"""A program in its own process, and the pipes to it.
+"""Process of a competing program, and exchange of messages with it through pipes.
 
 A request is written and a response read at the same time, so that neither side waits for the other with a full pipe. A
 program that ends, is late or writes too much raises a :class:`Failure` with its reason. The process and all that it has
@@ -22,7 +22,7 @@ from . import isolated_estimator
 
 
 def quickest_form(source: str) -> str:
-    """Return the compiled form of a source file, which starts in half the time, if it is up to date; else the file."""
+    """Return the path of a source file's compiled form, which starts faster; the source if that is outdated."""
     compiled = cache_from_source(source)
     try:
         with open(compiled, "rb") as file:
@@ -36,29 +36,31 @@ def quickest_form(source: str) -> str:
 
 LAUNCHER = quickest_form(isolated_estimator.__file__)
 ENDED, LATE, WRONG = 6, 7, 8
-"""Numbers of the reasons among :data:`..storage.dataset.FAULTS`."""
+"""Numbers among :data:`..storage.dataset.FAULTS`: the program ended, did not respond in time, or wrote no valid
+estimate.
+"""
 START_SECONDS = 30.0
-"""Limit for the first response, s, where the usual one is shorter: an interpreter starts slowly."""
+"""Least time limit for the first response, s, since an interpreter starts slowly."""
 END_SECONDS = 1.0
-"""Time that a program has to end by itself, s."""
+"""Time in which a program must end after its input is closed, s."""
 PIPE_BYTES = 1 << 20
-"""Size of a pipe, bytes, where the system can set it: then a message of a thousand tracks is one piece."""
-MORE = "it has written more than an answer"
+"""Size of a pipe, bytes, where the system can set it: large enough for a message of a thousand tracks."""
+MORE = "it has written more than one response"
 LAST_WORDS = 2000
-"""Bytes of standard error that are stored."""
+"""Number of the last bytes of standard error that are stored."""
 
 
 class Limits(NamedTuple):
-    """Limits of a program's time and memory."""
+    """Time and memory limits of a program."""
 
     seconds: float = 10.0
-    """Time from a request to its whole response, s."""
+    """Time limit for each response, s."""
     memory: float = 4000.0
-    """Address space, MB; 0: no limit. Only Linux applies it."""
+    """Limit of the address space, MB; 0: no limit. Only Linux applies it."""
 
 
 class Failure(Exception):  # noqa: N818  (a program's failure, not an error of this package)
-    """A missing or wrong response, with its reason."""
+    """Error for a missing or invalid response of a program."""
 
     def __init__(self, fault: int, words: str) -> None:
         super().__init__(words)
@@ -66,11 +68,11 @@ class Failure(Exception):  # noqa: N818  (a program's failure, not an error of t
 
 
 class ProgramProcess:
-    """A running program.
+    """A running program, with pipes to its standard input and output.
 
     Args:
-        command: its words; no shell runs it. None: an estimator, see :mod:`.isolated_estimator`.
-        limits: of its time and memory.
+        command: the program and its arguments; no shell runs it. Empty: an estimator, see :mod:`.isolated_estimator`.
+        limits: limits of its time and memory.
         environment: environment variables; None: those of this process.
 
     Raises:
@@ -92,47 +94,47 @@ class ProgramProcess:
             env=None if environment is None else dict(environment),
             start_new_session=True,  # Ctrl-C is for this process, which ends the whole group
         )
-        self._answers = selectors.DefaultSelector()
-        self.end = weakref.finalize(self, _end, process, self._answers)
+        self._selector = selectors.DefaultSelector()
+        self.end = weakref.finalize(self, _end, process, self._selector)
         streams = (process.stdin, process.stdout, process.stderr)
         self._to, self._from, self._errors = (stream.fileno() for stream in streams if stream is not None)
         for pipe in (self._to, self._from, self._errors):
             os.set_blocking(pipe, False)
             _widen(pipe)
-        self._answers.register(self._from, selectors.EVENT_READ)
-        self._answers.register(self._errors, selectors.EVENT_READ)
+        self._selector.register(self._from, selectors.EVENT_READ)
+        self._selector.register(self._errors, selectors.EVENT_READ)
         self._buffer, self._last_words = bytearray(), b""
         self._seconds = max(limits.seconds, START_SECONDS)
 
-    def exchange(self, question: bytes, size: int | None, most: int = 0) -> bytes:
-        """Write a request, and return the response.
+    def exchange(self, request: bytes, size: int | None, most: int = 0) -> bytes:
+        """Write a request to the program, wait for its response and return it.
 
         Args:
-            question: bytes of the request.
-            size: bytes of the response; None: it is a line.
+            request: bytes of the request.
+            size: number of bytes of the response; None: it is a line.
             most: maximal bytes of a line.
 
         Raises:
             Failure: if there is no such response in time.
         """
-        unsent, until = memoryview(question), time.monotonic() + self._seconds
+        unsent, until = memoryview(request), time.monotonic() + self._seconds
         self._read(self._from)
         if self._buffer:
             raise Failure(WRONG, MORE)
         while True:
             if unsent:
                 unsent = self._write(unsent)
-            if not unsent and (found := self._whole_answer(size, most)) is not None:
+            if not unsent and (found := self._whole_response(size, most)) is not None:
                 self._seconds = self.limits.seconds
                 return found
             left = until - time.monotonic()
             if left <= 0.0:
-                raise Failure(LATE, f"it has not answered within {self._seconds:g} s")
-            for key, _ in self._answers.select(left):
+                raise Failure(LATE, f"it has not responded within {self._seconds:g} s")
+            for key, _ in self._selector.select(left):
                 self._read(key.fd)
 
     def send(self, message: bytes) -> None:
-        """Write a message without a response.
+        """Write a message without a response to the program.
 
         Raises:
             Failure: if the program does not read it in time.
@@ -140,17 +142,19 @@ class ProgramProcess:
         self.exchange(message, 0)
 
     def finish(self) -> None:
-        """Close its input, and check that nothing follows its last response; a program has ``END_SECONDS`` to end.
+        """Close the program's input, and check that it writes nothing more.
+
+        It has ``END_SECONDS`` to end.
 
         Raises:
-            Failure: if something does: then an earlier response was one too many, and later ones belong to other
+            Failure: if it writes more: then an earlier response was one too many, and later ones belong to other
                 requests.
         """
         if self._process.stdin is not None:
             self._process.stdin.close()
         until, goes_on = time.monotonic() + END_SECONDS, True
         while goes_on and not self._buffer and (left := until - time.monotonic()) > 0.0:
-            for key, _ in self._answers.select(left):
+            for key, _ in self._selector.select(left):
                 if key.fd == self._from:
                     found = os.read(self._from, PIPE_BYTES)
                     self._buffer += found
@@ -161,18 +165,18 @@ class ProgramProcess:
             raise Failure(WRONG, MORE)
 
     def _write(self, unsent: memoryview) -> memoryview:
-        """Write as much as the pipe takes, and wait for room for the rest."""
+        """Write as much of a message as the pipe takes; return the rest."""
         try:
             unsent = unsent[os.write(self._to, unsent) :]
         except BlockingIOError:
             pass
         except OSError:  # the program has closed its input
             raise self._explain_end() from None
-        waits = self._to in self._answers.get_map()
+        waits = self._to in self._selector.get_map()
         if unsent and not waits:
-            self._answers.register(self._to, selectors.EVENT_WRITE)
+            self._selector.register(self._to, selectors.EVENT_WRITE)
         elif waits and not unsent:
-            self._answers.unregister(self._to)
+            self._selector.unregister(self._to)
         return unsent
 
     def _read(self, pipe: int) -> None:
@@ -185,19 +189,19 @@ class ProgramProcess:
         if pipe == self._errors:
             self._last_words = (self._last_words + found)[-LAST_WORDS:]
             if not found:
-                self._answers.unregister(pipe)
+                self._selector.unregister(pipe)
         elif not found:
             raise self._explain_end()
         else:
             self._buffer += found
 
-    def _whole_answer(self, size: int | None, most: int) -> bytes | None:
-        """Return a response from the bytes read so far; None where it is incomplete."""
+    def _whole_response(self, size: int | None, most: int) -> bytes | None:
+        """Return the response from the bytes read so far and remove it from them; None if it is incomplete."""
         buffer = self._buffer
         if size is None:
             end = buffer.find(b"\n")
             if end < 0 and len(buffer) > most:
-                raise Failure(WRONG, f"it has answered with a line of more than {most:,} bytes")
+                raise Failure(WRONG, f"it has responded with a line of more than {most:,} bytes")
             size = end + 1
             if end < 0:
                 return None
@@ -208,10 +212,10 @@ class ProgramProcess:
         return found
 
     def _explain_end(self) -> Failure:
-        """Return how the program has ended, with the last line that it wrote to standard error."""
+        """Return an error that describes how the program has ended, with its last line on standard error."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
-        if self._errors in self._answers.get_map():
+        if self._errors in self._selector.get_map():
             with suppress(OSError):
                 self._last_words += os.read(self._errors, PIPE_BYTES)
         lines = self._last_words.decode(errors="replace").strip().splitlines()
@@ -227,7 +231,7 @@ class ProgramProcess:
 
     @property
     def apart(self) -> bool:
-        """Whether it is in its own PID namespace, after its first response; True on systems other than Linux."""
+        """Whether the program is in its own PID namespace, after its first response; True except on Linux."""
         try:
             return os.readlink(f"/proc/{self._process.pid}/ns/pid_for_children") != os.readlink(
                 "/proc/self/ns/pid"
@@ -237,7 +241,7 @@ class ProgramProcess:
 
     @property
     def processor_seconds(self) -> float:
-        """Processor time of the process and of all that it has started, s; NaN where the system does not report it."""
+        """Processor time of the process and its descendants, s; NaN where the system does not report it."""
         if sys.platform != "linux":
             return float("nan")
         children: dict[int, list[int]] = {}
@@ -266,9 +270,9 @@ def _widen(pipe: int) -> None:
             fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
 
-def _end(process: "subprocess.Popen[bytes]", answers: selectors.BaseSelector) -> None:
-    """Close the pipes and end the process with all that it has started; no zombie remains."""
-    answers.close()
+def _end(process: "subprocess.Popen[bytes]", selector: selectors.BaseSelector) -> None:
+    """Close the pipes and kill the process with its descendants."""
+    selector.close()
     for stream in (process.stdin, process.stdout, process.stderr):
         if stream is not None:
             stream.close()

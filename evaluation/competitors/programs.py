@@ -1,4 +1,4 @@
-"""Programs in any language as competitors, each in its own process, by standard input and output.
+"""Programs in any language as competitors: separate processes that use standard input and output.
 
 This is version 1 of the protocol; docs/programs.md describes it for authors of programs.
 
@@ -45,15 +45,15 @@ LONGEST_HELLO = 10_000
 BYTES_OF_NUMBER = 40
 """Maximal bytes of a number in JSON, with its separators."""
 NO_NAMESPACES = "no PID namespace here: it could end or slow this process"
-"""Warning before a program runs on a system without namespaces: what remains possible."""
+"""Warning before a program runs on a system without PID namespaces."""
 USUAL = Limits()
 LIMITS: ContextVar[Limits] = ContextVar("limits", default=USUAL)
-"""Limits of the programs that are named while it is in force."""
+"""Limits of the programs that are made while the context variable has this value."""
 
 
 @contextmanager
 def limit_programs(seconds: float, memory: float) -> Iterator[None]:
-    """Set the limits of the programs that are named inside the context, see :class:`.program_process.Limits`.
+    """Set the limits of time, s, and memory, MB, of the programs that are made inside the context.
 
     Raises:
         ValueError: for a time that is not above zero, or a negative memory.
@@ -70,7 +70,7 @@ def limit_programs(seconds: float, memory: float) -> Iterator[None]:
 
 
 def search_path() -> str:
-    """Return the search path for programs, with the folder of this process's virtual environment first.
+    """Return the value of PATH for programs, with the folder of the virtual environment first.
 
     So ``python`` is the interpreter that has the package, whether the environment is activated or not.
     """
@@ -82,11 +82,11 @@ def search_path() -> str:
 
 @dataclass(frozen=True)
 class Program:
-    """A program that competes as an estimator; called with a task it returns the estimator.
+    """A program that competes as an estimator; a call with a task returns that estimator.
 
     Args:
         command: the program and its arguments, one text as in a shell; no shell runs it.
-        limits: of its time for each response and of its memory.
+        limits: limits of its time for each response and of its memory.
         words: see the attributes, also for the other arguments.
 
     Raises:
@@ -96,7 +96,7 @@ class Program:
     command: str
     limits: Limits = field(default_factory=LIMITS.get)
     words: tuple[str, ...] | None = None
-    """Words of the command; default: the command split as by a shell; empty: an estimator in Python."""
+    """The program and its arguments; default: the command split as by a shell; empty: a Python estimator."""
     preface: bytes = field(default=b"", repr=False)
     """Bytes that are written before the hello."""
     environment: tuple[tuple[str, str], ...] | None = None
@@ -123,25 +123,25 @@ class Program:
         object.__setattr__(self, "words", words)
 
     def __call__(self, task: Task) -> "ProgramEstimator":
-        """Make the estimator."""
+        """Return the estimator that runs the program for a task."""
         return ProgramEstimator(task, self)
 
 
 class ArrayField(NamedTuple):
-    """Description of an array in the messages to a program."""
+    """Description of one array in the messages to a program."""
 
     name: str
-    """Its name, with dots between the names of nested fields."""
+    """Name, with dots between the names of nested fields."""
     shape: tuple[int, ...] | None
-    """Shape for one track; None: it exists in other scenarios, or in recordings, only."""
+    """Shape for one track; None: the array exists in other scenarios, or in recordings, only."""
     type: str
     """``float64``, ``int64`` or ``bool``; in a frame all are float64."""
     about: str
-    """Its meaning and unit."""
+    """Meaning and unit."""
 
 
 def fields_of(part: Any, prefix: str = "") -> Iterator[ArrayField]:
-    """Yield descriptions of the arrays of nested NamedTuples ``(..., N)``, in the order of ``leaves``."""
+    """Yield a description of each array of nested NamedTuples ``(..., N)``, in the order of ``leaves``."""
     about = field_words(type(part))
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
@@ -155,7 +155,7 @@ def fields_of(part: Any, prefix: str = "") -> Iterator[ArrayField]:
 
 
 def parameters_of(task: Task) -> dict[str, Any]:
-    """Return by name the constants of a task that JSON can represent."""
+    """Return the task's constants that JSON can represent, by name."""
     own = task.parameters
     found = {}
     for name in getattr(own, "__dataclass_fields__", ()):
@@ -172,32 +172,32 @@ def parameters_of(task: Task) -> dict[str, Any]:
 
 
 def rows_of(part: Any, count: int) -> numpy.ndarray:
-    """Return the numbers of nested tuples of arrays ``(..., N)``, one row for each track, ``(count, numbers)``."""
+    """Return the numbers of nested tuples of arrays ``(..., N)`` as one row for each track, ``(count, numbers)``."""
     flat = [numpy.asarray(a, dtype="<f8").reshape(-1, numpy.shape(a)[-1])[:, :count] for a in leaves(part)]
     return numpy.ascontiguousarray(numpy.concatenate(flat).T)
 
 
 def as_lists(values: numpy.ndarray) -> Any:
-    """Return nested lists of numbers, None where one is not finite."""
+    """Return an array as nested lists of numbers, None where one is not finite."""
     held = values.astype(object)
     held[~numpy.isfinite(values)] = None
     return held.tolist()
 
 
 class ProgramEstimator:
-    """A program as an estimator, see :class:`.kinds.Estimator`.
+    """Estimator that runs a program for all episodes, see :class:`.kinds.Estimator`.
 
-    Its faults do not end an evaluation: all its tracks are lost from then on, and a warning gives the reason.
+    A fault of the program does not end an evaluation: all tracks are lost from then on, and a warning gives the reason.
 
     Args:
         task: the estimation problem.
-        program: to run.
+        program: the program to run.
 
     Attributes:
-        tracks: how many of the N lanes are tracks; the others repeat the last one.
-        last: number of the last measurement, after whose response the program must write nothing; None where unknown.
+        tracks: number of the N lanes that are tracks; the others repeat the last one.
+        last: number of the last measurement, after which the program must write nothing more; None: unknown.
         fault: number among ``FAULTS`` of the reason for a missing response; 0 while it responds.
-        feedback: its feedback to the world, ``(..., N)``; None where it gives none.
+        feedback: the program's feedback to the world, ``(..., N)``; None where it writes none.
     """
 
     kind: ClassVar[Kind] = "estimator"
@@ -212,14 +212,16 @@ class ProgramEstimator:
         self.step_number: int = 0
         self.feedback: numpy.ndarray | None = None
         self._feedback_field: ArrayField | None = None
-        """Description of the feedback of a track, which the hello offers; None where the program does not use it."""
+        """Description of the feedback, which the hello offers; None if the program does not use it."""
         self._process: ProgramProcess | None = None
         self._format = ""
         self._initial: numpy.ndarray | None = None
         self._fields: list[ArrayField] = []
 
     def start(self, initial: Any, N: int) -> int:
-        """Start the program; the hello waits for the first measurement, since it describes its fields.
+        """Start the program; return the memory, which is the number of measurements so far.
+
+        The hello is sent with the first measurement, since it describes its fields.
 
         Raises:
             ValueError: if it cannot be started.
@@ -242,7 +244,7 @@ class ProgramEstimator:
         return 0
 
     def update(self, memory: int, measurement: Any) -> tuple[Array, Array, int]:
-        """Exchange a measurement for an estimate; the memory is the number of measurements.
+        """Send a measurement to the program; return its means, covariances and the memory.
 
         Raises:
             ValueError: if the program takes no part, or for an earlier memory, since a process cannot go back.
@@ -270,7 +272,7 @@ class ProgramEstimator:
                 )
                 self.end()
         if answer is None:
-            answer = numpy.full((self.count, self._answer_size), numpy.nan)
+            answer = numpy.full((self.count, self._response_size), numpy.nan)
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
         answer = answer[lanes].T
         if self._feedback_field is not None:
@@ -278,17 +280,20 @@ class ProgramEstimator:
         return answer[:C], answer[C : C + C * C].reshape(C, C, width), self.step_number
 
     def processor_seconds(self) -> float:
-        """Return the processor time of the program, s; NaN where unknown."""
+        """Return the processor time of the program, s; NaN if it is unknown."""
         return float("nan") if self._process is None else self._process.processor_seconds
 
     def end(self) -> None:
-        """End the process."""
+        """End the program's process."""
         if self._process is not None:
             self._process.end()
             self._process = None
 
     def hello(self, measurement: Any) -> dict[str, Any]:
-        """Return the hello, with the keys that programs in plain C search at its beginning."""
+        """Return the first message to the program: components, fields of messages, number of tracks.
+
+        The keys that programs in plain C search are at its beginning.
+        """
         C, measured = len(self.task.components), list(fields_of(measurement))
         numbers = {"initial": _count(self._fields), "measurement": _count(measured), "answer": C + C * C}
         offered = {}
@@ -312,12 +317,12 @@ class ProgramEstimator:
         }
 
     @property
-    def _answer_size(self) -> int:
+    def _response_size(self) -> int:
         C = len(self.task.components)
         return C + C * C + (0 if self._feedback_field is None else _count([self._feedback_field]))
 
     def _greet(self, measurement: Any) -> None:
-        """Exchange the hello, and write the initial estimate."""
+        """Exchange the first messages (hello and format) with the program, and send the initial estimate."""
         assert self._process is not None
         assert self._initial is not None
         hello = self.program.preface + json.dumps(self.hello(measurement)).encode() + b"\n"
@@ -328,7 +333,7 @@ class ProgramEstimator:
         if answer.get("filtergym") != VERSION or answer.get("format") not in ("json", "float64"):
             raise Failure(
                 WRONG,
-                f'it has not answered the hello with {{"filtergym": {VERSION}, "format": "json" or "float64"}}',
+                f'it has not responded to the hello with {{"filtergym": {VERSION}, "format": "json" or "float64"}}',
             )
         gaps = answer.get("warning", "" if self._process.apart or not self.program.words else NO_NAMESPACES)
         if isinstance(gaps, str) and gaps:
@@ -353,10 +358,10 @@ class ProgramEstimator:
         return json.dumps({name: content}).encode() + b"\n"
 
     def _exchange(self, rows: numpy.ndarray, C: int) -> numpy.ndarray:
-        """Return the response to a measurement, ``(tracks, C + C * C)``."""
+        """Send a measurement to the program; return its response as numbers, ``(tracks, C + C * C)``."""
         assert self._process is not None
         question = self._message("measurement", self._fields, rows)
-        size = self.count * self._answer_size
+        size = self.count * self._response_size
         if self._format == "float64":
             answer = self._process.exchange(question, 8 * size)
             return numpy.frombuffer(answer, dtype="<f8").reshape(self.count, -1)
@@ -380,12 +385,12 @@ class ProgramEstimator:
 
 
 def _count(fields: Sequence[ArrayField]) -> int:
-    """Return the number of numbers of a track."""
+    """Return the total number of entries of these fields for one track."""
     return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 
 
 def _read_object(line: bytes) -> dict[str, Any]:
-    """Parse a response.
+    """Parse a program's response as a JSON object.
 
     Raises:
         Failure: if it is no JSON object.
@@ -396,10 +401,10 @@ def _read_object(line: bytes) -> dict[str, Any]:
         found = None
     if not isinstance(found, dict):
         shown = "".join(c if c.isprintable() else " " for c in line[:80].decode(errors="replace"))
-        raise Failure(WRONG, f"its answer is no JSON object: {shown!r}")
+        raise Failure(WRONG, f"its response is no JSON object: {shown!r}")
     return found
 
 
 def find_program(name: str, command: str, problem: Any, find: Any) -> Competitor:
-    """Return the competitor of ``exec:COMMAND``."""
+    """Return the competitor for the name ``exec:COMMAND``, which runs that command."""
     return Competitor(name, Program(command))

@@ -1,4 +1,4 @@
-"""Smoothers in the loop: a forward run as an estimator, then the smoothed estimates."""
+"""Evaluation of smoothers: a forward run as an estimator, then the smoothed estimates."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -20,12 +20,12 @@ from .filters import AdaptedState, Checked, find_fault, is_lacking
 
 
 class SmoothedTrack(Filter[Task, Any, int]):
-    """An estimator whose estimates a smoother has computed before; its state counts the measurements.
+    """Filter that returns estimates that a smoother has computed before; its state is the number of measurements.
 
     Args:
         task: the estimation problem.
-        means: ``(C, K, N)``.
-        covariances: ``(C, C, K, N)``.
+        means: smoothed means at K measurements, ``(C, K, N)``.
+        covariances: smoothed covariances, ``(C, C, K, N)``.
     """
 
     in_python = True
@@ -36,31 +36,30 @@ class SmoothedTrack(Filter[Task, Any, int]):
         self.covariances = covariances
         count = means.shape[-1]
         self.lanes: numpy.ndarray = numpy.minimum(numpy.arange(round_up_lanes(count)), count - 1)
-        """Index of the episode of each lane; lanes beyond repeat the last one."""
+        """Index of the episode of each lane; further lanes repeat the last episode."""
 
     def start(self, initial: Any) -> int:
-        """Return the state before the first measurement."""
+        """Return the state before the first measurement: zero measurements."""
         return 0
 
-    def update(self, state: int, given: FilterInput) -> int:
-        """Count the measurement."""
+    def update(self, state: int, inputs: FilterInput) -> int:
+        """Return the state after one more measurement."""
         return state + 1
 
     def mean(self, state: int) -> Array:
-        """Return the estimate at the last measurement."""
+        """Return the smoothed mean at the last measurement, ``(C, N)``."""
         return self.means[:, state - 1, self.lanes]
 
     def covariance(self, state: int) -> Array:
-        """Return the estimate at the last measurement."""
+        """Return the smoothed covariance at the last measurement, ``(C, C, N)``."""
         return self.covariances[:, :, state - 1, self.lanes]
 
 
 def check_open_loop(model: Model, name: str) -> None:
-    """Raise ValueError if the loop is closed: estimates of a smoother or from a file cannot steer the next
-    measurements.
+    """Raise ValueError if a model's estimates affect its later measurements (closed loop).
 
     Args:
-        model: model in which the smoother or the estimates from a file are to run.
+        model: model in which a smoother or estimates from a file are to run.
         name: kind and name of the competitor.
     """
     if model.task.closes_loop:
@@ -70,14 +69,14 @@ def check_open_loop(model: Model, name: str) -> None:
         )
 
 
-def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Run a smoother forward over episodes, then smooth them.
+def run_forward(model: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Run a smoother forward over episodes; return the smoothed means and covariances.
 
     Args:
-        looped: model with the smoother as its filter.
+        model: model with the smoother as its filter.
         lanes: episodes of the model, with their first measurement.
         length: number of measurements of each episode.
-        name: name of the smoother in errors.
+        name: name of the smoother, for error messages.
 
     Returns:
         Means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of K measurements.
@@ -85,58 +84,58 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
     Raises:
         ValueError: if its estimates have other shapes.
     """
-    run = _run_compiled if can_step(looped, report_forward) else _step_forward
-    measurements, memories = run(looped, lanes, length)
-    own = looped.filter.own.own if looped.filter.in_python else looped.filter.own
+    run = _run_compiled if can_step(model, report_forward) else _step_forward
+    measurements, memories = run(model, lanes, length)
+    own = model.filter.own.own if model.filter.in_python else model.filter.own
     with explain_errors(f"smoother {name!r} failed after {length} measurements"):
         means, covariances = own.smooth(measurements, memories)
-    C, N = len(looped.task.components), lanes.count if run is _run_compiled else lanes.width
+    C, N = len(model.task.components), lanes.count if run is _run_compiled else lanes.width
     return (
         _check_shape("means", means, (C, length, N), name),
         _check_shape("covariances", covariances, (C, C, length, N), name),
     )
 
 
-def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
+def _step_forward(model: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
 
     def memory_in(episode: Any) -> Any:
-        return looped.filter.own.memory if looped.filter.in_python else episode.filter.own
+        return model.filter.own.memory if model.filter.in_python else episode.filter.own
 
     measurements: list[Any] = []
     memories = [memory_in(lanes.state)]
     action = numpy.zeros(lanes.count, dtype=numpy.int64)
     while len(measurements) < length:
         for episode, _ in lanes.decide(action, whole_episode):
-            measurements.append(looped.task.world.mask_missing(episode.measurement))
+            measurements.append(model.task.world.mask_missing(episode.measurement))
             memories.append(memory_in(episode))
     return measurements, memories
 
 
 def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
-    """Report the inputs of ``smooth``."""
+    """Return the measurement and the filter's memory, the inputs of ``smooth``."""
     return episode.measurement, episode.filter.own
 
 
-def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
-    """Return the measurements, masked as the smoother receives them, and the memories of a compiled smoother."""
+def _run_compiled(model: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
+    """Return the measurements, with missing ones masked, and the memories of a compiled smoother."""
     start = map_nested(lambda values: values[None, ..., : lanes.count], lanes.state.filter.own)
     measured: list[Any] = []
     memories = [start]
     for stretch in run_stretches(lanes, report_forward, length):
         # Copies without the padding lanes, which make the arrays of one episode eight times as long.
         measurement, memory = map_nested(lambda values: values[..., : lanes.count].copy(), stretch)
-        masked = over_time(looped.task.world.mask_missing, stack_scans(Scans(measurement)))
+        masked = over_time(model.task.world.mask_missing, stack_scans(Scans(measurement)))
         measured.append(map_nested(lambda values: numpy.moveaxis(values, -2, 0), masked))
         memories.append(memory)
     return Scans(_join(measured)), Scans(_join(memories))
 
 
 def run_stretches(lanes: Lanes, report: Report, length: int) -> Iterator[Any]:
-    """Run episodes from their start, and yield reports on successive stretches of measurements, ``(scans, ..., N)``.
+    """Run episodes from their start; yield reports on successive stretches of measurements, ``(scans, ..., N)``.
 
     Args:
         lanes: compiled episodes, whose filter has no policy.
-        report: as of :meth:`.Lanes.run`.
+        report: function of model and episode that returns arrays ``(..., N)``, see :meth:`.Lanes.run`.
         length: number of measurements of each episode.
     """
     together = max(1, TOGETHER // lanes.width)
@@ -152,17 +151,17 @@ def _join(stretches: Sequence[Any]) -> Any:
 
 
 def report_world(model: Model, episode: Episode) -> tuple[Any, Any]:
-    """Report the quantities of the world, which do not depend on the estimate."""
+    """Return truth and measurement of an episode, which do not depend on the estimate."""
     return episode.truth, episode.measurement
 
 
 def report_smoothed(
-    looped: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
+    model: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
 ) -> Iterator[dict[str, numpy.ndarray]]:
-    """Report on a smoothed track as on a filter's estimates, for many measurements together.
+    """Yield the reports that a filter with the smoothed estimates would give, for stretches of measurements.
 
     Args:
-        looped: model with the smoothed track as its filter.
+        model: model with the smoothed track as its filter.
         lanes: compiled episodes of the same world that have just begun, with any filter.
         track: the smoothed estimates.
         report: function that returns arrays ``(..., N)`` by name.
@@ -176,22 +175,22 @@ def report_smoothed(
     for stretch in run_stretches(lanes, report_world, length):
         world = map_nested(lambda values: numpy.moveaxis(values, 0, -2), stretch)
         some = slice(first, first := first + len(leaves(stretch)[0]))
-        answers = track.means[:, some][..., track.lanes], track.covariances[:, :, some][..., track.lanes]
-        checked = _check_answers(looped.task, state, world[1], *answers)
-        found = over_time(lambda episode: looped.run(report, episode), Episode(world[0], world[1], checked))
+        estimates = track.means[:, some][..., track.lanes], track.covariances[:, :, some][..., track.lanes]
+        checked = _check_estimates(model.task, state, world[1], *estimates)
+        found = over_time(lambda episode: model.run(report, episode), Episode(world[0], world[1], checked))
         yield map_nested(lambda values: numpy.moveaxis(values, -2, 0), found)
         state = map_nested(lambda values: values[..., -1, :], checked)
 
 
-def _check_answers(
+def _check_estimates(
     task: Task, before: Checked, measurement: Any, means: numpy.ndarray, covariances: numpy.ndarray
 ) -> Checked:
-    """Return the states of a :class:`.CheckedFilter` at measurements ``(..., scans, N)``, from estimates at them.
+    """Return the states of a :class:`.CheckedFilter` with these estimates, for many measurements at once.
 
     Args:
         task: the estimation problem.
         before: state before the first measurement.
-        measurement: all measurements.
+        measurement: all measurements, ``(..., scans, N)``.
         means: ``(C, scans, N)``; changed in place where an earlier estimate is repeated.
         covariances: ``(C, C, scans, N)``; changed in place in the same way.
     """
@@ -206,9 +205,9 @@ def _check_answers(
     for lane in numpy.flatnonzero((fault > 0.0).any(axis=0)):
         first = numpy.argmax(fault[:, lane] > 0.0)
         fault[first:, lane] = fault[first, lane]
-        for answers, start in ((means, before.mean), (covariances, before.covariance)):
-            last = answers[..., first - 1, lane] if first else start[..., lane]
-            answers[..., first:, lane] = last[..., None]
+        for estimates, start in ((means, before.mean), (covariances, before.covariance)):
+            last = estimates[..., first - 1, lane] if first else start[..., lane]
+            estimates[..., first:, lane] = last[..., None]
     own = AdaptedState(means, covariances, None, Likelihood.unknown(fault))
     return Checked(own, means, covariances, fault, missed)
 

@@ -1,6 +1,6 @@
-"""A bank closed by a policy, as one filter that calls the policy itself.
+"""Bank and policy combined in one filter, which computes the policy's actions itself.
 
-Traced for one track, its arithmetic has no branches, so the policy is compiled and exported with its bank.
+Traced for one track its arithmetic has no branches. So the policy is compiled and exported with its bank.
 """
 
 import math
@@ -19,13 +19,13 @@ from ...compiler.program import Graph
 from ...envs.contract.filter import FilterInput
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array, DecisionMeans
-from ...envs.engine.compiled import CompiledModel, warn_of
+from ...envs.engine.compiled import CompiledModel, warn_not_compiled
 from .filters import AroundBank
 from .kinds import Policy, is_traceable
 
 
 class Decisions(NamedTuple):
-    """State of a policy: its memory, the action in force and the sums since the decision."""
+    """State of a policy in a filter: its memory, the present action, and sums since the last decision."""
 
     memory: Any
     """Memory of the policy, every array as ``(entries, N)``; zeros before its first decision."""
@@ -33,25 +33,26 @@ class Decisions(NamedTuple):
     """Number of measurements since the last decision, including that of the decision; zero before the first one,
     ``(N,)``."""
     action: Array
-    """Action in force, ``(A, N)``."""
+    """Present action, ``(A, N)``."""
     total: Array
     """Sums since the last decision of the fields that are observed as means, ``(fields, N)``."""
 
 
 Act = Callable[[Array, Any, Array], tuple[Array, Any]]
-"""Function of an observation ``(N, fields)``, a memory, and whether the episode begins ``(N,)``; returns an action
-``(N, A)`` or ``(N,)`` and the memory."""
+"""Function from observations ``(N, fields)``, a memory and a mask of new episodes ``(N,)`` to actions ``(N, A)`` or
+``(N,)`` and the memory.
+"""
 
 
 class Decider:
-    """A policy that is computed at every measurement; its actions apply where a decision is due.
+    """Policy evaluated at every measurement; its action changes only where a decision is due.
 
     Args:
-        model: defines the observations.
-        act: computes the actions.
-        memory: a memory of the policy, arrays of one track; their values do not matter. The batch is the first axis or
-            else the last. Where one has neither, the filter is for one track: N is 1, or the arrays are traced.
-        interval: measurements for which an action holds; default: the task's decision interval.
+        model: model that defines the observations.
+        act: function that computes the actions.
+        memory: a memory of the policy for one track, as template. The batch is the first axis of each array or else the
+            last. If one has neither, the filter is for one track: N is 1, or the arrays are traced.
+        interval: number of measurements for which an action holds; default: the task's decision interval.
     """
 
     def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
@@ -65,7 +66,7 @@ class Decider:
         self.means: DecisionMeans = DecisionMeans(model.fields, self.interval)
 
     def start(self, zero: Array) -> Decisions:
-        """Return the state before the first decision; all numbers are zero, ``(N,)``."""
+        """Return the policy's state before the first decision; ``zero`` is an array ``(N,)`` of zeros."""
         memory = map_arrays(
             lambda array: self.xp.stack([zero] * max(int(numpy.size(array)), 1)), self._template
         )
@@ -73,11 +74,11 @@ class Decider:
         return Decisions(memory, zero, action, self.xp.stack([zero] * max(len(self.means.columns), 1)))
 
     def is_due(self, state: Decisions) -> Array:
-        """Return whether a decision is due at the next measurement, ``(N,)``."""
+        """Return a mask ``(N,)`` of tracks for which a decision is due at the next measurement."""
         return (state.count == 0.0) | (state.count >= float(self.interval))
 
     def decide(self, observation: Array, state: Decisions) -> tuple[Array, Decisions]:
-        """Return the action in force, ``(A, N)`` floats or ``(N,)`` integers, after an observation ``(fields, N)``."""
+        """Return the present action, ``(A, N)`` or ``(N,)``, and the state after an observation ``(fields, N)``."""
         xp, K = self.xp, self.interval
         first = state.count == 0.0
         due, total = self.is_due(state), state.total
@@ -85,19 +86,19 @@ class Decider:
             total = xp.where(first, 0.0, self.means.add(total, observation))
             observation = xp.where(first, observation, self.means.show(observation, total, xp))
             total = xp.where(due, 0.0, total)
-        answer, memory = self._act(observation, state.memory, first)
+        chosen, memory = self._act(observation, state.memory, first)
         if K > 1:
-            answer = xp.where(due, answer, state.action)
+            chosen = xp.where(due, chosen, state.action)
             kept = iter(leaves(state.memory))
             memory = map_arrays(lambda array: xp.where(due, array, next(kept)), memory)
-        action = answer if self.space.shape else xp.astype(answer[0], xp.int64)
+        action = chosen if self.space.shape else xp.astype(chosen[0], xp.int64)
         # Never more than the interval: float has no consecutive whole numbers beyond 2^24, for a filter that runs for
         # days.
         count = xp.where(due, 1.0, state.count + 1.0) if K > 1 else xp.ones_like(state.count)
-        return action, Decisions(memory, count, answer, total)
+        return action, Decisions(memory, count, chosen, total)
 
     def _act(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
-        """Return the action ``(A, N)`` and memory, every array ``(entries, N)``."""
+        """Return the policy's action ``(A, N)`` and its memory, arrays ``(entries, N)``, for an observation."""
         shapes, N = iter(self._shapes), observation.shape[-1]
 
         def restore(array: Array) -> Array:
@@ -116,18 +117,18 @@ class Decider:
                 rows = self.xp.reshape(array, (N if shape[:1] == (1,) else 1, -1)).T
             return self.xp.astype(rows, self.xp.float64)
 
-        answer, memory = self.act(observation.T, map_arrays(restore, memory), first)
-        answer = self.xp.asarray(answer)
-        if answer.size != self.size * N or (answer.dtype.kind == "f" and not self.space.shape):
+        chosen, memory = self.act(observation.T, map_arrays(restore, memory), first)
+        chosen = self.xp.asarray(chosen)
+        if chosen.size != self.size * N or (chosen.dtype.kind == "f" and not self.space.shape):
             raise ValueError(
-                f"expected an action of {self.space}, got {answer.dtype} of shape {answer.shape}"
+                f"expected an action of {self.space}, got {chosen.dtype} of shape {chosen.shape}"
             )
         remembered = iter(shape for shape, _ in self._shapes)
-        return flatten(answer), map_arrays(lambda array: flatten(array, next(remembered)), memory)
+        return flatten(chosen), map_arrays(lambda array: flatten(array, next(remembered)), memory)
 
 
 class PolicyFilterState(NamedTuple):
-    """State of a steered filter."""
+    """State of a :class:`SteeredFilter`."""
 
     bank: Any
     """State of the bank."""
@@ -136,11 +137,11 @@ class PolicyFilterState(NamedTuple):
 
 
 class SteeredFilter(AroundBank[PolicyFilterState]):
-    """A bank closed by a policy.
+    """Filter that consists of a bank and the policy that steers it.
 
     Args:
-        model: with the bank.
-        decider: computes the policy's actions.
+        model: model with the bank.
+        decider: object that computes the policy's actions.
     """
 
     def __init__(self, model: Model, decider: Decider) -> None:
@@ -151,27 +152,27 @@ class SteeredFilter(AroundBank[PolicyFilterState]):
         self.adapts_covariance: bool = self.bank.adapts_covariance
 
     def start(self, initial: Any) -> PolicyFilterState:
-        """Start the bank; the policy begins at its first decision."""
+        """Start the bank and the policy; return their states."""
         return PolicyFilterState(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
 
-    def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
-        """Update the bank with the policy's action, chosen anew where a decision is due."""
-        observation = self.model.observe(Episode(None, given.measurement, state.bank))
+    def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
+        """Update the bank with the policy's action, which is computed anew where a decision is due."""
+        observation = self.model.observe(Episode(None, inputs.measurement, state.bank))
         action, decisions = self.decider.decide(observation, state.policy)
-        return PolicyFilterState(self.bank.act(state.bank, given.measurement, action), decisions)
+        return PolicyFilterState(self.bank.act(state.bank, inputs.measurement, action), decisions)
 
     def records(self, state: PolicyFilterState, measurement: Any) -> dict[str, Array]:
-        """Return the records of the bank."""
+        """Return the bank's statistics of the measurement, by name."""
         return self.bank.records(state.bank, measurement)
 
 
 def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Decider:
-    """Return the object that computes a policy at every measurement of a model.
+    """Return an object that computes a policy's actions at every measurement of a model.
 
     Args:
-        model: on NumPy or traced arrays.
-        policy: made for the same task on NumPy arrays, whose ``act`` is arithmetic of NumPy.
-        interval: measurements for which an action holds; default: the task's decision interval.
+        model: model on NumPy or traced arrays.
+        policy: policy made for the same task on NumPy arrays, whose ``act`` is arithmetic of NumPy.
+        interval: number of measurements for which an action holds; default: the task's decision interval.
     """
     blank = numpy.zeros((1, len(model.fields)))
     with numpy.errstate(all="ignore"):
@@ -180,7 +181,7 @@ def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Dec
 
 
 def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
-    """Return the bank of a model closed by a policy; arguments as of :func:`decider_of`.
+    """Return a filter that combines the bank of a model with a policy; arguments as of :func:`decider_of`.
 
     Raises:
         NotTraceable: on traced arrays, where the policy's arithmetic cannot be traced.
@@ -189,14 +190,15 @@ def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredF
 
 
 def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = None) -> Specialised:
-    """Return a policy traced: a function of the observation, lane by lane, and of :class:`Decisions`.
+    """Return a policy as a traced function of an observation and :class:`Decisions`, ready for compilation.
 
-    It returns an action and the next :class:`Decisions`, which are zero before the first decision.
+    The function returns an action and the next :class:`Decisions`, which are zero before the first decision.
 
     Args:
-        model: compiled model in which it acts.
-        policy: made for that model.
-        interval: as of :func:`decider_of`; 1 where the policy is called only when a decision is due.
+        model: compiled model of the policy.
+        policy: policy made for that model.
+        interval: number of measurements for which an action holds; 1 where the policy is called only when a decision is
+            due.
 
     Raises:
         NotTraceable: if its arithmetic cannot be traced.
@@ -210,17 +212,19 @@ def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = No
 
 
 def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Policy], Any]) -> Any:
-    """Return a policy traced, or None where it runs in Python; warn if a policy declared traceable cannot be traced.
+    """Return a policy as a traced function, or None if it must run in Python.
+
+    Warn if a policy that is declared traceable cannot be traced.
 
     Args:
-        model: model in which it acts.
-        policy: made for that model.
-        trace: :func:`trace_policy`.
+        model: model of the policy.
+        policy: policy made for that model.
+        trace: :func:`trace_policy` with its options.
     """
     if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and is_traceable(policy)):
         return None
     try:
         return trace(model, policy)
     except NotTraceable as error:
-        warn_of(f"policy {type(policy).__name__} of {model.task.id}", error)
+        warn_not_compiled(f"policy {type(policy).__name__} of {model.task.id}", error)
         return None

@@ -1,4 +1,4 @@
-"""Filters and policies in a user's loop, one measurement at a time, with the same numbers as an evaluation.
+"""Filters and policies called by the user for one measurement at a time, with the same numbers as an evaluation.
 
 A filter of a compiled model processes a measurement by one native call (:class:`CompiledUpdate`), any other by the
 functions of its model (:class:`ModelUpdate`). :class:`SteppingPolicy` computes the actions of any number of episodes.
@@ -34,16 +34,16 @@ MODEL_ROWS = 128
 
 
 class PolicyMemory(NamedTuple):
-    """Memory of a policy between two steps."""
+    """Memory of a :class:`SteppingPolicy` between two calls."""
 
     calls: list[Any]
-    """State of each call of the policy."""
+    """Memory of the policy for each of its calls."""
     fresh: bool
     """Whether the episodes have not begun yet."""
 
 
 class SteppingPolicy(Policy):
-    """A policy for a user's loop, with actions equal to those in an evaluation, to the last bit.
+    """Policy for a user's loop, whose actions equal those in an evaluation to the last bit.
 
     Rounding in matrix products depends on their shape, and an episode must not depend on the number of others. So the
     policy is called with a multiple of eight observations, a Stable-Baselines3 model always with ``MODEL_ROWS``, and
@@ -51,8 +51,8 @@ class SteppingPolicy(Policy):
 
     Args:
         model: task with the bank that the policy controls.
-        policy: anything with Stable-Baselines3's ``predict``.
-        scenario: of the environment; None is its default.
+        policy: object with Stable-Baselines3's method ``predict``.
+        scenario: scenario of the environment; None: its default.
         task_keywords: parameters of the task with which the environment must be made.
     """
 
@@ -71,15 +71,12 @@ class SteppingPolicy(Policy):
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """Keywords of ``gymnasium.make`` for an environment that the policy acts in."""
+        """Keywords of ``gymnasium.make`` for an environment that fits the policy."""
         scenario = {} if self.scenario is None else {"scenario": self.scenario}
         return {"control": self.control, **scenario, **self.task_keywords}
 
     def begin(self, seeds: Sequence[int]) -> PolicyMemory:
-        """Return the state for the first :meth:`predict` of the episodes with these seeds.
-
-        Only policies that draw random numbers need it, such as ``random``; for the others None is enough.
-        """
+        """Return the memory for the first :meth:`predict` in some episodes; needed by random policies only."""
         own = self.policy
         return PolicyMemory(
             [
@@ -96,13 +93,12 @@ class SteppingPolicy(Policy):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[numpy.ndarray, PolicyMemory]:
-        """Choose actions.
+        """Return the actions for a batch of observations or for one, and the memory for the next call.
 
         Args:
             observation: ``(N, len(model.fields))``, or one observation without the batch axis.
-            state: as returned by the last call; at the first None, or the state of :meth:`begin`.
-            episode_start: ``(N,)`` booleans, or one; true where a new episode begins, as it does everywhere at the
-                first call.
+            state: memory that the last call returned; at the first call None, or the memory of :meth:`begin`.
+            episode_start: mask of new episodes, ``(N,)`` booleans, or one; all are new at the first call.
             deterministic: as in Stable-Baselines3.
 
         Returns:
@@ -133,7 +129,7 @@ class SteppingPolicy(Policy):
     def _act(
         self, observation: numpy.ndarray, memory: Any, start: numpy.ndarray, deterministic: bool
     ) -> tuple[Any, Any]:
-        """Compute the actions, in native code where the policy can be traced."""
+        """Return the actions and the memory of one call; in native code where the policy can be traced."""
         if not self._is_traced:
             trace = functools.partial(trace_policy, interval=1)
             self._traced, self._is_traced = compile_policy(self.model, self.policy, trace), True
@@ -157,11 +153,11 @@ class SteppingPolicy(Policy):
         return action.T, after
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the compiled code: a copy compiles its own."""
+        """Return the attributes for pickling, without compiled code: a copy compiles its own."""
         return {**self.__dict__, "_traced": None, "_is_traced": False, "_bound": {}}
 
     def _calls(self, count: int) -> list[numpy.ndarray]:
-        """Return the episodes of each call of the policy."""
+        """Return the indices of the episodes in each call of the policy, padded with the last one."""
         rows = MODEL_ROWS if hasattr(self.policy, "observation_space") else round_up_lanes(count)
         return [
             numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)
@@ -169,15 +165,15 @@ class SteppingPolicy(Policy):
 
 
 class MeasurementMemory:
-    """Fixed memory for a measurement.
+    """Preallocated arrays for a measurement of all tracks.
 
     Args:
-        like: a measurement, for its shapes and types.
-        tracks: number of tracks side by side; the last one is repeated up to a multiple of eight, since rounding in
+        like: a measurement, as template of shapes and types.
+        tracks: number of parallel tracks; the last one is repeated up to a multiple of eight, since rounding in
             matrix products must not depend on their number.
 
     Attributes:
-        parts: its arrays, ``(..., width)``, of floats.
+        parts: the arrays, ``(..., width)``, of floats.
     """
 
     def __init__(self, like: Any, tracks: int) -> None:
@@ -188,7 +184,7 @@ class MeasurementMemory:
         self._places = self.parts if tracks > 1 else [numpy.moveaxis(part, -1, 0) for part in self.parts]
 
     def put(self, measurement: Any) -> None:
-        """Write a measurement of tracks, ``(..., N)``, or of one track without this axis."""
+        """Write a measurement into the arrays: of several tracks, ``(..., N)``, or of one without this axis."""
         found = [part for part in measurement if part is not None] if self._is_flat else leaves(measurement)
         for place, values in zip(self._places, found, strict=True):
             place[...] = values if self._pad is None else values[..., self._pad]
@@ -200,7 +196,7 @@ class MeasurementMemory:
 
 
 class CompiledUpdate:
-    """The filter of a compiled model, with memory of its own, one native call for each measurement.
+    """Filter of a compiled model with its own memory, run by one native call for each measurement.
 
     Where a policy acts in Python there are two calls, one before the action and one after it.
 
@@ -208,10 +204,10 @@ class CompiledUpdate:
     memories of both, used alternately.
 
     Args:
-        model: compiled, of a world that is live.
+        model: compiled model, whose world takes measurements from outside.
         report: function that returns a dictionary of arrays after the update.
-        tracks: number of tracks side by side.
-        policy: traced, see :func:`.steered_filter.trace_policy`; None without.
+        tracks: number of parallel tracks.
+        policy: traced policy, see :func:`.steered_filter.trace_policy`; None without.
         in_python: whether a policy acts in Python.
         observe: function that returns ``(fields, N)`` before the update; None: the observation of a policy.
 
@@ -281,33 +277,33 @@ class CompiledUpdate:
         self._report = [(name, reported[i][cut]) for name, i in tell.template.items()]
 
     def receive(self, measurement: Any) -> None:
-        """Predict to a measurement, and update with it where no policy acts in Python."""
+        """Predict to a measurement; unless a policy acts in Python, also update with it."""
         before, now = self._now, int(self._now == 0)
         self._received[now].put(measurement)
         self._now = now
         self._arrivals[before].run(self._width, self._threads)
 
     def act(self, action: numpy.ndarray) -> None:
-        """Update with the measurement and an action chosen in Python, ``(width, ...)``."""
+        """Update with the received measurement and an action from Python, ``(width, ...)``."""
         self._action[...] = action.T
         self._answers[self._now].run(self._width, self._threads)
 
     def report(self) -> dict[str, Any]:
-        """Return the report in new arrays ``(..., N)``, for one track without this axis."""
+        """Return copies of the values that the report function gave after the update, by name, ``(..., N)``."""
         return {name: array.copy() if array.ndim else array[()] for name, array in self._report}
 
     @property
     def state(self) -> Any:
-        """State of the filter, in new arrays."""
+        """Copy of the filter's state."""
         return copy_arrays(self._template, self._states[self._now], self._kinds)
 
     @property
     def policy_state(self) -> Any:
-        """Memory of the traced policy, in new arrays."""
+        """Copy of the traced policy's memory."""
         return map_arrays(lambda i: self._policies[self._now > 0][i].copy(), self._policy_template)
 
     def resume(self, state: Any, policy: Any) -> None:
-        """Continue from a state of the filter and a memory of the traced policy."""
+        """Set the state of the filter and the memory of the traced policy."""
         self._now = 2
         arrays = leaves(state) + (leaves(policy) if self._policy_template else [])
         for memory, values in zip([*self._states[2], *self._policies[1]], arrays, strict=True):
@@ -315,9 +311,9 @@ class CompiledUpdate:
 
 
 class ModelUpdate:
-    """The filter of a model, run by the functions of the model, with an action from Python or zero.
+    """Filter of a model, run by the model's own functions, with an action from Python or zero.
 
-    Arguments as of :class:`CompiledUpdate`, and a measurement for its shapes and types.
+    Arguments as of :class:`CompiledUpdate`; ``like`` is a measurement, as template of shapes and types.
     """
 
     blank_policy = policy_state = None
@@ -328,7 +324,7 @@ class ModelUpdate:
         self._cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
         self._received = MeasurementMemory(like, tracks)
         self.state: Any = None
-        """State of the filter, in arrays that never change."""
+        """State of the filter, in arrays that are never changed."""
 
     def receive(self, measurement: Any) -> None:
         """Predict to a measurement."""
@@ -338,25 +334,25 @@ class ModelUpdate:
 
     @property
     def observation(self) -> numpy.ndarray:
-        """Observation of a policy, ``(width, fields)``."""
+        """Observation for a policy, ``(width, fields)``."""
         return numpy.asarray(self._model.observe(self._episode)).T
 
     @property
     def observed(self) -> numpy.ndarray:
-        """Values of ``observe``, ``(width, fields)``."""
+        """Values of the function ``observe``, ``(width, fields)``."""
         return numpy.asarray(self._model.run(self._observe, self._episode)).T
 
     def act(self, action: numpy.ndarray) -> None:
-        """Update with the measurement and an action, ``(width, ...)``."""
+        """Update with the received measurement and an action, ``(width, ...)``."""
         turned = numpy.asarray(action.T, dtype=float if self._model.action_space.shape else None)
         self._episode = self._model.act(self._episode, turned)
         self.state = self._episode.filter
 
     def report(self) -> dict[str, Any]:
-        """Return the report in new arrays ``(..., N)``, for one track without this axis."""
+        """Return copies of the report function's values, by name, ``(..., N)``, without N for one track."""
         reported = self._model.run(self._make_report, self._episode)
         return {name: numpy.copy(array[self._cut])[()] for name, array in reported.items()}
 
     def resume(self, state: Any, policy: Any) -> None:
-        """Continue from a state of the filter."""
+        """Set the state of the filter."""
         self.state = state

@@ -1,4 +1,4 @@
-"""Components of Stone Soup as an estimator."""
+"""Adapter that runs components of Stone Soup as an estimator."""
 
 from datetime import datetime, timedelta
 from typing import Any
@@ -12,11 +12,11 @@ from stonesoup.types.state import GaussianState
 from .adapters import Array, SingleTrackEstimator
 
 START = datetime(2000, 1, 1)
-"""Start of the time stamps; Stone Soup requires a date, and any date will do."""
+"""Time stamp of the start of each track; Stone Soup requires a date, and any date will do."""
 
 
 class StoneSoupEstimator(SingleTrackEstimator):
-    """Estimator by a predictor and an updater of Stone Soup, with one state for each episode.
+    """Base class of estimators by a predictor and an updater of Stone Soup, with one state for each episode.
 
     Subclasses set ``self.predictor`` and ``self.updater``, after ``super().__init__(task)``. Where a
     measurement is more than positions with a covariance they define :meth:`detection`, for a control or hypotheses of
@@ -29,16 +29,15 @@ class StoneSoupEstimator(SingleTrackEstimator):
 
     @property
     def interval(self) -> float:
-        """Seconds between measurements without an interval; a subclass must define it where the parameters do not."""
+        """Time between measurements without an interval, s; a subclass must define it where the parameters do not."""
         return self.task.parameters.sampling_interval
 
     def begin(self, initial: Any) -> Any:
-        """Return the Gaussian state at the start of the track."""
+        """Return the Gaussian state of Stone Soup at the initial estimate."""
         return GaussianState(initial.mean[:, None], initial.covariance, timestamp=START)
 
     def detection(self, measurement: Any, timestamp: datetime) -> Any:
-        """Return the detection of the position, with the measurement's covariance in its model; None where it is
-        missing.
+        """Return the detection of the measured position, with its covariance; None if it is missing.
 
         Args:
             measurement: measurement of this track.
@@ -52,7 +51,7 @@ class StoneSoupEstimator(SingleTrackEstimator):
         return Detection(z[:, None], timestamp=timestamp, measurement_model=model)
 
     def step(self, track: Any, measurement: Any) -> Any:
-        """Predict to the time of the measurement and update with its detection, if there is one."""
+        """Return the state predicted to the time of a measurement and updated with its detection, if there is one."""
         interval = measurement.interval if hasattr(measurement, "interval") else self.interval
         timestamp = track.timestamp + timedelta(seconds=float(interval))
         prediction = self.predictor.predict(track, timestamp=timestamp)
@@ -62,5 +61,5 @@ class StoneSoupEstimator(SingleTrackEstimator):
         return self.updater.update(SingleHypothesis(prediction, detection))
 
     def estimate(self, track: Any) -> tuple[Array, Array]:
-        """Return ``mean`` and ``covar``."""
+        """Return the mean and the covariance of a state, as arrays."""
         return numpy.asarray(track.mean), numpy.asarray(track.covar)

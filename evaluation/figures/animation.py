@@ -1,4 +1,4 @@
-"""Animations of an episode with any competitor's estimates, for documentation and for a look at bad episodes."""
+"""Animations of an episode with the estimates of a competitor, as GIF files."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from ..running.rollout import run_competitor
 from ..storage.files import whole_file
 
 SHADES = 7
-"""Number of steps from a colour of the figure to white, for smooth edges."""
+"""Number of shades between a colour of the figure and white, for smooth edges."""
 
 
 def episode_frames(
@@ -32,7 +32,7 @@ def episode_frames(
     every: int = 2,
     **keywords: Any,
 ) -> list[Image.Image]:
-    """Run an episode and return its frames.
+    """Run an episode of a competitor and return its frames as a list of images.
 
     Args:
         task: task class of the environment.
@@ -81,7 +81,7 @@ def _policy_frames(world: TaskEnv, name: str, policy: Any, seed: int, every: int
 def _estimate_frames(
     model: Model, scenario: str, name: str, estimator: Any, seed: int, every: int
 ) -> list[Image.Image]:
-    """Draw the estimates of a filter without observations and actions."""
+    """Return the frames of an episode of a competitor without observations and actions."""
     # They import matplotlib.
     from ...envs.drawing.estimate_picture import EstimatePicture
     from ...envs.drawing.rendering import EpisodePicture
@@ -113,10 +113,7 @@ def _frame(world: TaskEnv) -> Any:
 
 
 def _palette() -> Image.Image:
-    """Return the colours of the figures and their shades: one palette for all frames, or colours would flicker.
-
-    A palette chosen from the pixels would drop small details, such as the radar's mark.
-    """
+    """Return an image with one palette for all frames, so that colours do not flicker and details are not lost."""
     from matplotlib.colors import to_rgb
 
     # Imported here, as in the environment, since it is optional.
@@ -133,11 +130,11 @@ def _palette() -> Image.Image:
 
 
 def write_animation(frames: list[Image.Image], path: Path, frames_per_second: float = 6.0) -> None:
-    """Write frames as an endless GIF whose last frame stays for two seconds.
+    """Write frames as an endless GIF, whose last frame lasts two seconds.
 
     Args:
-        frames: at least one.
-        path: path of the file, which is complete or missing.
+        frames: images of equal size, at least one.
+        path: path of the file, which is written atomically.
         frames_per_second: number of frames per second.
     """
     palette = _palette()

@@ -1,4 +1,4 @@
-"""Figures of an evaluation, all drawn from its curves (:mod:`.curves`), as wide as a paper's columns.
+"""Figures of an evaluation from its curves (:mod:`.curves`), in the widths of a paper's columns.
 
 At most six lines of a figure have a colour: the user's own, the paper's algorithm, the reference, the bound, the best
 learned and the best classical competitor, then the others by their cost; the rest is grey. Policies and estimators are
@@ -31,7 +31,7 @@ from .print_layout import (
 
 
 class CurvePanel(NamedTuple):
-    """One pair of axes with lines over time."""
+    """Lines over time for one pair of axes, with their bands."""
 
     label: str
     """Label of the ordinate."""
@@ -43,19 +43,19 @@ class CurvePanel(NamedTuple):
 
 
 def _abscissa(curves: xarray.Dataset) -> numpy.ndarray:
-    """Return the seconds where measurements come regularly, otherwise their numbers."""
+    """Return the values of the time axis: seconds for a constant sampling interval, else measurement numbers."""
     found: numpy.ndarray = curves["elapsed" if "elapsed" in curves.coords else "time"].values
     return found
 
 
 def _bound_abscissa(axis: Any, x: numpy.ndarray) -> None:
-    """Set limits from just before the first measurement to the last, or around a single one."""
+    """Set the limits of the time axis from just before the first measurement to the last, or around a single one."""
     first, last = float(x[0]), float(x[-1])
     axis.set_xlim(*((first - 0.01 * (last - first), last) if last > first else (0.5 * first, 1.5 * first)))
 
 
 def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
-    """Label the axis: seconds below and measurements above, where they come regularly; otherwise measurements below."""
+    """Label the time axis: seconds below and measurements above, or without constant interval only measurements."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
     if "elapsed" not in curves.coords:
@@ -71,7 +71,7 @@ def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
 
 
 def _shade_windows(axis: Any, curves: xarray.Dataset) -> None:
-    """Shade the scenario's windows, and name them at the top, except those that span the whole episode."""
+    """Shade the scenario's windows and write their names at the top, except those that span the whole episode."""
     length, x = curves.sizes["time"], _abscissa(curves)
     step = 0.5 * (x[1] - x[0]) if length > 1 else 0.5
     shown = {name: ends for name, ends in windows_of(curves).items() if ends[1] - ends[0] + 1 < 0.85 * length}
@@ -103,7 +103,7 @@ def _over_time(
     columns: int,
     finish: Callable[[Any, CurvePanel], None],
 ) -> Any:
-    """Draw lines over time in panels one above the other: those of a look in colour, the others grey."""
+    """Return a figure of lines over time in panels one above the other; lines without a style are grey."""
     from matplotlib.lines import Line2D
 
     names = curves["policy"].values.tolist()
@@ -162,10 +162,7 @@ def _draw_bands(
     distinct: Iterable[str],
     look: Mapping[str, Mapping[str, Any]],
 ) -> bool:
-    """Draw the bands about lines, and return whether some were left out.
-
-    Bands that on average fill a third of the axis would hide all lines, and mean only that there are too few episodes.
-    """
+    """Draw the bands about lines, except those over a third of the axis; return whether some were left out."""
     left_out = False
     if panel.low is None or panel.high is None:
         return left_out
@@ -204,7 +201,7 @@ def _title(curves: xarray.Dataset) -> str:
 def draw_error_over_time(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Draw the RMSE over time of every quantity, with 95 % bands over episodes.
+    """Return a figure of the RMSE over time of every quantity, with 95 % bands over episodes.
 
     Args:
         curves: curves of an evaluation with truth.
@@ -238,7 +235,7 @@ def draw_error_over_time(
 def draw_cost_difference(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Draw the mean cost over time less that of the paper's algorithm, and of the best, with paired 95 % bands.
+    """Return a figure of mean costs over time minus those of the paper's algorithm and of the best; bands are paired.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -277,8 +274,7 @@ def draw_cost_difference(
 def draw_consistency(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Draw the mean NEES and NIS over their dimensions at every measurement, with the 95 % chi-square band of that
-    mean.
+    """Return a figure of ANEES and ANIS over time, with the 95 % chi-square band of a consistent filter.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -306,7 +302,7 @@ def draw_consistency(
 def draw_error_distribution(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Draw the share of measurements with an error above a given size, for every quantity.
+    """Return a figure of the share of measurements with an error above a given size, for every quantity.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -350,7 +346,7 @@ def draw_error_distribution(
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the policies whose mode probabilities vary by more than 0.02 over time, with those that have the same."""
+    """Return policies whose mode probabilities vary by over 0.02, each with those that have equal probabilities."""
     probabilities = {name: curves["mode_probability"].sel(policy=name).values for name in names}
     found = {
         name: values
@@ -365,7 +361,7 @@ def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, lis
 def draw_mode_probabilities(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Draw the mean over episodes of the mode probabilities that vary, with 95 % bands, for the coloured lines.
+    """Return a figure of the mode probabilities over time of the highlighted policies, with 95 % bands.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -409,7 +405,7 @@ def draw_mode_probabilities(
 def draw_true_class_probability(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Draw the mean over episodes of the probability of the true class, with 95 % bands.
+    """Return a figure of the mean probability of the true class over time, with 95 % bands.
 
     Arguments as of :func:`draw_error_over_time`.
     """
@@ -431,12 +427,12 @@ def evaluation_figures(
     own: Sequence[str] = (),
     points: Sequence[Point] = (),
 ) -> Iterator[tuple[str, Any]]:
-    """Yield every figure of an evaluation, with the name of its file, except figures without data.
+    """Yield the name and the figure of each plot of an evaluation for which there are data.
 
     Args:
         curves: curves of an evaluation, from :func:`.curves.curves_of`.
         columns: width of the figures in columns of a paper, 1 or 2.
-        highlight: names of the coloured lines, at most six; default: see :func:`choose_highlights`.
+        highlight: names of the coloured lines, at most six; default: as in :func:`choose_highlights`.
         learned: names of learned competitors.
         own: names of the user's competitors.
         points: points of cost and time, see :func:`.times.points_of_records`; without points there is no such figure.

@@ -1,4 +1,4 @@
-"""Figure of cost and time: a point for every competitor, and steps along the Pareto front."""
+"""Figure of cost over processor time: a point for every competitor, and the Pareto front."""
 
 import itertools
 import math
@@ -14,38 +14,40 @@ from .looks import COLOURS, OWN
 from .print_layout import FONT_SIZES, add_title, figure_with_axes, in_print
 
 MOST_ABOVE = 1.0
-"""Upper limit of the drawn costs, in octaves above the paper's cost; competitors above it are only counted, except the
-user's own."""
+"""Upper limit of the drawn costs, in octaves above the paper's cost. Competitors above it are only counted, except the
+user's.
+"""
 TICKS = (
     *(-99.5, -99, -98, -95, -90, -85, -80, -75, -70, -65, -60, -55, -50, -45, -40, -35, -30, -25, -20, -15, -10, -5),
     *(0, 5, 10, 15, 20, 30, 40, 50, 70, 100),
 )  # fmt: skip
-"""Candidates for ticks of the cost, %; as many are drawn as there is room for."""
+"""Candidates for ticks of the cost axis, %; as many are drawn as fit."""
 LEARNED, PAPER, CLASSICAL = COLOURS[1], COLOURS[0], "0.45"
 TOUCHES = 3.0
-"""Penalty of a place from which on a name touches a line, a point or another name: there only the paper's algorithm and
-the user's own are named."""
+"""Penalty of a label's place from which on it overlaps a line, a point or another label. There only the paper's
+algorithm and the user's competitors have labels.
+"""
 DISTANCES = (5.0, 7.0, 9.0, 15.0, 23.0, 33.0, 45.0)
-"""Distances of a name from its point, points of print; the nearest free one is used."""
+"""Distances of a label from its point, points of print; the nearest free one is used."""
 NEAR = 3
-"""Number of these distances for optional names: lines to names farther away would cross."""
+"""Number of these distances for optional labels: lines to labels farther away would cross."""
 DIRECTIONS = 16
 
 Box = tuple[float, float, float, float]
-"""Left, bottom, right, top, pixels."""
+"""Left, bottom, right, top of a rectangle, pixels."""
 
 
 class FrontPanel(NamedTuple):
-    """Contents of the panel of one environment in one scenario."""
+    """Competitors of one environment in one scenario, for a panel of the figure."""
 
     title: str
     points: Sequence[Point]
-    """Points, with costs relative to the paper's algorithm, %."""
+    """Cost and time of each competitor, with the cost relative to the paper's algorithm, %."""
     paper: str
     reference: str
     learned: Collection[str]
     own: Collection[str] = ()
-    """Names of the user's own competitors, which are always drawn and named."""
+    """Names of the user's competitors, which are always drawn and labelled."""
 
     @property
     def top(self) -> float:
@@ -56,7 +58,7 @@ class FrontPanel(NamedTuple):
 
     @property
     def beyond(self) -> list[Point]:
-        """Points with higher cost, which are not drawn."""
+        """Points with a higher cost than ``top``, which are not drawn."""
         return [point for point in self.points if point.kind in RANKED and point.cost > self.top]
 
 
@@ -69,7 +71,7 @@ def draw_front(
     *,
     columns: int = 2,
 ) -> Any:
-    """Draw the cost relative to the paper's algorithm over the time of a measurement, and the front of both.
+    """Return a figure of the cost relative to the paper's algorithm over the time of a measurement, with the front.
 
     Args:
         curves: curves of an evaluation with times.
@@ -91,7 +93,7 @@ def draw_front(
 
 
 def draw_panel(axis: Any, panel: FrontPanel) -> None:
-    """Draw points, front and reference, without names."""
+    """Draw a panel's points, the Pareto front and the reference, without labels."""
     axis.set_title(panel.title, loc="left")
     axis.set_xscale("log")
     axis.set_yscale("function", functions=(_octaves, _percent))
@@ -122,7 +124,7 @@ def draw_panel(axis: Any, panel: FrontPanel) -> None:
 
 
 def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
-    """Return the legend handles of the contents of the panels."""
+    """Return legend handles for the kinds of points and lines in some panels."""
     from matplotlib.lines import Line2D
 
     shown = [(point, panel) for panel in panels for point in panel.points if point.kind in RANKED]
@@ -141,7 +143,7 @@ def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
 
 
 def name_points(figure: Any, panels: Mapping[Any, FrontPanel]) -> None:
-    """Write names in free places: of the paper's algorithm, the user's own, the front, and the reference.
+    """Write labels in free places: of the paper's algorithm, the user's competitors, the front and the reference.
 
     Args:
         figure: figure with a complete layout.
@@ -154,7 +156,7 @@ def name_points(figure: Any, panels: Mapping[Any, FrontPanel]) -> None:
 
 
 class _Names:
-    """Placement of names in one pair of axes, in pixels.
+    """Placement of labels in one pair of axes, in pixels.
 
     Args:
         figure: figure of the axes.
@@ -170,10 +172,10 @@ class _Names:
         self.points: list[Box] = []
         self.names: list[Box] = []
         self.lines: list[numpy.ndarray] = []
-        """Points along lines, ``(n, 2)``."""
+        """Points along lines, ``(n, 2)`` each, pixels."""
 
     def place(self, panel: FrontPanel) -> None:
-        """Write all names."""
+        """Write all labels of a panel."""
         on_front = _on_front(panel)
         low, high = self.axis.get_ylim()
         shown = [p for p in panel.points if p.kind in RANKED and low <= p.cost <= high]
@@ -226,7 +228,7 @@ class _Names:
         return float(box.width), float(box.height)
 
     def _name_line(self, point: Point, y: float) -> None:
-        """Name the reference on its line, at the end with fewer points, or at the right."""
+        """Write the label of the reference on its line, at the less crowded end."""
         width, height = self._extent(point.name)
         gap = 2.0 * self.pixels
         boxes = [
@@ -239,7 +241,7 @@ class _Names:
         self._write(point.name, best, "black")
 
     def _find_place(self, point: Point, always: bool) -> tuple[Box, float] | None:
-        """Return and reserve the best free box for a name, with its penalty; None if every place touches something."""
+        """Return and reserve the best box for a point's label, with its penalty; None without a free place."""
         width, height = self._extent(point.name)
         x, y = self._at(point.time.nanoseconds, point.cost)
         k = numpy.arange(DIRECTIONS)
@@ -266,7 +268,7 @@ class _Names:
         return box, float(badness[best])
 
     def _name(self, point: Point, box: Box, colour: str) -> None:
-        """Write a name, with a line to its point where that is not near."""
+        """Write a label into its box, with a line to its point if that is not near."""
         x, y = self._at(point.time.nanoseconds, point.cost)
         end = _nearest(box, (x, y))
         if math.dist((x, y), end) > 6.5 * self.pixels:
@@ -275,7 +277,7 @@ class _Names:
         self._write(point.name, box, colour)
 
     def _crosses(self, start: tuple[float, float], boxes: numpy.ndarray) -> numpy.ndarray:
-        """Return whether a line from a point to its name, in each of the boxes, crosses another name or point."""
+        """Return a mask of boxes for which the line from the point to the box crosses another label or point."""
         ends = numpy.clip(numpy.array(start), boxes[:, :2], boxes[:, 2:])
         x, y = numpy.linspace(numpy.broadcast_to(start, ends.shape), ends, 12, axis=1).T[..., None]
         a, b, c, d = numpy.array(self.points + self.names).reshape(-1, 4).T
@@ -284,7 +286,7 @@ class _Names:
         return found
 
     def _is_nearer(self, point: tuple[float, float], boxes: numpy.ndarray) -> numpy.ndarray:
-        """Return whether a name in each of the boxes is ambiguous, since another point is about as near."""
+        """Return a mask of boxes for which a label is ambiguous, since another point is about as near."""
         taken = numpy.array(self.points)
         centres = 0.5 * (taken[:, :2] + taken[:, 2:])
         apart = numpy.linalg.norm(centres - point, axis=1) > 5.0 * self.pixels
@@ -294,7 +296,7 @@ class _Names:
         return nearer
 
     def _crowding(self, boxes: numpy.ndarray) -> numpy.ndarray:
-        """Return the weighted overlap of each box: points weigh more than lines, names more, and the frame most."""
+        """Return the weighted overlap of each box with lines, points, labels and the frame, in order of weight."""
         left, bottom, right, top = boxes.T[..., None]
         margin = 0.8 * self.pixels
         found = numpy.zeros(len(boxes))
@@ -329,17 +331,17 @@ class _Names:
 
 
 def _nearest(box: Box, point: tuple[float, float]) -> tuple[float, float]:
-    """Return the point of a box that is nearest to another point."""
+    """Return the coordinates of the point of a box that is nearest to another point."""
     return min(max(point[0], box[0]), box[2]), min(max(point[1], box[1]), box[3])
 
 
 def _unit(cosine: numpy.ndarray) -> numpy.ndarray:
-    """Return the side on which a box lies: that of its middle for directions near the other axis."""
+    """Return the offset of a box's centre as a multiple of half its size, -1 to 1, for a direction."""
     return numpy.clip(1.8 * cosine, -1.0, 1.0)
 
 
 def _octaves(percent: Any) -> Any:
-    """Return the logarithm of a cost's ratio to the paper's."""
+    """Return the binary logarithm of the ratio of a cost to the paper's, from their relative difference in %."""
     return numpy.log2(numpy.maximum(1.0 + numpy.asarray(percent) / 100.0, 1e-6))
 
 
@@ -365,7 +367,7 @@ def _colour(point: Point, panel: FrontPanel) -> str:
 
 
 MARKED = ("paper's algorithm", "learned", "yours")
-"""Origins that have a colour at every place."""
+"""Origins of competitors that have a colour whether on the front or not."""
 
 
 def _marker(point: Point, panel: FrontPanel, on_front: bool) -> dict[str, Any]:
@@ -384,7 +386,7 @@ def _marker(point: Point, panel: FrontPanel, on_front: bool) -> dict[str, Any]:
 
 
 def _label_axes(axis: Any, panel: FrontPanel) -> None:
-    """Draw ticks and titles of the axes, and the number of points beyond the top."""
+    """Draw ticks and titles of the axes, and the number of points above the upper limit."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
     low, high = (float(_octaves(end)) for end in axis.get_ylim())

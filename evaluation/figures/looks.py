@@ -1,4 +1,4 @@
-"""Styles of competitors in figures: coloured lines, their order, and lines that are drawn as one."""
+"""Line styles of competitors in figures, choice of the coloured lines, and detection of equal lines."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -13,7 +13,7 @@ LINES = ("-", "--", "-.", ":")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999933")
 LINES_OF_KINDS = {"policy": "-", "estimator": "-", "smoother": "-.", "reference": "--", "bound": ":"}
 OWN = "#9B5DE5"
-"""Colour of the user's competitors."""
+"""Colour of the user's competitor."""
 GREY = "0.72"
 """Colour of lines that are not highlighted."""
 MOST_HIGHLIGHTED = 6
@@ -21,7 +21,7 @@ MOST_HIGHLIGHTED = 6
 
 
 def styles(names: list[str]) -> dict[str, dict[str, Any]]:
-    """Return the colour and line style of each policy, a different pair for each."""
+    """Return a mapping from each name to its colour and line style, all different."""
     n = len(COLOURS)
     return {
         name: {"color": COLOURS[i % n], "linestyle": LINES[(i // n) % len(LINES)], "linewidth": 1.6}
@@ -30,7 +30,7 @@ def styles(names: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def by_cost(curves: xarray.Dataset) -> list[str]:
-    """Return the names of the ranked competitors by mean cost, the lowest first.
+    """Return a list of the names of the ranked competitors, ordered by mean cost, the lowest first.
 
     Without costs the order is by the mean RMSE of the first quantity, and without truth that of the evaluation.
     """
@@ -51,12 +51,12 @@ def choose_highlights(
     learned: Sequence[str] = (),
     own: Sequence[str] = (),
 ) -> list[str]:
-    """Return the names of the highlighted lines, the most important first; of equal lines the first.
+    """Return a list of the names of the lines to highlight, the most important first; of equal lines the first.
 
     Args:
         curves: curves of an evaluation.
-        highlight: names; default: the user's own, the paper's algorithm, the reference, the bound, the best learned and
-            the best classical competitor, and then by cost.
+        highlight: names to highlight; default: the user's own, the paper's algorithm, the reference, the bound, the
+            best learned and the best classical competitor, and then by cost.
         learned: names of learned competitors.
         own: names of the user's competitors.
 
@@ -96,7 +96,7 @@ def choose_highlights(
 
 
 def _same(one: numpy.ndarray, other: numpy.ndarray) -> bool:
-    """Return whether two lines coincide, apart from values that are missing in both."""
+    """Return whether two lines agree within a relative 1e-6, with NaN in the same places; False if all are NaN."""
     missing = numpy.isnan(one).all() and numpy.isnan(other).all()
     return not missing and bool(numpy.allclose(one, other, rtol=1e-6, atol=0.0, equal_nan=True))
 
@@ -107,13 +107,15 @@ def looks(
     learned: Sequence[str] = (),
     own: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """Return the colour, line style and width of the highlighted lines, in the order of the legend.
+    """Return a mapping from the name of each highlighted line to its colour, line style and width.
+
+    The order is that of the legend.
 
     Args:
         curves: curves of an evaluation.
-        highlight: as of :func:`choose_highlights`.
+        highlight: names to highlight; default: as in :func:`choose_highlights`.
         learned: names of learned competitors; their lines are thicker.
-        own: names of the user's competitors; their lines are thicker, and the first has a colour of its own.
+        own: names of the user's competitors; their lines are thicker, and the first has its own colour.
     """
     chosen = choose_highlights(curves, highlight, learned, own)
     kinds = {name: str(curves["kind"].sel(policy=name).values) for name in chosen}
@@ -148,7 +150,7 @@ def looks(
 
 
 def group_equal_lines(names: Iterable[str], values: Mapping[str, numpy.ndarray]) -> dict[str, list[str]]:
-    """Return the names of coinciding lines, by the first of them, in the order of ``names``."""
+    """Return a mapping from the first name of each group of equal lines to all names of the group."""
     found: dict[str, list[str]] = {}
     for name in names:
         twin = next((first for first in found if _same(values[first], values[name])), name)
@@ -159,7 +161,9 @@ def group_equal_lines(names: Iterable[str], values: Mapping[str, numpy.ndarray])
 def distinguish_lines(
     look: Iterable[str], values: Mapping[str, numpy.ndarray]
 ) -> tuple[dict[str, str], list[str]]:
-    """Return the highlighted lines with their labels, and the others; a label names all coinciding lines.
+    """Return the labels of the highlighted lines by name, and the names of the others.
+
+    A label contains the names of all equal lines.
 
     Args:
         look: names of the highlighted lines, in the order of the legend.
@@ -174,8 +178,6 @@ def distinguish_lines(
 
 
 def join_names(names: Sequence[str], most: int = 2) -> str:
-    """Return the name of a line that several share: ``imm = zero``, or of more than ``most`` ``imm = zero = 3
-    more``.
-    """
+    """Return a label for equal lines: ``imm = zero``, or for more than ``most`` of them ``imm = zero = 3 more``."""
     few = len(names) <= most
     return " = ".join(names if few else [*names[:most], f"{len(names) - most} more"])

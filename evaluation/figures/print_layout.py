@@ -1,4 +1,4 @@
-"""Axes for print: widths of a paper's columns, letters, limits, names at the ends of lines, and files."""
+"""Layout of figures for print: widths, fonts, limits of axes, labels of lines, and files."""
 
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,24 +11,24 @@ import numpy
 from ..storage.files import whole_file
 
 MOST_BESIDE = 8
-"""Number of names that fit beside the lowest axes."""
+"""Maximal number of labels that fit beside the lowest axes."""
 WIDTHS = {1: 3.5, 2: 7.16}
 """Widths of one and two columns of a paper, inches."""
 FONT_SIZES = {1: 7.0, 2: 8.0}
-"""Font sizes in print, points: the figure has the width of its place on the page."""
+"""Font sizes in print, points, for figures of one and two columns."""
 FORMATS = ("png", "svg", "pdf")
 DOTS_PER_INCH = 200
 
 
 def check_columns(columns: int) -> int:
-    """Return a number of columns, or raise ValueError if no figure is that wide."""
+    """Return a figure's number of columns unchanged, or raise ValueError if it is not 1 or 2."""
     if columns not in WIDTHS:
         raise ValueError(f"a figure is 1 or 2 columns wide, got {columns}")
     return columns
 
 
 def check_formats(formats: Iterable[str]) -> list[str]:
-    """Return formats, each once, or raise ValueError for one in which no figure is written."""
+    """Return a list of the file formats without repetitions, or raise ValueError for an unsupported one."""
     for each in formats:
         if each not in FORMATS:
             raise ValueError(
@@ -38,7 +38,7 @@ def check_formats(formats: Iterable[str]) -> list[str]:
 
 
 def in_print(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Draw with the sizes of print inside the context, independent of matplotlib's settings."""
+    """Decorate a function that draws a figure, so that it uses the fonts and line widths of print."""
 
     @wraps(draw)
     def draw_in_print(*arguments: Any, columns: int = 2, **keywords: Any) -> Any:
@@ -65,7 +65,7 @@ def in_print(draw: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def figure_with_axes(rows: int = 1, columns: int = 2, height: float | None = None) -> Any:
-    """Return an empty figure and its axes, one above the other, each of a height in inches."""
+    """Return an empty figure and its axes, one above the other; ``height`` is that of each in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -77,7 +77,7 @@ def figure_with_axes(rows: int = 1, columns: int = 2, height: float | None = Non
 
 
 def figure_with_pairs(rows: int, columns: int = 2) -> Any:
-    """Return an empty figure and its axes, two beside each other in every row, ``(rows, 2)``."""
+    """Return an empty figure and its axes, two in every row, ``(rows, 2)``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -87,7 +87,7 @@ def figure_with_pairs(rows: int, columns: int = 2) -> Any:
 
 
 def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
-    """Add a title and a legend, of the first axes or of handles: beside the title where there is room, else below."""
+    """Add a title and a legend to a figure and return it; the legend is beside the title where it fits, else below."""
     width = figure.get_figwidth()
     size = FONT_SIZES[1 if width < 5.0 else 2]
     # Letters are a little wider than half their height.
@@ -112,9 +112,9 @@ def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> 
 
 
 def logarithmic(axis: Any) -> None:
-    """Label a logarithmic axis, whose limits are set, with plain numbers.
+    """Set the tick labels of a logarithmic axis, whose limits are set, to plain numbers.
 
-    These are decades; also 2 and 5 within three decades, 3 within one, and a few round numbers within half of one.
+    Labels are at decades; over three decades also at 2 and 5, over one also at 3, over half of one at round numbers.
     """
     from matplotlib.ticker import MaxNLocator, NullLocator
 
@@ -133,7 +133,7 @@ def sensible_limits(
     always: Sequence[numpy.ndarray] = (),
     bounds: Sequence[numpy.ndarray] = (),
 ) -> tuple[float, float]:
-    """Return the limits of a logarithmic axis on which one line, or a transient, cannot compress all others.
+    """Return lower and upper limit of a logarithmic axis, which one line or a transient does not determine.
 
     A line extends the limits from its 5th percentile, so that it need not begin at zero, to its largest value, but at
     most a factor of six above half of the lines.
@@ -158,13 +158,13 @@ def sensible_limits(
 
 
 def positive(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the values that a logarithmic axis can show."""
+    """Return the finite positive values of an array, which a logarithmic axis can show."""
     found: numpy.ndarray = values[numpy.isfinite(values) & (values > 0.0)]
     return found
 
 
 def _spread(wanted: Sequence[float], gap: float) -> list[float]:
-    """Return places within 0 and 1, as near to the desired ones as a gap between them allows."""
+    """Return places in [0, 1] near the desired ones, with at least a gap between them."""
     order = numpy.argsort(wanted, kind="stable")
     places = numpy.clip(numpy.asarray(wanted, dtype=float)[order], 0.0, 1.0)
     for _ in range(200):
@@ -183,12 +183,12 @@ def _spread(wanted: Sequence[float], gap: float) -> list[float]:
 
 
 def direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float, Any]], rows: int) -> None:
-    """Name lines at their right end.
+    """Write labels of lines at their right ends, beside the axes.
 
     Args:
         figure: figure of the axes.
         axis: axes with their limits and scales set.
-        ends: end of the line and colour, by label.
+        ends: coordinates of the line's end and its colour, by label.
         rows: number of axes above each other in the figure.
     """
     size = FONT_SIZES[1 if figure.get_figwidth() < 5.0 else 2] - 0.5
@@ -211,19 +211,19 @@ def direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float,
 
 
 def room_for_labels(labels: Iterable[str], columns: int) -> bool:
-    """Return whether names fit beside the axes: most of the width remains, and the lowest axes are high enough."""
+    """Return whether labels fit beside the axes, within a third of the width and the height of the lowest axes."""
     labels = list(labels)
     width = 0.5 * (FONT_SIZES[columns] - 0.5) * max(map(len, labels), default=0) / 72.0
     return width <= 0.3 * WIDTHS[columns] and len(labels) <= MOST_BESIDE
 
 
 def wrap_label(label: str, columns: int) -> str:
-    """Wrap a label of an ordinate that is longer than the height of a low panel."""
+    """Return a label of an ordinate with line breaks, so that it fits the height of a panel."""
     return "\n".join(textwrap.wrap(label, 26 if columns == 1 else 32))
 
 
 def save(figure: Any, path: Path) -> None:
-    """Save a figure in the format of its suffix, completely or not at all.
+    """Write a figure to a file atomically, in the format of its suffix.
 
     Formats are ``.png``; ``.svg``, with text as text; ``.pdf``, with embedded fonts. Equal figures give equal files.
 

@@ -1,4 +1,4 @@
-"""Episodes with the highest cost of a competitor, run again for figures: the seed determines an episode."""
+"""Selection of the episodes in which a competitor has the highest cost, and a figure of them."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -11,12 +11,20 @@ import xarray
 from ..running.evaluate import Experiment, Plan, plan_of, run_piece
 from ..running.metrics import mean_cost
 from ..statistics.bootstrap import ratio
-from ..statistics.cause_split import COST, COUNT, EVERYTHING, VARIABLE, cause_sums, held_causes, reason_weight
+from ..statistics.cause_split import (
+    COST,
+    COUNT,
+    EVERYTHING,
+    VARIABLE,
+    active_causes,
+    cause_sums,
+    reason_weight,
+)
 from .looks import COLOURS
 from .print_layout import add_title, figure_with_pairs, in_print
 
 MOST_WORST = 3
-"""Number of episodes in the figure."""
+"""Maximal number of episodes in the figure."""
 MOST_CAUSES = 2
 LEAST_WEIGHT = 0.1
 """Maximal number of main causes of an episode, and the least weight of each."""
@@ -38,7 +46,7 @@ class WorstEpisode(NamedTuple):
 
 
 def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
-    """Return the numbers of the episodes with the highest cost, the worst first.
+    """Return the numbers of the episodes with the highest cost, the highest first.
 
     Args:
         costs: mean cost of every episode; one that is NaN is left out.
@@ -51,7 +59,7 @@ def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
 def run_episodes(
     experiment: Experiment, competitors: Mapping[str, Any], numbers: list[int]
 ) -> xarray.Dataset:
-    """Run some episodes of an experiment again, with the data for figures.
+    """Run some episodes of an experiment again; return their dataset with the data for figures.
 
     Args:
         experiment: experiment of the episodes.
@@ -59,7 +67,7 @@ def run_episodes(
         numbers: numbers of the episodes.
 
     Returns:
-        An evaluation of these episodes, in their order, as of :func:`.evaluate.run_experiment`.
+        Dataset of these episodes, in their order, as from :func:`.evaluate.run_experiment`.
     """
     drawn = replace(experiment, tracks=False, drawn_episodes=len(numbers))
     plan = _with_episodes(plan_of(drawn, competitors), numbers)
@@ -71,14 +79,14 @@ def run_episodes(
 
 
 def _with_episodes(plan: Plan, numbers: list[int]) -> Plan:
-    flown, lengths = (None if each is None else each[numbers] for each in (plan.flown, plan.lengths))
-    return plan._replace(seeds=[plan.seeds[i] for i in numbers], flown=flown, lengths=lengths)
+    flown, lengths = (None if each is None else each[numbers] for each in (plan.flight_numbers, plan.lengths))
+    return plan._replace(seeds=[plan.seeds[i] for i in numbers], flight_numbers=flown, lengths=lengths)
 
 
 def describe_worst(
     dataset: xarray.Dataset, numbers: list[int], name: str, opponent: str = ""
 ) -> list[WorstEpisode]:
-    """Describe some episodes by their costs and main causes.
+    """Return costs, seed and main causes of some episodes of a competitor.
 
     Args:
         dataset: evaluation from :func:`run_episodes`.
@@ -97,7 +105,7 @@ def describe_worst(
 
 
 def main_causes(run: xarray.Dataset) -> list[list[str]]:
-    """Return the main causes of each episode, by :func:`.cause_split.reason_weight`, the heaviest first.
+    """Return a list of the names of each episode's main causes, by weight (:func:`.cause_split.reason_weight`).
 
     Args:
         run: one competitor's part of an evaluation.
@@ -107,7 +115,7 @@ def main_causes(run: xarray.Dataset) -> list[list[str]]:
     """
     if VARIABLE not in run:
         return [[] for _ in range(run.sizes["episode"])]
-    names = [name for name, _ in held_causes(run)]
+    names = [name for name, _ in active_causes(run)]
     sums = cause_sums(run, None)
     weights = reason_weight(_share_of_all(sums[..., COST]), _share_of_all(sums[..., COUNT]))
     weights[:, names.index(EVERYTHING)] = 0.0
@@ -118,7 +126,7 @@ def main_causes(run: xarray.Dataset) -> list[list[str]]:
 
 
 def _share_of_all(sums: numpy.ndarray) -> numpy.ndarray:
-    """Return the share that each cause has of the whole, ``(episodes, causes)``; zero where the whole is zero."""
+    """Return sums by cause over those of all measurements, ``(episodes, causes)``; zero where these are zero."""
     whole = numpy.broadcast_to(sums[:, :1], sums.shape)
     return numpy.nan_to_num(ratio(numpy.stack([sums, whole], axis=1)))
 
@@ -130,7 +138,7 @@ def _share_of_all(sums: numpy.ndarray) -> numpy.ndarray:
 def draw_worst(
     tracks: Sequence[xarray.Dataset], titles: Sequence[tuple[str, str]], name: str, *, columns: int = 2
 ) -> Any:
-    """Draw episodes below each other: true and estimated positions of the target, and the error.
+    """Return a figure of episodes, one in each row: true and estimated positions of the target, and the error.
 
     Args:
         tracks: track of each episode, with ``truth``, optionally ``seen``, ``estimate`` and ``sigma`` over policy,
@@ -162,7 +170,7 @@ def draw_worst(
 
 
 def _draw_positions(axis: Any, track: xarray.Dataset, colours: Mapping[str, str], name: str) -> None:
-    """Draw truth, readings and estimates in the plane, or of the first component over time."""
+    """Draw true, measured and estimated positions in the plane, or the first component over time."""
     plane = bool(track.attrs["plane"])
     clock = track["elapsed" if "elapsed" in track.coords else "time"].values
 
@@ -193,7 +201,7 @@ def _draw_positions(axis: Any, track: xarray.Dataset, colours: Mapping[str, str]
 
 
 def _draw_errors(axis: Any, track: xarray.Dataset, colours: Mapping[str, str]) -> None:
-    """Draw the size of the error in the plane, or of the first component, with the reported two sigmas."""
+    """Draw the size of the error in the plane or of the first component over time, and two reported sigmas."""
     clock = track["elapsed" if "elapsed" in track.coords else "time"].values
     drawn = track.isel(component=slice(2 if track.attrs["plane"] else 1))
     for one in reversed([str(n) for n in track["policy"].values]):

@@ -1,4 +1,4 @@
-"""Curves of an evaluation: one reduction over its episodes, from which all figures are drawn.
+"""Curves of an evaluation over time, by competitor: the data of all its figures.
 
 Bands of ``rmse``, mode and true-class probabilities are 95 % percentile bootstraps over episodes (Efron and Tibshirani:
 An Introduction to the Bootstrap, 1993, 13.3), or over flights where episodes fly several. After the end of shorter
@@ -30,29 +30,29 @@ from .threads import one_thread
 from .times import COORDINATES
 
 SHARES = numpy.geomspace(1e-4, 1.0, 121)
-"""Shares at which the distribution of errors is computed: thirty to a decade."""
+"""Shares of the measurements at which the distribution of errors is computed: thirty to a decade."""
 BAND_RESAMPLES = 200
-"""Resamples of the bootstrap of curves: bands need fewer than intervals of single numbers."""
+"""Number of bootstrap resamples for bands of curves, which need fewer than intervals of single numbers."""
 DISTRIBUTION_LIMIT = 2**21
-"""Maximal number of measurements in a distribution: all must be stored, and more do not change a figure."""
+"""Maximal number of measurements in the distribution of errors: all are stored, and more do not change a figure."""
 PERCENTILES = (10.0, 90.0)
 """Percentiles of actions and gains over episodes."""
 
 MOST_STRETCHES = 100
-"""Maximal number of stretches of an episode for comparing the mean cost over time."""
+"""Maximal number of stretches of an episode in the comparison of mean costs over time."""
 
 ENDINGS = ("", "_low", "_high")
-"""Endings of the names of a curve and of the ends of its band."""
+"""Endings of the variable names of a curve and of the lower and upper ends of its band."""
 
 Curve = dict[str, numpy.ndarray]
-"""Values of a curve and the ends of its band, by the ending of the name."""
+"""Values of a curve and the ends of its band, by the ending of the variable name."""
 Series = tuple[tuple[str, ...], numpy.ndarray]
-"""Dimensions and values of a variable."""
+"""Dimensions and values of a dataset variable."""
 
 
 @one_thread()
 def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarray.Dataset:
-    """Reduce an evaluation to the curves of its figures.
+    """Return the curves of an evaluation's figures as a dataset: errors, consistency, probabilities, actions, costs.
 
     Args:
         dataset: evaluation, in memory or read from a file; also with some of its policies only.
@@ -65,8 +65,7 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
         * ``rmse`` (policy, quantity, time), in the unit of the quantity, with ``rmse_low`` and ``rmse_high``: root of
           the mean square error over episodes;
         * ``error_exceeded`` (policy, quantity, share), in the unit of the quantity: size of error that this share of
-            measurements reaches
-          or exceeds; none of bounds, nor where there are too few measurements for a share;
+          measurements reaches or exceeds; none of bounds, nor where there are too few measurements for a share;
         * ``anees`` and ``anis`` (policy, time): mean NEES and NIS over their dimension, with the 95 % chi-square band
           of that mean, ``anees_low`` and so on, (time);
         * ``mode_probability`` (policy, mode, time) and ``true_class_probability`` (policy, time): means over episodes,
@@ -92,13 +91,13 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
     return stack_curves(found, dataset, bootstrap.episodes)
 
 
-def spread(count: int, most: int) -> numpy.ndarray:
-    """Return at most ``most`` indices of ``count``, spread evenly, with the first and the last."""
+def evenly_spaced(count: int, most: int) -> numpy.ndarray:
+    """Return at most ``most`` evenly spaced indices below ``count``, including the first and the last."""
     return numpy.unique(numpy.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 class CompetitorCurves(NamedTuple):
-    """The curves of one competitor, and the names of its actions and gains."""
+    """Curves of one competitor, and the names of its actions and gains."""
 
     curves: dict[str, numpy.ndarray]
     actions: list[str]
@@ -107,15 +106,15 @@ class CompetitorCurves(NamedTuple):
     """Mean over episodes of the cost in each stretch, in the data and every resample, ``(1 + resamples, stretches)``;
     None for bounds, and without truth."""
 
-    def at_measurements(self, chosen: numpy.ndarray, times: int) -> "CompetitorCurves":
-        """Return the curves at the measurements of these indices, out of ``times``."""
+    def at_measurements(self, indices: numpy.ndarray, times: int) -> "CompetitorCurves":
+        """Return the curves with only the measurements of these indices, out of ``times``."""
         over_time = {key for key, own in self.curves.items() if own.shape[-1:] == (times,)}
-        fewer = {key: own[..., chosen] if key in over_time else own for key, own in self.curves.items()}
+        fewer = {key: own[..., indices] if key in over_time else own for key, own in self.curves.items()}
         return self._replace(curves=fewer)
 
 
 def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
-    """Return the curves from the results of :func:`curve_statistics` over all episodes of a competitor."""
+    """Return the curves of one competitor, from the results of :func:`curve_statistics` over all its episodes."""
     curves = {"mean_cost": numpy.array(results["cost",].mean())} if ("cost",) in results else {}
     labels: dict[str, list[str]] = {}
     for (kind, *words), endings in results.items():
@@ -128,7 +127,7 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
 
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
-    """Return the groups of components, or without groups the first three components, with known truth."""
+    """Return the names of quantities with known truth: groups of components, or the first three components."""
     reported = list(components_and_groups(dataset))
     return [name for name in groups_of(dataset) if name in reported] or reported[:3]
 
@@ -136,7 +135,7 @@ def select_quantities(dataset: xarray.Dataset) -> list[str]:
 def curve_statistics(
     run: xarray.Dataset, episodes: int, resamples: int = BAND_RESAMPLES
 ) -> Iterator[Statistic]:
-    """Declare the statistics of curves by variable, and the names of actions and gains.
+    """Yield the statistics needed for a competitor's curves, as declarations (:class:`.Statistic`).
 
     Args:
         run: some episodes of one competitor.
@@ -191,30 +190,32 @@ DIMENSIONS: dict[str, tuple[str, ...]] = {
 """Dimensions of a curve, after the competitor."""
 
 
-def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, episodes: int) -> xarray.Dataset:
-    """Combine the curves of several competitors in a dataset.
+def stack_curves(
+    competitors: Sequence[CompetitorCurves], dataset: xarray.Dataset, episodes: int
+) -> xarray.Dataset:
+    """Return the curves of several competitors as one dataset, see :func:`curves_of`.
 
     Args:
-        found: curves in the order of the policies of the evaluation.
+        competitors: curves in the order of the policies of the evaluation.
         dataset: the evaluation, of which only coordinates and attributes are needed.
         episodes: number of episodes of the curves.
     """
     units, shown = components_and_groups(dataset), select_quantities(dataset)
     names = {
-        "action_name": list(dict.fromkeys(name for each in found for name in each.actions)),
-        "gain_name": list(dict.fromkeys(name for each in found for name in each.gains)),
+        "action_name": list(dict.fromkeys(name for each in competitors for name in each.actions)),
+        "gain_name": list(dict.fromkeys(name for each in competitors for name in each.gains)),
     }
     variables: dict[str, Series] = {}
     for key, dims in DIMENSIONS.items():
         for ending in ENDINGS:
-            own = [each.curves.get(key + ending) for each in found]
+            own = [each.curves.get(key + ending) for each in competitors]
             shapes = [values.shape for values in own if values is not None]
             if not shapes:
                 continue
             listed = names.get(dims[0], []) if dims else []
             shape = (len(listed), *shapes[0][1:]) if listed else shapes[0]
-            stacked = numpy.full((len(found), *shape), numpy.nan)
-            for i, (values, each) in enumerate(zip(own, found, strict=True)):
+            stacked = numpy.full((len(competitors), *shape), numpy.nan)
+            for i, (values, each) in enumerate(zip(own, competitors, strict=True)):
                 if values is not None and listed:
                     of = each.actions if key == "action" else each.gains
                     stacked[i, [listed.index(name) for name in of]] = values
@@ -224,10 +225,10 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
                 key in variables or not numpy.isnan(stacked).all()
             ):  # a curve without a band has NaN for its ends
                 variables[key + ending] = (("policy", *dims), stacked)
-    variables |= _consistency_bands(found)
-    best = _cheapest(found, dataset)
+    variables |= _consistency_bands(competitors)
+    best = _cheapest(competitors, dataset)
     bases = {"paper": dataset.attrs["paper"], "best": best}
-    differences = _cost_differences(found, dataset["policy"].values.tolist(), bases)
+    differences = _cost_differences(competitors, dataset["policy"].values.tolist(), bases)
     variables |= differences
     coords: dict[str, Any] = {
         name: dataset[name].variable
@@ -263,7 +264,7 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
 
 
 def stretches_of(times: int) -> list[slice]:
-    """Cut an episode into at most ``MOST_STRETCHES`` stretches of one length; the last may be shorter.
+    """Return the slices of at most ``MOST_STRETCHES`` stretches of an episode; the last may be shorter.
 
     Args:
         times: number of its measurements.
@@ -273,22 +274,17 @@ def stretches_of(times: int) -> list[slice]:
 
 
 def cost_in_stretches(cost: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean cost of every episode in each stretch, NaN where it has none.
+    """Return the mean cost in each stretch of every episode, ``(episodes, stretches)``; NaN where it has no cost.
 
     Args:
         cost: ``(episodes, time)``; NaN where there is none.
-
-    Returns:
-        ``(episodes, stretches)``.
     """
     means = [ratio(sums_of_present(cost[:, stretch])) for stretch in stretches_of(cost.shape[1])]
     return numpy.stack(means, axis=1)
 
 
 def _stretch_coords(dataset: xarray.Dataset) -> dict[str, Any]:
-    """Return the middle of every stretch, as the number of a measurement and, where they come regularly, in
-    seconds.
-    """
+    """Return the middle of each stretch as coordinates: measurement number, and seconds for constant intervals."""
     middles = {
         name: [float(dataset[name].values[stretch].mean()) for stretch in stretches_of(dataset.sizes["time"])]
         for name in ("time", "elapsed")
@@ -301,7 +297,7 @@ def _stretch_coords(dataset: xarray.Dataset) -> dict[str, Any]:
 
 
 def _cheapest(found: Sequence[CompetitorCurves], dataset: xarray.Dataset) -> str:
-    """Return the name of the best ranked competitor; empty where none is ranked."""
+    """Return the name of the ranked competitor with the lowest mean cost; empty if none is ranked."""
     named = zip(dataset["policy"].values.tolist(), dataset["kind"].values.tolist(), found, strict=True)
     means = {
         str(name): float(each.curves["mean_cost"])
@@ -314,7 +310,7 @@ def _cheapest(found: Sequence[CompetitorCurves], dataset: xarray.Dataset) -> str
 def _cost_differences(
     found: Sequence[CompetitorCurves], names: Sequence[str], bases: Mapping[str, str]
 ) -> dict[str, Series]:
-    """Return the mean cost over time less that of other competitors, paired.
+    """Return the dataset variables of mean costs over time minus those of other competitors, paired, with bands.
 
     Args:
         found: curves in the order of the names.
@@ -336,7 +332,7 @@ def _cost_differences(
 
 
 def gains_of(dataset: xarray.Dataset) -> list[str]:
-    """Return the names of the gains that a bank records, one number for every measurement."""
+    """Return the names of the dataset's variables that are gains of a bank, one number for every measurement."""
     names = map(str, dataset.data_vars)
     return [
         name
@@ -349,7 +345,7 @@ def gains_of(dataset: xarray.Dataset) -> list[str]:
 
 
 def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
-    """Return the size that a share of errors reaches or exceeds, for each of :data:`SHARES`.
+    """Return the size of error that each share :data:`SHARES` of the errors reaches or exceeds, ``(shares,)``.
 
     Args:
         errors: non-negative errors of any shape; NaN is left out.
@@ -367,7 +363,7 @@ def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
 
 
 def _consistency_bands(found: Sequence[CompetitorCurves]) -> dict[str, Series]:
-    """Declare the 95 % intervals of mean NEES and NIS over their dimension for a consistent filter.
+    """Return the dataset variables of the 95 % bands of ANEES and ANIS for a consistent filter.
 
     A sum of independent chi-square numbers is chi-square with the sum of their degrees (Bar-Shalom, Li, Kirubarajan:
     Estimation with Applications to Tracking and Navigation, 2001, 5.4).
@@ -388,7 +384,7 @@ def _consistency_bands(found: Sequence[CompetitorCurves]) -> dict[str, Series]:
 
 
 def _spread(values: numpy.ndarray) -> Curve:
-    """Return the mean and percentiles over the episodes of ``(episodes, name, time)``."""
+    """Return the mean and the 10 and 90 % percentiles over episodes of values ``(episodes, name, time)``."""
     flat = values.reshape(len(values), -1)
     found = numpy.full((3, flat.shape[1]), numpy.nan)
     absent = numpy.isnan(flat)
@@ -415,5 +411,5 @@ def _exceedance(squares: numpy.ndarray) -> Curve:
 
 
 def _over_dimension(episodes: int, means: numpy.ndarray) -> Curve:
-    """Return the mean NEES or NIS over its dimension, and the sum of dimensions, from both means, ``(1, 2, time)``."""
+    """Return the ANEES or ANIS and the sum of dimensions over time, from the means of both sums, ``(1, 2, time)``."""
     return {"": ratio(means)[0], "_dimension": episodes * means[0, 1]}

@@ -1,4 +1,4 @@
-"""Monte Carlo evaluation: every policy, estimator, smoother, reference and bound on identical noise.
+"""Monte Carlo evaluation of policies, estimators, smoothers, references and bounds on identical noise.
 
 The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`run_experiment`.
 """
@@ -33,8 +33,8 @@ from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
-from .stored_values import StoredValues, limits
-from .supervision import running
+from .stored_values import StoredValues, bound_values
+from .supervision import report_running
 from .threads import one_thread
 from .times import with_times
 
@@ -43,13 +43,15 @@ if TYPE_CHECKING:
 
 
 def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> str:
-    """Return the control that a run uses: the policy's own, or the one that fits a model's spaces.
+    """Return the name of the control (the quantity that actions change) in which a competitor runs.
+
+    It is the policy's own, or one whose spaces fit those of a learned model.
 
     Args:
         maker: maker of the competitor, or the competitor itself.
         control: required control; None: any.
         cls: task class of the environment.
-        name: name of the competitor in errors.
+        name: name of the competitor, for error messages.
 
     Raises:
         ValueError: if the competitor cannot act in the required control, or in any.
@@ -79,7 +81,7 @@ def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> s
 
 
 def check_observation(model: Model, policy: Any, name: str) -> None:
-    """Raise ValueError if a model expects observations of another shape than the task's, or privileged ones."""
+    """Raise ValueError if a learned policy expects observations of another shape, or privileged ones."""
     space = getattr(policy, "observation_space", None)
     if isinstance(space, gymnasium.spaces.Dict):
         raise ValueError(
@@ -99,34 +101,33 @@ OPTIONS = (
     "scenario", "episodes", "seed", "split", "control", "tracks", "drawn_episodes", "backend", "threads", "strict",
     "timed",
 )  # fmt: skip
-"""Fields of an experiment that a user gives together with parameters of the task."""
+"""Names of the fields of an experiment that a user can give as keywords, together with parameters of the task."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Environment, episodes and options of an evaluation.
-
-    Plain data for any process; another process finds the environment by its name.
-    """
+    """Environment, episodes and options of an evaluation, as plain data for any process."""
 
     task: type[Task]
     """Class of the environment's task."""
     scenario: Any = None
     """Name of a scenario, a trajectory, a set of flights, or a recording; None: the training distribution."""
     episodes: int = 500
-    """Monte Carlo runs M. Every flight of a set gets as many, so they may be rounded up. Of a recording every episode
-    is replayed once, independent of this number."""
+    """Number of Monte Carlo runs M; for a set of flights rounded up to the same number for each. A recording is
+    replayed once, independent of it.
+    """
     seed: int = 0
     """Seed of the experiment."""
     split: str = "test"
     """One of "test", "validation" and "train", which have no episode in common."""
     control: str | None = None
-    """Required control; None: every policy runs in its own."""
+    """Name of the control in which all policies run; None: every policy runs in its own."""
     tracks: bool = False
-    """Store the data of plots of tracks, see :meth:`.Task.track`; they take memory."""
+    """Whether to store the data for plots of tracks, see :meth:`.Task.track`; they need memory."""
     drawn_episodes: int = 0
-    """Number of first episodes for which the values of :meth:`.Task.drawn` are stored, as ``drawn_estimate`` and so on
-    over policy, drawn_episode and time."""
+    """Number of first episodes with data for pictures, :meth:`.Task.drawn`: variables ``drawn_estimate`` and so on,
+    over policy, drawn_episode and time.
+    """
     paper: str = ""
     """Name of the paper's algorithm, whose score is 0; stored in the attributes of the evaluation."""
     reference: str = ""
@@ -136,23 +137,27 @@ class Experiment:
     threads: int = 1
     """Number of threads that share the episodes, with the compiled backend."""
     strict: bool = False
-    """Raise where an estimator would lose an episode, see :class:`.filters.CheckedFilter`."""
+    """Whether to raise an error where an estimator would lose an episode, see :class:`.filters.CheckedFilter`."""
     timed: bool = False
-    """Measure the processor time of every competitor, the coordinates ``nanoseconds`` and ``compiled``: the only
-    results that differ from run to run."""
+    """Whether to measure the processor time of every competitor, as coordinates ``nanoseconds`` and ``compiled``: the
+    only results that differ from run to run.
+    """
     keywords: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters of the task."""
+    """Parameters of the task by name."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         others = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "task"}
         return _experiment_on, (importable_name(self.task), others)
 
     def make_task(self) -> Task:
-        """Make the task, with its scenario and the parameters."""
+        """Return the task of the environment, with the scenario and the parameters."""
         return make_task(self.task, self.scenario, **self.keywords)
 
     def make_model(self, maker: Any, control: str) -> Model:
-        """Make the model that a competitor acts in; the experiment's keywords override those tuned with it."""
+        """Return the model (task, bank and control) in which a competitor runs.
+
+        The experiment's keywords override those that the competitor was tuned with.
+        """
         keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
         return make_model(
             self.task, control, self.scenario, backend=self.backend, threads=self.threads, **keywords
@@ -160,7 +165,7 @@ class Experiment:
 
 
 def _experiment_on(name: str, others: Mapping[str, Any]) -> Experiment:
-    """Return the experiment that another process has sent, on the environment of this name."""
+    """Return an experiment on the environment of this name, from the other fields; for unpickling."""
     return Experiment(task_class(name), **others)
 
 
@@ -171,7 +176,7 @@ def run_experiment(
     progress: Progress | None = None,
     workers: Workers | None = None,
 ) -> "xarray.Dataset":
-    """Run policies, estimators, references and bounds over the same episodes.
+    """Run policies, estimators, references and bounds over the same episodes; return a dataset of all values.
 
     Args:
         experiment: the episodes and options.
@@ -212,7 +217,7 @@ def run_competitors(
     progress: Progress | None = None,
     workers: Workers | None = None,
 ) -> "xarray.Dataset":
-    """Return the evaluation of :func:`run_experiment`, without its note on intervals."""
+    """Return the dataset of :func:`run_experiment`, without its note on intervals of a single episode."""
     if progress is not None and not callable(progress):
         raise ValueError(
             f"progress must be a function of the number of measurements done, got {quote_shortened(progress)}"
@@ -238,7 +243,7 @@ def run_competitors(
 
 
 class Piece(NamedTuple):
-    """Some episodes of one competitor, as plain data for any process."""
+    """Some episodes of one competitor as a unit of parallel work: plain data for any process."""
 
     experiment: Experiment
     name: str
@@ -250,39 +255,36 @@ class Piece(NamedTuple):
     """Number of the first episode."""
     horizon: int
     model: Model | None
-    """Model that already exists in this process."""
+    """Model, if it already exists in this process."""
 
     @property
     def part(self) -> slice:
-        """Slice of the evaluation's episodes."""
+        """Slice of these episodes among all episodes of the evaluation."""
         return slice(self.first, self.first + len(self.seeds))
 
 
 LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
-"""Names of the likelihood statistics, which only some estimators and references report."""
+"""Names of the likelihood statistics, which only some estimators and references return."""
 
 
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
-    """Run some episodes of one competitor; return the stored values of every measurement, ``(episodes, time, ...)``.
-
-    For a policy whose action is a box they include ``action``, clipped to the limits of the box, as every bank does.
-    """
+    """Run some episodes of one competitor; return its values at all measurements by name, ``(episodes, time, ...)``."""
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
     kept, drawn = StoredValues(experiment.tracks), None
-    report: Report = limits if kind == "bound" else kept
+    report: Report = bound_values if kind == "bound" else kept
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
         drawn = replace(kept, drawings=True), most
     # Code that is timed afterwards is optimised here: so nothing is compiled in two ways.
     with (
         optimised_code() if experiment.timed else nullcontext(),
-        running(piece.name, tick) as report_progress,
+        report_running(piece.name, tick) as report_progress,
     ):
-        flown = run_episodes(
+        result = run_episodes(
             model, piece.maker, kind, piece.seeds, report, piece.name, report_progress, drawn
         )
-    arrays = dict(flown.found)
+    arrays = dict(result.found)
     if kind == "policy":
         _check_reserved(model, arrays)
     if experiment.strict and "lost" in arrays and arrays["lost"].any():
@@ -293,8 +295,8 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
         raise ValueError(
             f"estimator {piece.name!r}: {reason} in episode {piece.first + i} at measurement {k + 1}"
         )
-    if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
-        box, action = model.action_space, numpy.asarray(flown.action, dtype=numpy.float64)
+    if result.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
+        box, action = model.action_space, numpy.asarray(result.action, dtype=numpy.float64)
         arrays["action"] = numpy.clip(action, box.low, box.high).reshape(*action.shape[:2], -1)
     if kind in ("estimator", "smoother", "reference"):
         for name in LIKELIHOOD:
@@ -304,7 +306,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
 
 
 def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
-    """Raise ValueError if a task records something under a name that the evaluation of a policy needs."""
+    """Raise ValueError if a task records a value under the name ``action`` or ``lost``."""
     for taken in {"action", "lost"} & found.keys():
         raise ValueError(
             f"{model.task.id} records a value named {taken!r}, a name that an evaluation uses for "
@@ -313,10 +315,10 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
 
 
 class Plan(NamedTuple):
-    """An evaluation before its episodes are run, with all its arguments checked."""
+    """Prepared evaluation: its episodes and models, from checked arguments."""
 
     experiment: Experiment
-    """The experiment with its scenario opened."""
+    """The experiment; its scenario is read from files."""
     competitors: Mapping[str, Any]
     kinds: dict[str, Kind]
     models: dict[str, Model]
@@ -325,12 +327,12 @@ class Plan(NamedTuple):
     """Seeds of the planned episodes."""
     first: int
     """Number of the first planned episode."""
-    flown: numpy.ndarray | None
+    flight_numbers: numpy.ndarray | None
     """Number of the flight of each episode."""
     lengths: numpy.ndarray | None
 
     def piece(self, name: str, first: int, count: int, here: bool) -> Piece:
-        """Return some episodes of a competitor as a piece of work, with its task if it runs in this process."""
+        """Return some episodes of a competitor as a unit of parallel work; ``here``: with its model."""
         model = self.models[name]
         return Piece(
             self.experiment,
@@ -345,14 +347,12 @@ class Plan(NamedTuple):
         )
 
     def time(self, name: str) -> ProcessorTime | None:
-        """Measure the processor time of a competitor, see :func:`.rollout.measure_time`."""
-        with running(name, timed=False):
+        """Return the measured processor time of a competitor, see :func:`.rollout.measure_time`."""
+        with report_running(name, timed=False):
             return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
     def arrays(self, episodes: int, drawn: int) -> StackedArrays:
-        """Return arrays for the stored values of the episodes of every competitor; arguments as of
-        :class:`.StackedArrays`.
-        """
+        """Return preallocated arrays for the values of all competitors in some episodes."""
         acting = [
             name
             for name, model in self.models.items()
@@ -360,21 +360,21 @@ class Plan(NamedTuple):
         ]
         return StackedArrays(self.models, acting, episodes, drawn)
 
-    def dataset(self, kept: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
-        """Return the stored values of some competitors or episodes as an evaluation."""
+    def dataset(self, arrays: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
+        """Return the dataset of an evaluation from the arrays of values and the seeds of their episodes."""
         experiment = self.experiment
-        dataset = with_named_axes(kept, self.kinds, self.models, self.scenario.windows, seeds)
-        if self.flown is not None and self.lengths is not None:
+        dataset = with_named_axes(arrays, self.kinds, self.models, self.scenario.windows, seeds)
+        if self.flight_numbers is not None and self.lengths is not None:
             beyond = dataset["time"].values > self.lengths[:, None]
             for values in dataset.data_vars.values() if beyond.any() else ():
                 values.values[:, beyond[: values.shape[1]]] = numpy.nan
             dataset = dataset.assign_coords(
-                flight=("episode", [self.scenario.flights[i] for i in self.flown]),
+                flight=("episode", [self.scenario.flights[i] for i in self.flight_numbers]),
                 length=("episode", self.lengths),
             )
             if self.scenario.recording is not None:
                 dataset = dataset.assign_coords(
-                    recording_coords(self.scenario.recording, self.flown, dataset)
+                    recording_coords(self.scenario.recording, self.flight_numbers, dataset)
                 )
                 dataset = with_innovations(dataset, next(iter(self.models.values())).task)
         task = next(iter(self.models.values())).task
@@ -397,13 +397,15 @@ class Plan(NamedTuple):
 def plan_of(
     experiment: Experiment, competitors: Mapping[str, Any], first: int = 0, end: int | None = None
 ) -> Plan:
-    """Return the plan of an evaluation; errors as of :func:`run_experiment`.
+    """Check the arguments of an evaluation; return its episodes, models and kinds of competitors.
+
+    Errors as of :func:`run_experiment`.
 
     Args:
         experiment: the episodes and options.
         competitors: competitors by name.
         first: number of the first planned episode; for flights and recordings all episodes are planned.
-        end: number after the last planned episode; None, with a first of 0: all.
+        end: number after the last planned episode; None with ``first=0``: all.
     """
     cls = experiment.task
     experiment = replace(
@@ -458,7 +460,7 @@ def plan_of(
 
 
 def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
-    """Raise ValueError for a task or a competitor that cannot be sent to another process, or found there.
+    """Raise ValueError for a task or competitor that another process cannot import or unpickle.
 
     Args:
         task: task class of the environment.
@@ -481,10 +483,7 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
 def _flights_in_turn(
     model: Model, split: str, seed: int, episodes: int
 ) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
-    """Return seeds, in their order, with the same number for every flight, and the flight and length of each.
-
-    The seed alone determines an episode. With fewer episodes than flights there is one of each flight.
-    """
+    """Return seeds, flight numbers and lengths of episodes that fly each flight equally often, at least once."""
     count = len(model.task.flights)
     share = -(-episodes // count)
     found: list[int] = []

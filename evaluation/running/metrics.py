@@ -1,4 +1,4 @@
-"""Tidy records of an evaluation, computed from its dataset alone.
+"""Records: the statistics of every competitor of an evaluation, each with its interval, in long form.
 
 A record is one number with its 95 % bootstrap interval over episodes, or over flights where episodes fly several.
 Differences and ratios are paired: numerator and denominator are resampled together.
@@ -13,7 +13,14 @@ import numpy
 
 from ..competitors.kinds import RANKED
 from ..statistics.bootstrap import RESAMPLES, Bootstrap, IntervalEstimate, ratio, share_interval
-from ..statistics.cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
+from ..statistics.cause_split import (
+    EVERYTHING,
+    CauseCosts,
+    cause_sums,
+    compare_by_cause,
+    opponent_of,
+    split_by_cause,
+)
 from ..statistics.cause_split import VARIABLE as CAUSES
 from ..statistics.predictions import correlation, stretch_interval
 from ..statistics.statistic import ALL, Function, Key, Reduction, Statistic, identity, reduce_run
@@ -37,11 +44,11 @@ if TYPE_CHECKING:
 
 NOTHING = IntervalEstimate(math.nan, math.nan, math.nan)
 NEGLIGIBLE = 5e-5
-"""Relative difference of costs that counts as rounding."""
+"""Relative difference of costs below which they count as equal."""
 
 
 class Record(NamedTuple):
-    """One number of one competitor in one window."""
+    """One statistic of one competitor over one window, with its 95 % interval."""
 
     environment: str
     control: str
@@ -65,7 +72,7 @@ class Record(NamedTuple):
 def squared_errors(
     run: "xarray.Dataset", component: str, groups: dict[str, tuple[str, ...]]
 ) -> numpy.ndarray:
-    """Return the squared error of a component or group in one run, ``(episodes, time)``; for a bound its mean."""
+    """Return the squared errors of a component or group in one run, ``(episodes, time)``; for bounds the mean ones."""
     parts = list(groups.get(component, (component,)))
     if "mean_square" in run and not numpy.isnan(run["mean_square"].values[0, 0, 0]):
         return run["mean_square"].sel(component=parts).sum("component", skipna=False).values
@@ -73,7 +80,7 @@ def squared_errors(
 
 
 def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Return the components and groups of components whose truth is known, with their units."""
+    """Return a mapping from each component and group with known truth to its unit."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
     if "truth_known" in dataset.coords:
         known = dataset["truth_known"].values > 0
@@ -83,43 +90,43 @@ def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
 
 
 def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the sum of every episode over the times and the number of terms; :func:`.bootstrap.ratio` gives the mean.
+    """Return the sum and number of the values that are not NaN in every episode, ``(episodes, 2)``.
+
+    :func:`.bootstrap.ratio` gives their means.
 
     Args:
         values: ``(episodes, time)``; NaN stands for no measurement, or no event.
-
-    Returns:
-        ``(episodes, 2)``.
     """
     present = ~numpy.isnan(values)
     return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
 
 
 def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
-    """Return the bootstrap over the episodes of an evaluation, or over whole flights where they fly several."""
+    """Return the bootstrap over the episodes of an evaluation, or over its flights."""
     clusters = tuple(dataset["flight"].values.tolist()) if "flight" in dataset.coords else None
-    return resampling(dataset.sizes["episode"], resamples, clusters)
+    return cached_bootstrap(dataset.sizes["episode"], resamples, clusters)
 
 
 @functools.lru_cache(maxsize=2)
-def resampling(
+def cached_bootstrap(
     episodes: int, resamples: int = RESAMPLES, clusters: tuple[str, ...] | None = None
 ) -> Bootstrap:
-    """Return the bootstrap over a number of episodes, cached since many episodes take a while."""
+    """Return the bootstrap over a number of episodes, or over clusters of them, from a cache."""
     return Bootstrap(episodes, resamples, clusters=clusters)
 
 
 def units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
-    """Return the units of time for resampling one long episode; None for several episodes or a short one."""
+    """Return the division of one long episode into units of time; None for several episodes or a short one."""
     if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST:
         return TimeUnits(dataset.sizes["time"])
     return None
 
 
 def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | None:
-    """Return sums in units of time, ``(units, 2)``, which determine the length of blocks.
+    """Return sums and numbers of one competitor's costs in units of time, ``(units, 2)``.
 
-    They are sums of the cost, without truth of the log-likelihood; None where neither is known.
+    They determine the length of blocks. Without truth they are sums of the log-likelihood; None where neither is
+    known.
     """
     known = [name for name in ("cost", "log_likelihood") if name in run]
     return units.sums_of_present(run[known[0]].values) if known else None
@@ -128,7 +135,7 @@ def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | N
 def bootstrap_over_time(
     units: TimeUnits, series: Sequence[numpy.ndarray | None], resamples: int = RESAMPLES
 ) -> Bootstrap:
-    """Return the bootstrap over one episode, with blocks as long as the ``series`` of all competitors require."""
+    """Return the bootstrap over blocks of one episode; the series of all competitors determine their length."""
     known = [one for one in series if one is not None]
     return BlockBootstrap(units, known, resamples) if known else Bootstrap(1, resamples)
 
@@ -142,25 +149,25 @@ def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Boots
 
 
 class Reduced(NamedTuple):
-    """Statistics of one competitor for its records; for one episode sums in units of time."""
+    """Sums and samples over one competitor's episodes, from which its records follow."""
 
     reduction: Reduction
     units: TimeUnits | None
     """Units of time of one long episode."""
     series: numpy.ndarray | None
-    """As of :func:`sums_over_time`."""
+    """Sums of the cost or log-likelihood in units of time, from :func:`sums_over_time`."""
     predictions: list[Measure]
     run: "xarray.Dataset"
-    """Its part of an evaluation, of which only coordinates and attributes are needed."""
+    """The competitor's part of an evaluation, of which only coordinates and attributes are needed."""
 
     def without_variables(self) -> "Reduced":
-        """Return the statistics with only coordinates and attributes of the evaluation at its first measurement."""
+        """Return a copy without the values of the dataset, which saves memory."""
         run = self.run.drop_vars(list(self.run.data_vars))
         return self._replace(run=run.isel(time=slice(0, 1)).copy(deep=True))
 
 
 def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
-    """Reduce a competitor's part of an evaluation to the statistics for its records; no ``metrics`` for recordings."""
+    """Return the sums and samples over one competitor's episodes, from which its records follow."""
     # An environment's own metrics need more of the truth than a recording contains.
     own = None if run.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)
@@ -171,7 +178,7 @@ def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) 
 
 
 def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset") -> Bootstrap:
-    """Return the bootstrap over a reduced evaluation, equal to that of :func:`bootstrap_of`."""
+    """Return the bootstrap over the episodes of a reduced evaluation; for one episode over blocks of time."""
     if (units := reduced[0].units) is None:
         return bootstrap_of_episodes(evaluation)
     return bootstrap_over_time(units, [one.series for one in reduced])
@@ -180,12 +187,12 @@ def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset
 def records_of_reduced(
     reduced: Sequence[Reduced], evaluation: "xarray.Dataset", metrics: OwnMetrics | None = None
 ) -> list[Record]:
-    """Return every record of an evaluation.
+    """Return all records of an evaluation, from its reduced competitors.
 
     Args:
         reduced: all competitors, from :func:`reduce_competitor`.
-        evaluation: gives the coordinates and attributes.
-        metrics: as of :func:`reduce_competitor`.
+        evaluation: dataset with the coordinates and attributes.
+        metrics: metrics of the environment; not used for recordings.
     """
     own = None if evaluation.attrs.get("recorded") else metrics
     bootstrap = bootstrap_of_reduced(reduced, evaluation)
@@ -198,7 +205,7 @@ def records_of_reduced(
 
 
 def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean of each episode, ``(episodes,)``; where flights differ in length, over its own.
+    """Return the means over time of values ``(episodes, time)``; NaN beyond the end of a flight is left out.
 
     Args:
         run: part of the evaluation with the values.
@@ -217,7 +224,9 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
 def record_statistics(
     run: "xarray.Dataset", episodes: int, metrics: OwnMetrics | None = None
 ) -> Iterator[Statistic]:
-    """Declare the statistics for records, by metric, component, window and unit, and the cost of every episode.
+    """Yield the statistics needed for a competitor's records, as declarations (:class:`.Statistic`).
+
+    Their keys contain metric, component, window and unit. The costs of all episodes are declared, too.
 
     Args:
         run: some episodes of one competitor.
@@ -229,7 +238,7 @@ def record_statistics(
     judged = run.attrs.get("truth", True)
 
     def means(metric: str, component: str, unit: str, values: Any, function: Function = identity) -> Any:
-        """Return the mean over every window."""
+        """Yield the statistic of a mean over time for each window."""
         for window, times in slices.items():
             key, mean = ("record", metric, component, window, unit), mean_over_time(run, values[:, times])
             yield Statistic(key, mean, function, of_units=_units(values, times))
@@ -280,22 +289,22 @@ def record_statistics(
 def _mean_of_present(
     metric: str, component: str, window: str, unit: str, values: numpy.ndarray, times: slice
 ) -> Statistic:
-    """Return the mean over episodes and times of the numbers that are not NaN; a block of episodes may have none."""
+    """Return the declaration of a mean over episodes and times, without NaN; a block of episodes may have only NaN."""
     key, sums = ("record", metric, component, window, unit), sums_of_present(values[:, times])
     return Statistic(key, sums, ratio, optional=True, of_units=_units(values, times))
 
 
 def _units(values: numpy.ndarray, times: slice) -> Callable[[TimeUnits], numpy.ndarray]:
-    """Return a function that sums values of one episode, ``(1, time)``, in units of time."""
+    """Return a function from units of time to sums and numbers of one episode's values ``(1, time)`` in them."""
     return functools.partial(TimeUnits.sums_of_present, values=values, times=times)
 
 
 def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[Statistic]:
-    """Declare the consistency statistics of errors and innovations with their covariances: one, and 95 %, if
-    consistent.
+    """Yield the declarations of the statistics of NEES or NIS: mean over the dimension, share in the interval.
 
-    The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
-    interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4).
+    Of a consistent filter the mean is one, and 95 % of the measurements are inside the chi-square distribution's
+    two-sided interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001,
+    5.4).
     """
     component = "state" if metric == "nees" else "measurement"
     normalised, degrees = _over_dimension(run, metric)
@@ -314,16 +323,14 @@ def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[
 
 
 def _over_dimension(run: "xarray.Dataset", metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the NEES or NIS over its dimension, NaN where there is none, and that dimension, in the shape of the
-    variable.
-    """
+    """Return NEES or NIS over its dimension, and the dimension, ``(episodes, time)`` each; NaN for neither."""
     degrees = consistency_degrees(run, metric)
     some = numpy.where(degrees > 0.0, degrees, 1.0)
     return numpy.where(degrees > 0.0, run[metric].values / some, numpy.nan), degrees
 
 
 def _band(means: numpy.ndarray, episodes: int) -> IntervalEstimate:
-    """Return the 95 % interval of the mean of chi-square numbers, each over its degrees of freedom.
+    """Return the 95 % interval of ANIS for a consistent filter: the mean of chi-square numbers over their degrees.
 
     It follows from the chi-square distribution of the same variance, which is exact where all degrees are equal.
 
@@ -341,13 +348,13 @@ def _band(means: numpy.ndarray, episodes: int) -> IntervalEstimate:
 
 
 def consistency_metrics(run: "xarray.Dataset") -> list[str]:
-    """Return which of ``nees`` and ``nis`` exist; the latter requires its dimension, ``nis_degrees``."""
+    """Return the names among ``nees`` and ``nis`` that a run contains; ``nis`` requires ``nis_degrees``."""
     present = ["nees"] * ("nees" in run) + ["nis"] * ("nis" in run and "nis_degrees" in run)
     return [metric for metric in present if not numpy.isnan(run[metric].values).all()]
 
 
 def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
-    """Return the dimension of ``nees`` or ``nis``, in the shape of the variable."""
+    """Return the degrees of freedom of ``nees`` or ``nis`` at each measurement, ``(episodes, time)``."""
     if metric == "nis":
         return numpy.nan_to_num(run["nis_degrees"].values)
     # A filter that reports all components has no degrees, though others in the same evaluation may have them.
@@ -356,7 +363,7 @@ def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
 
 
 def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
-    """Return the quantile of the chi-square distribution.
+    """Return the quantile of the chi-square distribution, for an array of degrees of freedom.
 
     Args:
         probability: probability of smaller numbers.
@@ -374,9 +381,7 @@ def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
 
 
 def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of
-    freedom.
-    """
+    """Return the ends of the two-sided 95 % interval of the mean over ``runs`` of chi-square numbers."""
     low, high = (chi_square_quantile(p, runs * degrees) / runs for p in (0.025, 0.975))
     return low, high
 
@@ -384,7 +389,10 @@ def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarra
 def score(
     cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
 ) -> IntervalEstimate:
-    """Return ``(C_paper - C) / (C_paper - C_reference)`` of means and resampled means of costs or their logarithms."""
+    """Return ``(C_paper - C) / (C_paper - C_reference)`` with its interval; NaN if the reference is hardly better.
+
+    Each is the mean of costs or log costs in the data and every resample, ``(1 + resamples,)``.
+    """
     room = paper - reference
     # Where the reference is not significantly better than the paper, a ratio to their difference means nothing, and
     # where it is worse, a higher cost would give a higher score.
@@ -392,15 +400,15 @@ def score(
 
 
 class Contender(NamedTuple):
-    """A competitor with the statistics for its records."""
+    """One competitor with its statistics, for comparisons with the others and its records."""
 
     name: str
     kind: str
     control: str
     measures: list[Measure]
-    """Measures of this competitor alone."""
+    """Statistics of this competitor alone."""
     further: list[Measure]
-    """Measures of the environment."""
+    """Statistics that the environment defines, and those by cause."""
     costs: numpy.ndarray | None
     """Mean cost of every episode; None for bounds, and without truth."""
     losses: Losses | None
@@ -411,12 +419,12 @@ class Contender(NamedTuple):
 
 
 def mean_cost(dataset: "xarray.Dataset", name: str) -> numpy.ndarray:
-    """Return the mean cost of every episode of one competitor, ``(episodes,)``."""
+    """Return the mean cost over time of every episode of one competitor, ``(episodes,)``."""
     return mean_over_time(dataset, dataset["cost"].sel(policy=name).values)
 
 
 class _Against:
-    """Costs of every episode, and their comparisons with the paper's algorithm, the reference and the best.
+    """Comparisons of every competitor's costs with the paper's algorithm, the reference and the best competitor.
 
     Ratios are geometric means over episodes, exp of mean differences of logarithms, in which no single episode
     dominates.
@@ -448,11 +456,7 @@ class _Against:
         }
 
     def _columns(self, part: slice) -> numpy.ndarray:
-        """Return the columns to average over some episodes, ``(some, columns)``.
-
-        For every competitor: the cost, its logarithm, whether the track is lost, and whether the cost is less than that
-        of the paper's algorithm.
-        """
+        """Return cost, log cost, loss and win of every competitor for some episodes, ``(some, columns)``."""
         costs = [own[part] for own in self.costs.values()]
         with numpy.errstate(divide="ignore", invalid="ignore"):
             columns = [*costs, *map(numpy.log, costs), *(own > self.bound for own in costs)]
@@ -461,9 +465,7 @@ class _Against:
         return numpy.stack(columns, axis=1)
 
     def behind_best(self, name: str) -> Iterator[Measure]:
-        """Return the paired ratio of the cost to the best one's, less one, and the share of resamples in which it is
-        best.
-        """
+        """Yield the paired ratio of the cost to the best one's, minus one, and the share of resamples that it wins."""
         if name in self.ranked:
             difference = self._difference(name, self.best)
             yield Measure("behind_best", self.best, "all", difference, "1")
@@ -471,14 +473,12 @@ class _Against:
             yield Measure("best_share", "", "all", IntervalEstimate(share, math.nan, math.nan), "1")
 
     def _difference(self, name: str, other: str) -> IntervalEstimate:
-        """Return the geometric mean of the ratios of two costs, less one."""
+        """Return the geometric mean of the ratios of two competitors' costs, minus one, with its interval."""
         with numpy.errstate(invalid="ignore", over="ignore"):
             return self.bootstrap.interval(numpy.expm1(self.logs[name] - self.logs[other]))
 
     def own(self, name: str) -> Iterator[Measure]:
-        """Return the geometric mean of the cost, and the share of lost tracks where the environment has a bound for
-        them.
-        """
+        """Yield the geometric mean of the cost, and the share of lost tracks if the environment defines them."""
         if name in self.logs:
             with numpy.errstate(over="ignore"):
                 mean = self.bootstrap.interval(numpy.exp(self.logs[name]))
@@ -491,7 +491,7 @@ class _Against:
                 yield Measure("lost_tracks", "", "all", share, "1")
 
     def others(self, name: str) -> Iterator[Measure]:
-        """Return the score and the paired differences to the paper's algorithm, where their inputs exist."""
+        """Yield the score and the paired differences to the paper's algorithm, where their inputs exist."""
         if name not in self.wins:
             return
         bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
@@ -513,10 +513,10 @@ class _Against:
 
 
 def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
-    """Return the statistics of one competitor's innovations: their size and their correlation.
+    """Yield size and lag-one correlation of one competitor's innovations, for every group of measured quantities.
 
-    ``prediction_error`` is the root of their mean square in the sensor's unit, ``innovation_correlation`` the
-    correlation of successive ones, zero where they are white; for every group of measured components.
+    ``prediction_error`` is their root mean square in the sensor's unit. ``innovation_correlation`` is the correlation
+    of successive innovations, zero if they are white.
 
     Args:
         run: one competitor's part of an evaluation.
@@ -538,7 +538,7 @@ def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
 
 
 def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
-    """Return one where an episode costs less than with the paper's algorithm, ``(episodes,)``."""
+    """Return one for each episode with a cost ratio below one, zero above, and one half for a draw, ``(episodes,)``."""
     # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
     draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
     return numpy.where(draw, 0.5, ratio < 1.0)
@@ -546,7 +546,7 @@ def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
 
 @one_thread()
 def flight_records(dataset: "xarray.Dataset") -> list[Record]:
-    """Return the cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
+    """Return the records of every flight: cost, errors and differences to the paper's algorithm.
 
     Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
 
@@ -558,7 +558,7 @@ def flight_records(dataset: "xarray.Dataset") -> list[Record]:
 
 
 def parts_by_flight(dataset: "xarray.Dataset") -> "Iterator[xarray.Dataset]":
-    """Yield the evaluation of each flight, whose scenario has its name, in the order of the names."""
+    """Yield the dataset of each flight's episodes, in the order of the flights' names."""
     for flight in sorted(set(dataset["flight"].values.tolist())):
         own = dataset["flight"].values == flight
         part = dataset if own.all() else dataset.isel(episode=numpy.flatnonzero(own))  # a copy
@@ -568,12 +568,12 @@ def parts_by_flight(dataset: "xarray.Dataset") -> "Iterator[xarray.Dataset]":
 
 
 PER_FLIGHT = ("rmse", "cost", "geometric_cost", "geometric_cost_difference", "relative_cost_difference")
-"""Metrics that are reported for every flight."""
+"""Names of the metrics that are reported for every flight."""
 
 
 @one_thread()
 def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -> list[Record]:
-    """Return every metric of every competitor with its interval.
+    """Return the records of an evaluation: every metric of every competitor with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent),
@@ -606,11 +606,11 @@ def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -
 def contender_of(
     results: Mapping[Key, Any], run: "xarray.Dataset", bootstrap: Bootstrap, metrics: OwnMetrics | None
 ) -> Contender:
-    """Return a competitor with the statistics for its records.
+    """Return a competitor with its statistics, from the results of :func:`record_statistics`.
 
     Args:
-        results: results of :func:`record_statistics`.
-        run: its part of an evaluation, of which only coordinates and attributes are needed.
+        results: results over all its episodes.
+        run: the competitor's part of an evaluation, of which only coordinates and attributes are needed.
         bootstrap: bootstrap over the episodes.
         metrics: metrics of the environment.
     """
@@ -621,13 +621,13 @@ def contender_of(
             estimate = value if isinstance(value, IntervalEstimate) else bootstrap.interval(value)
             measures.append(Measure(metric, component, window, estimate, unit))
     if (nees := results.get(("episodes", "anees"))) is not None:
-        middle = bootstrap.interval(bootstrap.quantiles(nees, chosen=~numpy.isnan(nees)))
+        middle = bootstrap.interval(bootstrap.quantiles(nees, mask=~numpy.isnan(nees)))
         measures.append(Measure("median_anees", "state", "all", middle, "1"))
     further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
     causes = None
     if ("causes",) in results:
-        found, causes = split(results["causes",], run, bootstrap)
+        found, causes = split_by_cause(results["causes",], run, bootstrap)
         further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
     if (time := time_of(run)) is not None:
         estimate = IntervalEstimate(time.nanoseconds, math.nan, math.nan)
@@ -643,25 +643,25 @@ def contender_of(
 def _compare_causes(
     contender: Contender, contenders: Sequence[Contender], bootstrap: Bootstrap
 ) -> Iterator[Measure]:
-    """Return the cost under each cause relative to that of the opponent; the cause takes the place of a window."""
+    """Yield the mean cost under each cause relative to that of the opponent; the cause is stored as the window."""
     split = {c.name: c.causes for c in contenders if c.causes is not None}
     if contender.name not in split:
         return
     costs = {name: float(causes.of(EVERYTHING)[0]) for name, causes in split.items()}
     opponent = opponent_of(contender.name, costs, [c.name for c in contenders if c.kind in RANKED])
     if opponent:
-        for m in compare(split[contender.name], split[opponent], opponent, bootstrap):
+        for m in compare_by_cause(split[contender.name], split[opponent], opponent, bootstrap):
             yield Measure(m.metric, m.opponent, m.cause, m.estimate, "1")
 
 
 def records_of(
     contenders: Sequence[Contender], evaluation: "xarray.Dataset", bootstrap: Bootstrap
 ) -> list[Record]:
-    """Return every record, with the comparisons between competitors.
+    """Return all records of an evaluation, from its competitors' statistics and the comparisons between them.
 
     Args:
-        contenders: all competitors.
-        evaluation: gives the attributes.
+        contenders: all competitors, with their statistics.
+        evaluation: dataset with the attributes.
         bootstrap: bootstrap over the episodes.
     """
     attrs = evaluation.attrs

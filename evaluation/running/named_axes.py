@@ -1,4 +1,4 @@
-"""The stored values of episodes as a dataset, whose axes have names and units."""
+"""Assembly of the values of all episodes to a dataset with named axes and units."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
-"""Names of the observation blocks with the last action."""
+"""Names of the observation blocks that contain the last action."""
 
 
 OF_COMPONENTS = "that of the component (coordinate unit)"
@@ -39,12 +39,12 @@ MEANINGS = {
     "lost": ("1", "number of the reason why the episode is lost, 0 where it is not"),
     "causes": ("1", "bit field of the causes that hold, in the order of the coordinate cause"),
 }
-"""Unit and meaning of variables; the environment's page gives the units of its own variables."""
+"""Unit and meaning of the dataset's variables; the environment's page lists the units of its own variables."""
 MEASURED = ("that of the environment's table of measurements", "as the sensors report it, not normalised")
 
 
 def _attributes(key: str, cost: str) -> dict[str, str]:
-    """Return the unit of a variable, and whether it is normalised; empty for variables of the environment."""
+    """Return the attributes ``units`` and ``long_name`` of a dataset variable; empty if they are not known here."""
     name = key.removeprefix(DRAWN_PREFIX)
     if name == "cost":
         return {"units": "1", "long_name": f"{cost}, normalised as stated"}
@@ -55,7 +55,7 @@ def _attributes(key: str, cost: str) -> dict[str, str]:
 def recording_coords(
     recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
 ) -> dict[str, Any]:
-    """Return the coordinates of a recording's evaluation that refer to its log.
+    """Return the coordinates that relate the evaluation of a recording to its log.
 
     Args:
         recording: the replayed recording.
@@ -77,7 +77,7 @@ def recording_coords(
 
 
 def _further_dimensions(key: str, count: int) -> list[str]:
-    """Return the names of a variable's dimensions after policy, episode and time: the first and ``count`` more."""
+    """Return the names of a variable's ``count + 1`` dimensions after policy, episode and time."""
     if count < 0:
         return []
     key = key.removeprefix(DRAWN_PREFIX)
@@ -106,20 +106,22 @@ def action_names(model: Model) -> tuple[str, ...]:
 
 
 class StackedArrays:
-    """Arrays of all competitors and episodes, filled in place piece by piece.
+    """Arrays of the values of all competitors and episodes, filled in place piece by piece.
 
     Args:
         models: model of every competitor.
         acting: names of the competitors whose action is a box.
         episodes: number of episodes of each.
-        drawn: number of first episodes with data for pictures.
+        plotted: number of first episodes with data for pictures.
 
     Attributes:
         actions: names of the actions of each acting competitor, with its control where they use several.
         action_names: all names of actions.
     """
 
-    def __init__(self, models: Mapping[str, Model], acting: Sequence[str], episodes: int, drawn: int) -> None:
+    def __init__(
+        self, models: Mapping[str, Model], acting: Sequence[str], episodes: int, plotted: int
+    ) -> None:
         several = len({models[name].control for name in acting}) > 1
         self.actions: dict[str, list[str]] = {
             name: [
@@ -130,15 +132,15 @@ class StackedArrays:
         self.action_names = list(dict.fromkeys(part for own in self.actions.values() for part in own))
         self._arrays: dict[str, numpy.ndarray] = {}
         self._places = {name: i for i, name in enumerate(models)}
-        self._episodes, self._drawn = episodes, min(drawn, episodes)
+        self._episodes, self._drawn = episodes, min(plotted, episodes)
         self._written: list[tuple[int, slice, set[str]]] = []
 
-    def write(self, name: str, part: slice, kept: dict[str, numpy.ndarray]) -> None:
-        """Write the values of some episodes, ``(episodes, time, ...)`` by name, and empty the mapping."""
+    def write(self, name: str, part: slice, new_values: dict[str, numpy.ndarray]) -> None:
+        """Write a competitor's values in some episodes, ``(episodes, time, ...)`` by name; empty the mapping."""
         place = self._places[name]
-        self._written.append((place, part, set(kept)))
-        while kept:
-            key, values = kept.popitem()
+        self._written.append((place, part, set(new_values)))
+        while new_values:
+            key, values = new_values.popitem()
             shape = values.shape[1:]
             if key == "action":
                 shape = (*shape[:-1], len(self.action_names))
@@ -152,7 +154,7 @@ class StackedArrays:
                 rows[...] = numpy.nan
                 rows[..., [self.action_names.index(each) for each in self.actions[name]]] = values
 
-    def finished(self) -> dict[str, numpy.ndarray]:
+    def finish(self) -> dict[str, numpy.ndarray]:
         """Return the arrays ``(policy, episode, time, ...)`` by name; NaN where nothing was written."""
         for key, array in self._arrays.items():
             for place, part, kept in self._written:
@@ -162,16 +164,16 @@ class StackedArrays:
 
 
 def with_named_axes(
-    kept: StackedArrays,
+    arrays: StackedArrays,
     kinds: Mapping[str, Kind],
     models: Mapping[str, Model],
     windows: Mapping[str, tuple[int, int]],
     seeds: Sequence[int],
 ) -> "xarray.Dataset":
-    """Return the values of competitors as a dataset.
+    """Return the dataset of the values of all competitors, with coordinates and units.
 
     Args:
-        kept: the values.
+        arrays: the values.
         kinds: kind of every competitor.
         models: model of every competitor.
         windows: windows of the scenario.
@@ -183,7 +185,7 @@ def with_named_axes(
     components = [c.name for c in model.task.components]
     times = numpy.arange(1, model.task.horizon + 1)
     variables: dict[str, Any] = {}
-    for key, values in kept.finished().items():
+    for key, values in arrays.finish().items():
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += ["action_name"] if key == "action" else _further_dimensions(key, values.ndim - 4)
         variables[key] = (dims, values, _attributes(key, model.task.reward.cost))
@@ -215,5 +217,5 @@ def with_named_axes(
         coords["cause_phrase"] = ("cause", [cause.phrase for cause in causes])
         coords["start_measurements"] = Causes.of(model.task).start
     if "action" in variables:
-        coords["action_name"] = kept.action_names
+        coords["action_name"] = arrays.action_names
     return xarray.Dataset(variables, coords)

@@ -1,4 +1,4 @@
-"""Metrics of a single environment, in addition to those of all environments, from any number of episodes.
+"""Metrics that one environment adds to those of all environments, computed block by block of episodes.
 
 They are computed in two steps, so that only a block of episodes is in memory. The first step gathers a few numbers of
 each episode, or arrays that are only averaged over the episodes. The second step computes the metrics from those of all
@@ -22,7 +22,7 @@ Arrays = Mapping[str, numpy.ndarray]
 
 
 class Measure(NamedTuple):
-    """A record without its competitor, as an environment's own metrics return it."""
+    """A record without its competitor: metric, component, window, value with interval, and unit."""
 
     metric: str
     component: str
@@ -32,7 +32,7 @@ class Measure(NamedTuple):
 
 
 class MetricInputs(NamedTuple):
-    """Inputs of an environment's metrics from episodes of one competitor; empty where there are none."""
+    """Inputs of an environment's metrics, from episodes of one competitor; empty mappings where there are none."""
 
     each: Arrays = {}  # noqa: RUF012  (never written to)
     """Numbers of every episode, ``(episodes, ...)``: all are stored, so they should be few."""
@@ -44,7 +44,7 @@ class MetricInputs(NamedTuple):
 
 @dataclass(frozen=True)
 class OwnMetrics:
-    """The metrics of an environment."""
+    """The functions that compute an environment's own metrics."""
 
     gather: "Callable[[xarray.Dataset], MetricInputs]"
     """Function from one competitor's part of some episodes of an evaluation to the inputs."""
@@ -52,7 +52,7 @@ class OwnMetrics:
     """Function from the inputs of all episodes, and the evaluation's coordinates and attributes, to the measures."""
 
     def statistics(self, run: "xarray.Dataset") -> Iterator[Statistic]:
-        """Declare the statistics of the inputs.
+        """Yield the inputs of the metrics as declarations of statistics, for some episodes.
 
         Args:
             run: some episodes of one competitor.
@@ -68,12 +68,12 @@ class OwnMetrics:
     def measures_of(
         self, results: Mapping[Key, Any], bootstrap: Bootstrap, evaluation: "xarray.Dataset"
     ) -> list[Measure]:
-        """Return the measures of one competitor.
+        """Return the environment's metrics of one competitor.
 
         Args:
             results: results of :meth:`statistics` of all episodes.
             bootstrap: bootstrap over the episodes.
-            evaluation: its part of the evaluation, of which only coordinates and attributes are needed.
+            evaluation: the competitor's part of the evaluation, of which only coordinates and attributes are needed.
         """
         gathered = MetricInputs(
             *({key[1]: results[key] for key in results if key[0] == f} for f in MetricInputs._fields)

@@ -29,7 +29,7 @@ from .rollout import Progress
 from .threads import one_thread
 
 RETRIES = 10
-"""Number of times that Ray repeats a piece whose process is lost; Dask has its own setting, three times."""
+"""Number of times that Ray repeats a piece of work whose process is lost; Dask has its own setting, three."""
 CLUSTER_PROCESSES = 16
 """Assumed number of processes of a remote cluster, to split work for it."""
 NO_HTTP_ROUTES: dict[str, Any] = {
@@ -39,11 +39,11 @@ NO_HTTP_ROUTES: dict[str, Any] = {
 CLUSTERS = "ray, ray://HOST:PORT, ray://auto, dask, tcp://HOST:PORT or tls://HOST:PORT"
 
 Function = Callable[[Any, Progress], Any]
-"""Function of a module that takes a piece of work and a progress callback, and returns its result."""
+"""Function of a module from a piece of work and a progress callback to a result."""
 
 
 class ImportPaths(NamedTuple):
-    """Paths to the modules and files that pieces of work name."""
+    """Paths on which a process finds the modules and files of its pieces of work."""
 
     folder: str
     paths: list[str]
@@ -58,15 +58,15 @@ Outcome = tuple[int, Any, tuple[Exception, str] | None, list[tuple[str, type[War
 
 
 class LostProcessError(ValueError):
-    """A process that did part of the work has ended."""
+    """Error for a process that ended before its part of the work was finished."""
 
 
 class Elsewhere(Exception):  # noqa: N818  (the cause of an error, not an error)
-    """Traceback of an error in another process."""
+    """Traceback of an error in another process, shown as the cause of that error in this process."""
 
 
-def end_with(parent: int) -> None:
-    """End this process when its parent ends, which may be killed without notice."""
+def end_with_parent(parent: int) -> None:
+    """Start a thread that ends this process when the process with the id ``parent`` ends, even if it is killed."""
 
     def watch() -> None:
         if sys.platform == "win32":
@@ -83,7 +83,7 @@ def end_with(parent: int) -> None:
 
 
 def _run_piece(index: int, packed: bytes, packed_item: bytes, paths: ImportPaths) -> Outcome:
-    """Do a piece of work, in a process that may be new."""
+    """Unpickle a function and its argument, and call it in this process, which may be new; return its outcome."""
     with suppress(OSError):  # another machine may not have it
         os.chdir(paths.folder)
     if paths.safe_path is None:  # competing programs run in the user's environment
@@ -104,7 +104,7 @@ def _run_piece(index: int, packed: bytes, packed_item: bytes, paths: ImportPaths
 
 
 def _sendable(error: Exception) -> Exception:
-    """Return an error that can be sent to another process; as text if it cannot be pickled."""
+    """Return an error that can be pickled: the same one, or a RuntimeError with its text."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
@@ -113,7 +113,7 @@ def _sendable(error: Exception) -> Exception:
 
 
 def check_workers(workers: Any) -> "Workers":
-    """Return the workers; default: this process.
+    """Return the workers unchanged; None becomes workers that use only this process.
 
     Raises:
         ValueError: for any other type, such as a number.
@@ -126,7 +126,7 @@ def check_workers(workers: Any) -> "Workers":
 
 
 class Workers:
-    """Processes that do the work; ``with Workers(4) as workers`` ends them afterwards.
+    """Processes that run pieces of work; ``with Workers(4) as workers`` ends them afterwards.
 
     Args:
         jobs: processes; 1: this one; -1: as many as there are cores.
@@ -163,7 +163,7 @@ class Workers:
 
     @property
     def width(self) -> int:
-        """Best number of pieces of work; for a remote cluster a guess."""
+        """Best number of pieces of work; for a remote cluster an assumed number."""
         if self.alone:
             return 1
         if self.cluster is not None and "://" in self.cluster:
@@ -193,7 +193,7 @@ class Workers:
         sizes: Sequence[int] | None = None,
         progress: Progress | None = None,
     ) -> Iterator[tuple[int, Any]]:
-        """Do pieces of work.
+        """Call a function with each item, on all processes; yield number and result of each when it is finished.
 
         Args:
             function: function of a module, which workers import.
@@ -239,7 +239,7 @@ class Workers:
         sizes: Sequence[int] | None = None,
         progress: Progress | None = None,
     ) -> list[Any]:
-        """Do pieces of work, see :meth:`run`, and return the results in their order."""
+        """Call a function with each item, on all processes; return the list of results in the order of the items."""
         found: list[Any] = [None] * len(items)
         for index, result in self.run(function, items, sizes, progress):
             found[index] = result
@@ -252,7 +252,7 @@ class Workers:
 
         class Processes(LokyBackend):
             def configure(self, *given: Any, **options: Any) -> Any:
-                own = {"initializer": end_with, "initargs": (os.getpid(),)}
+                own = {"initializer": end_with_parent, "initargs": (os.getpid(),)}
                 return super().configure(*given, **own, **options)
 
         # Where an error or Ctrl-C ends the work early, the rest is cancelled.
@@ -339,7 +339,7 @@ class Workers:
     def _from_ray(
         ray: Any, remote: Any, calls: Iterator[tuple[Any, ...]], pending: list[Any]
     ) -> Iterator[Outcome]:
-        """Submit pieces to the cluster and yield their results; ``pending`` is filled with the running ones."""
+        """Submit pieces of work to the cluster and yield their outcomes; fill ``pending`` with running ones."""
         more = True
         while pending or more:
             # The cluster may grow meanwhile; two pieces for each core keep it busy.

@@ -1,4 +1,4 @@
-"""Recordings made from the simulation: measurements in episodes of a scenario, with the truth."""
+"""Recording of simulated episodes of a scenario: their measurements and the truth."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from ...envs.contract.model import Episode, Model
 from ...envs.contract.task import Task, named_arrays
 from ...envs.data.foreign_files import MOST_NUMBERS
 from ...envs.data.recorded_world import measure_once
-from ...envs.data.recording import Recording, differing
+from ...envs.data.recording import Recording, changed_parameters
 from ...envs.engine.backend import make_model
 from ...envs.engine.compiled import can_step
 from ...envs.engine.episode_noise import uniforms_of_seeds
@@ -24,13 +24,13 @@ CHUNK = 256
 
 
 class NoFilter(Filter[Task, Any, Initial]):
-    """Filter that always returns the initial estimate, for runs without an estimator."""
+    """Filter whose estimate is always the initial one, for runs without an estimator."""
 
     def start(self, initial: Any) -> Initial:
-        """Return the initial estimate."""
+        """Return the initial estimate as the state."""
         return Initial(initial.mean, initial.covariance)
 
-    def update(self, state: Initial, given: FilterInput) -> Initial:
+    def update(self, state: Initial, inputs: FilterInput) -> Initial:
         """Return the state unchanged."""
         return state
 
@@ -40,7 +40,7 @@ def _no_filter(model: Model) -> NoFilter:
 
 
 def record_experiment(experiment: Experiment, progress: Progress | None = None) -> Recording:
-    """Record the measurements in the episodes of an experiment, and the truth.
+    """Return a recording of the measurements and the truth in the simulated episodes of an experiment.
 
     They are the episodes of an evaluation of the experiment. Replayed on the same backend, observations, estimates and
     costs are the same, bit for bit.
@@ -75,7 +75,7 @@ def record_experiment(experiment: Experiment, progress: Progress | None = None) 
         times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
     # The measurements with an action, and that of the last observation.
     there = numpy.arange(truth.shape[1]) <= lengths[:, None]
-    parameters = differing(plain.parameters)
+    parameters = changed_parameters(plain.parameters)
     for name in cls.World.own_parameters:
         parameters.pop(name, None)
     names = [str(i) for i in range(episodes)]
@@ -96,7 +96,7 @@ def record_experiment(experiment: Experiment, progress: Progress | None = None) 
 
 
 def _check_size(task: Task, episodes: int) -> None:
-    """Raise ValueError for more episodes than a recording may contain, or a closed loop."""
+    """Raise ValueError if the episodes have more numbers than a recording may contain, or for a closed loop."""
     arrays = dict(named_arrays(measure_once(task)[1]))
     row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(task.components) + 1
     if row * episodes * (task.horizon + 1) > MOST_NUMBERS:
@@ -109,7 +109,7 @@ def _check_size(task: Task, episodes: int) -> None:
 def _record(
     model: Model, seeds: Sequence[int], tick: Progress
 ) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
-    """Return the measurements and truth, ``(E, T, ...)``, and the values given at the start, ``(E, ...)``."""
+    """Return measurements and truth by name, ``(E, T, ...)``, and the initial values given to filters, ``(E, ...)``."""
     initial: dict[str, numpy.ndarray] = {}
     series: dict[str, list[numpy.ndarray]] = {}
     count, interval = len(seeds), model.task.decision_interval
@@ -148,5 +148,5 @@ def _measured(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _episodes_first(values: numpy.ndarray, count: int) -> numpy.ndarray:
-    """Return arrays ``(..., N)`` as ``(episodes, ...)``, without the padding."""
+    """Return an array ``(..., N)`` as ``(episodes, ...)``, without the padding lanes."""
     return numpy.moveaxis(values[..., :count], -1, 0).copy()

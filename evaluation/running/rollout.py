@@ -351,41 +351,91 @@ def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.
 
 TIMED_EPISODES, TIMED_MEASUREMENTS = 512, 256
 """Episodes side by side, and measurements of each, in a measurement of time: enough for two digits."""
-RUN_SECONDS = 0.02
+RUN_SECONDS = 0.01
 """Approximate duration of a run, s, where the episodes are long enough."""
-TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.05, 3, 20
+TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.02, 3, 20
 """Duration, s, and numbers of repeated runs, of which the quickest counts."""
+TIMED_ROUNDS = 3
+"""Measurements of a competitor and of the world in turn, of which the quickest of each count."""
+LEAST_NANOSECONDS = 1.0
+"""Least time of a competitor, ns: a difference of two measured times is no more precise."""
 
 
 class ProcessorTime(NamedTuple):
-    """Processor time of a measurement on one core: world and competitor together, or a program's process alone."""
+    """Processor time of a competitor for one measurement on one core, without the simulated world."""
 
     nanoseconds: float
     """Time of a measurement of one of many episodes side by side, ns."""
     compiled: bool
     """Whether all code is native; otherwise the time is mostly that of the steps in Python."""
     own: bool = False
-    """Whether it is the time of a program's own process, without the world, which is not comparable with the others."""
+    """Whether it is the time of a program's own process, which includes the exchange of messages."""
 
 
 def measure_time(
     model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str = "competitor"
 ) -> ProcessorTime | None:
-    """Measure the processor time of a measurement: motion of the world, sensors, and the competitor's estimate.
+    """Measure the processor time that a competitor takes for a measurement.
 
     :data:`TIMED_EPISODES` episodes run side by side, after tracing and compilation. For native code the quickest of
-    several runs counts, since disturbances only add time; for Python code the median decision. For a program it is the
-    time of its own process.
+    several runs counts, since disturbances only add time; for Python code the median decision. The time of the
+    simulated world (:func:`measure_world`) is subtracted. A program's time is that of its own process.
 
     Args:
         model: task with a bank; for a policy, that of its control.
         competitor: as in :func:`rollout`.
-        kind: kind of the competitor. Smoothers, bounds and competitors made for given episodes have no time: None.
+        kind: kind of the competitor.
         seeds: seeds of episodes, which are repeated up to that number.
         name: name of the competitor in errors.
+
+    Returns:
+        Time of at least :data:`LEAST_NANOSECONDS`. None for smoothers, bounds and competitors made for given episodes,
+        and where a program's time is not known.
     """
     if kind in ("smoother", "bound") or is_made_for_episodes(competitor):
         return None
+    run = _timed_run(model, competitor, kind, seeds, name)
+    spent = run()
+    if spent is None or spent.own:
+        return spent
+    world = measure_world(model, seeds)
+    # In turn, since the speed of a processor that others use changes.
+    for _ in range(TIMED_ROUNDS - 1 if spent.compiled else 0):
+        spent, world = min(spent, run() or spent), min(world, measure_world(model, seeds))
+    return spent._replace(nanoseconds=max(spent.nanoseconds - world, LEAST_NANOSECONDS))
+
+
+class IdleEstimator:
+    """Estimator that repeats the initial estimate: a run takes the time of the simulated world."""
+
+    traceable = True
+
+    def start(self, initial: Any, lanes: int) -> tuple[Array, Array]:
+        """Return the initial mean and covariance."""
+        return initial.mean, initial.covariance
+
+    def update(
+        self, memory: tuple[Array, Array], measurement: Any
+    ) -> tuple[Array, Array, tuple[Array, Array]]:
+        """Return the initial mean and covariance again."""
+        return *memory, memory
+
+
+def measure_world(model: Model, seeds: Sequence[int]) -> float:
+    """Return the processor time of the simulated world for a measurement, ns: motion and sensors."""
+
+    def prepare() -> Callable[[], ProcessorTime | None]:
+        return _timed_run(model, IdleEstimator, "estimator", seeds, "idle")
+
+    run = model.programs.keep(measure_world, prepare) if isinstance(model, CompiledModel) else prepare()
+    spent = run()
+    return spent.nanoseconds if spent is not None else 0.0
+
+
+def _timed_run(
+    model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str
+) -> Callable[[], ProcessorTime | None]:
+    """Return a function that measures the time of world and competitor together, or of a program's process."""
     seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
     task, is_policy = model.task, kind == "policy"
     clock = time.process_time
@@ -396,26 +446,30 @@ def measure_time(
     looped = model if is_policy else _close_loop(model, competitor, kind, seeds, name)
     compiled_policy = _compiled_policy_of(model, competitor, name) if is_policy else None
     if can_step(looped, _report_estimate) and (compiled_policy is not None or not is_policy):
-        spent = _time_compiled(looped, compiled_policy, seeds, decisions)
-        return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), True)
+        timed = _compiled_decision(looped, compiled_policy, seeds, decisions)
+        return lambda: ProcessorTime(1e9 * timed() / (len(seeds) * task.decision_interval), True)
     steps = _step(looped, competitor if is_policy else None, seeds, _report_estimate, name)
-    with warnings.catch_warnings():
-        if own:
-            warnings.simplefilter("ignore")  # the evaluation has already warned of a program's faults
-        spent = _time_steps(steps, decisions, task.decision_interval, clock)
-    if math.isnan(spent):
-        return None
-    return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), False, own)
+
+    def run_in_python() -> ProcessorTime | None:
+        with warnings.catch_warnings():
+            if own:
+                warnings.simplefilter("ignore")  # the evaluation has already warned of a program's faults
+            spent = _time_steps(steps, decisions, task.decision_interval, clock)
+        if math.isnan(spent):
+            return None
+        return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), False, own)
+
+    return run_in_python
 
 
 def _report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
     return {"estimate": model.mean(episode)}
 
 
-def _time_compiled(
+def _compiled_decision(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], decisions: int
-) -> float:
-    """Return the seconds of a decision of all episodes, in the quickest run of optimised code."""
+) -> Callable[[], float]:
+    """Return a function that measures the seconds of a decision of all episodes: the quickest run of optimised code."""
     identities = identities_of_seeds(seeds)
     lanes = start_lanes(looped, seeds, report=_report_estimate)
     interval = looped.task.decision_interval
@@ -433,11 +487,15 @@ def _time_compiled(
     # No step branches, so every decision takes the same time: a slow one need not be repeated to the end.
     count = min(decisions, 1 + math.ceil(RUN_SECONDS / setting_up))
     if count == 1:
-        return setting_up
-    spent: list[float] = []
-    while len(spent) < FEWEST_RUNS or (sum(spent) < TIMED_SECONDS and len(spent) < MOST_RUNS):
-        spent.append(run(count))
-    return (min(spent) - setting_up) / (count - 1)
+        return lambda: setting_up
+
+    def measure() -> float:
+        spent: list[float] = []
+        while len(spent) < FEWEST_RUNS or (sum(spent) < TIMED_SECONDS and len(spent) < MOST_RUNS):
+            spent.append(run(count))
+        return (min(spent) - setting_up) / (count - 1)
+
+    return measure
 
 
 def _time_steps(

@@ -1,4 +1,4 @@
-"""Seeds of episodes, in three splits without common seeds."""
+"""Seeds of episodes, in three splits (train, validation, test) without common seeds."""
 
 import numpy
 
@@ -9,7 +9,7 @@ SPLITS = {"train": 0, "validation": 1, "test": 2}
 
 
 def episode_seeds(split: str, seed: int, episodes: int, first: int = 0) -> list[int]:
-    """Return the seeds of a run of episodes.
+    """Return a list of the seeds of an experiment's episodes.
 
     Each is an ordinary Gymnasium seed: ``env.reset(seed=...)`` replays the episode.
 

@@ -1,4 +1,4 @@
-"""Values that an evaluation stores of every measurement of an episode, and of the first episodes only."""
+"""Values at every measurement of an episode that an evaluation stores."""
 
 import math
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ from ...envs.engine.reward import compressed_cost
 from ...filters.gaussian import log_density
 
 DRAWN_PREFIX = "drawn_"
-"""Prefix of the names of values that are stored of the first episodes only."""
+"""Prefix of the names of values that are stored for the first episodes only, for pictures."""
 
 
 def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
-    """Return the normalised squared error of the components whose truth is known, with their marginal covariance.
+    """Return ``nees``, the normalised estimation error squared of components with known truth, as a dictionary.
 
     Args:
         model: task with a filter.
@@ -41,15 +41,15 @@ def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, An
 
 @dataclass(frozen=True)
 class StoredValues:
-    """Report function of the values that are stored of every measurement of a competitor."""
+    """Function that returns the values to store at a measurement of a policy, estimator or reference."""
 
     tracks: bool = False
-    """Whether to include the data of plots of tracks."""
+    """Whether to include the data for plots of tracks."""
     drawings: bool = False
-    """Whether to include the data of pictures of tracks, under names that begin with :data:`DRAWN_PREFIX`."""
+    """Whether to include the data for pictures of tracks, under names that begin with :data:`DRAWN_PREFIX`."""
 
     def __call__(self, model: Model, episode: Episode) -> dict[str, Any]:
-        """Return the values by name, arrays ``(..., N)``; without truth those that need it are left out."""
+        """Return the values at the present measurement by name, ``(..., N)``; errors and costs only with truth."""
         found = {}
         if model.task.has_truth:
             error = model.error(episode)
@@ -67,6 +67,6 @@ class StoredValues:
         return {**found, **model.track(episode)} if self.tracks else found
 
 
-def limits(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return the values that are stored of a bound."""
+def bound_values(model: Model, episode: Episode) -> dict[str, Any]:
+    """Return the values to store at a measurement of a bound, by name."""
     return model.filter.records(episode.filter, episode.measurement)

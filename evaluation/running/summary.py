@@ -1,4 +1,4 @@
-"""Summaries of evaluations: statistics for records, curves and tracks, small enough to send and to store.
+"""Summaries of evaluations: the statistics of records and curves, small enough to send and to store.
 
 A summary contains one competitor. Its episodes are run in chunks, each reduced before the next begins, and the results
 are added in their order; so its bits depend only on the request.
@@ -18,7 +18,7 @@ from ..statistics.statistic import Reduction, Statistic, reduce_run
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import Losses, count_losses, losses_in
 from ..storage.store import Store, Work
-from .curves import CompetitorCurves, competitor_curves, curve_statistics, spread, stack_curves
+from .curves import CompetitorCurves, competitor_curves, curve_statistics, evenly_spaced, stack_curves
 from .evaluate import Experiment, check_sendable, plan_of, run_competitors, run_piece
 from .metrics import (
     PER_FLIGHT,
@@ -27,6 +27,7 @@ from .metrics import (
     Reduced,
     bootstrap_of_episodes,
     bootstrap_of_reduced,
+    cached_bootstrap,
     contender_of,
     mean_over_time,
     parts_by_flight,
@@ -34,7 +35,6 @@ from .metrics import (
     records_of,
     records_of_reduced,
     reduce_competitor,
-    resampling,
 )
 from .own_metrics import OwnMetrics
 from .parallel import Workers
@@ -44,18 +44,19 @@ from .threads import one_thread
 from .times import COORDINATES, with_times
 
 TOGETHER = 4 * BLOCK
-"""Episodes of a piece of work: enough that its result is small compared with its computation."""
+"""Number of episodes in a piece of work: its result is small compared with its computation."""
 DRAWN_TIMES = 20_000
-"""Maximal number of measurements of an episode in pictures."""
+"""Maximal number of measurements of an episode in a picture."""
 MOST_RECORDINGS = 40
 """Maximal number of episodes of a recording that are reported separately."""
 BATCH = 600_000
-"""Measurements that are sent to another process in one batch, where several pieces of work share a model: about a
-second. A longer batch would leave other processes idle at the end, and lose more in an interruption."""
+"""Number of measurements in a batch of pieces of work with a common model: about a second. A longer batch would leave
+processes idle at the end, and lose more in an interruption.
+"""
 
 
 class EvaluationRequest(NamedTuple):
-    """One competitor of an experiment."""
+    """Request to evaluate one competitor in an experiment, or in some of its episodes."""
 
     experiment: Experiment
     name: str
@@ -63,47 +64,47 @@ class EvaluationRequest(NamedTuple):
     metrics: OwnMetrics | None = None
     """Metrics of the environment."""
     horizon: int = 1
-    """Measurements of an episode, for the progress."""
+    """Number of measurements of an episode, for the progress."""
     first: int = 0
-    """Episode with which a piece of the work begins."""
+    """Number of the first episode."""
     last: int | None = None
-    """Episode before which it ends; None: the end."""
+    """Number after the last episode; None: the end of the experiment."""
     curves: bool = True
-    """Whether to compute curves, too, for figures; they take as long as the records."""
+    """Whether to compute curves for figures, too; they take as long as the records."""
     identity: str | None = None
     """Identity of the competitor, see :class:`..competitors.kinds.Competitor`; with None its summary is not stored."""
 
     @property
     def episodes(self) -> int:
-        """Number of episodes of the experiment."""
+        """Number of episodes of the whole experiment."""
         return self.experiment.episodes
 
     @property
     def end(self) -> int:
-        """Episode before which it ends."""
+        """Number after the last requested episode."""
         return self.episodes if self.last is None else self.last
 
     @property
     def measurements(self) -> int:
-        """Number of measurements."""
+        """Number of measurements in the requested episodes."""
         return (self.end - self.first) * self.horizon
 
     def work(self) -> Work | None:
-        """Return the piece of work of the summary, for a store; None where it is not stored."""
+        """Return the identity of the summary in a store; None if it is not stored."""
         if self.identity is None:
             return None
-        return Work(f"{stem_of(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
+        return Work(f"{file_stem(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
 
     def pieces(self) -> list["EvaluationRequest"]:
-        """Split the request into pieces of work: one, unless there are many episodes."""
+        """Return a list of requests for fewer episodes each, which together cover this one."""
         if self.episodes <= TOGETHER:
             return [self]
         begins = range(0, self.episodes, TOGETHER)
         return [self._replace(first=i, last=min(i + TOGETHER, self.episodes)) for i in begins]
 
 
-def stem_of(experiment: Experiment) -> str:
-    """Return the beginning of the name of a file about an experiment."""
+def file_stem(experiment: Experiment) -> str:
+    """Return the first part of the name of files about an experiment, with environment, scenario and seed."""
     environment, scenario = short_name(experiment.task.id), experiment.scenario or "default"
     return f"{environment}.{scenario}.{experiment.episodes}.{experiment.split}{experiment.seed}"
 
@@ -112,17 +113,18 @@ class Evaluation(NamedTuple):
     """Results of an evaluation."""
 
     dataset: xarray.Dataset
-    """Values of every episode (:func:`.evaluate.run_experiment`); or, for summaries, coordinates and attributes with
-    the values of the first episodes, over policy, drawn_episode and time."""
+    """Values of every episode (:func:`.evaluate.run_experiment`); for summaries only coordinates, attributes and
+    values of the first episodes, over policy, drawn_episode and time.
+    """
     records: list[Record]
     curves: xarray.Dataset | None
-    """See :func:`.curves.curves_of`; None where they were not requested of every competitor."""
+    """Curves (:func:`.curves.curves_of`); None unless they were requested of every competitor."""
     costs: Mapping[str, numpy.ndarray]
     """Mean cost of every episode by name, ``(episodes,)``, of all competitors with a known cost."""
     flights: Sequence[Record] = ()
     """Records of every flight, where they are reported separately."""
     differences: Mapping[str, IntervalEstimate] = {}
-    """For a recording, the log-likelihood per measurement less that of the best, by name."""
+    """For a recording, each competitor's mean log-likelihood of a measurement minus that of the best, by name."""
 
     @property
     def has_truth(self) -> bool:
@@ -136,36 +138,36 @@ class Evaluation(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """One competitor of an evaluation."""
+    """Statistics and curves of one competitor of an evaluation."""
 
     contender: Contender
     curves: CompetitorCurves | None
     """Curves; None where they were not requested."""
     head: xarray.Dataset
-    """Its part of the evaluation, without the values of every episode."""
+    """The competitor's part of the evaluation, without the values of every episode."""
     episodes: int
 
 
 class Part(NamedTuple):
-    """Some episodes of one competitor."""
+    """Sums and samples over some episodes of one competitor, from which its summary follows."""
 
     reduction: Reduction
     head: xarray.Dataset
 
     def merge(self, later: "Part") -> "Part":
-        """Add the episodes that come next."""
+        """Return the sums and samples of these and the next episodes together."""
         return self._replace(reduction=self.reduction.merge(later.reduction))
 
     def summary(self, request: EvaluationRequest) -> Summary:
-        """Return the summary of all episodes of the request."""
-        results, bootstrap = self.reduction.results(), resampling(request.episodes)
+        """Return the summary of the competitor, from the sums and samples of all its episodes."""
+        results, bootstrap = self.reduction.results(), cached_bootstrap(request.episodes)
         contender = contender_of(results, self.head, bootstrap, request.metrics)
         curves = competitor_curves(results) if request.curves else None
         return Summary(contender, curves, self.head, request.episodes)
 
 
 def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
-    """Run a request and reduce it to a summary; for a piece of the episodes only, return their contribution.
+    """Run a request; return its summary, or if it has only some of the episodes, their sums and samples.
 
     Raises:
         ValueError: as :func:`reduce_episodes`.
@@ -185,7 +187,7 @@ def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
 def reduce_episodes(
     request: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
-    """Run a request and reduce it to statistics, a block of episodes at a time.
+    """Run a request block by block of episodes; return sums and samples for declared statistics.
 
     Args:
         request: request of one competitor over episodes.
@@ -196,9 +198,9 @@ def reduce_episodes(
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
     """
     plan = plan_of(request.experiment, {request.name: request.maker}, request.first, request.end)
-    if plan.flown is not None:
+    if plan.flight_numbers is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
-    bootstrap = resampling(request.episodes)
+    bootstrap = cached_bootstrap(request.episodes)
     block = block_of(plan.models[request.name].task.horizon)
 
     def part(first: int) -> Part:
@@ -226,7 +228,7 @@ def summaries(
     progress: Progress | None = None,
     store: Store | None = None,
 ) -> Iterator[tuple[int, Summary]]:
-    """Summarise competitors, of any environments.
+    """Run requests for competitors, of any environments; yield number and summary of each when it is finished.
 
     Args:
         requests: the requests, started in this order.
@@ -283,10 +285,7 @@ def summaries(
 
 
 def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:
-    """Group pieces of work that share a model, so that one process traces it once.
-
-    A batch takes the place of its first piece, and contains at most ``BATCH`` measurements, or one piece.
-    """
+    """Return lists of requests that share a model, with at most ``BATCH`` measurements; a process traces it once."""
     batches: list[list[tuple[int, EvaluationRequest]]] = []
     last: dict[Any, tuple[list[tuple[int, EvaluationRequest]], int]] = {}
     for i, piece in pieces:
@@ -301,25 +300,25 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 
 @one_thread()
-def combine_summaries(found: Sequence[Summary]) -> Evaluation:
-    """Combine the summaries of all competitors to their evaluation."""
+def combine_summaries(parts: Sequence[Summary]) -> Evaluation:
+    """Return the evaluation (records, curves, costs) of all competitors, from their summaries."""
     evaluation = _heads_together(
-        [one.head for one in found], [one.contender.losses for one in found], found[0].episodes
+        [one.head for one in parts], [one.contender.losses for one in parts], parts[0].episodes
     )
-    costs = {one.contender.name: one.contender.costs for one in found if one.contender.costs is not None}
-    records = records_of([one.contender for one in found], evaluation, resampling(found[0].episodes))
-    each = [one.curves for one in found if one.curves is not None]
-    if len(each) < len(found):
+    costs = {one.contender.name: one.contender.costs for one in parts if one.contender.costs is not None}
+    records = records_of([one.contender for one in parts], evaluation, cached_bootstrap(parts[0].episodes))
+    each = [one.curves for one in parts if one.curves is not None]
+    if len(each) < len(parts):
         return Evaluation(evaluation, records, None, costs)
-    each = _actions_by_control(each, [one.contender.control for one in found])
-    curves = stack_curves(each, evaluation, found[0].episodes)
+    each = _actions_by_control(each, [one.contender.control for one in parts])
+    curves = stack_curves(each, evaluation, parts[0].episodes)
     return Evaluation(evaluation, records, curves, costs)
 
 
 def _actions_by_control(
     curves: Sequence[CompetitorCurves], controls: Sequence[str]
 ) -> list[CompetitorCurves]:
-    """Add the control to the names of actions where competitors use several controls."""
+    """Return the curves with the control added to the names of actions, if competitors use several controls."""
     if len({control for control, own in zip(controls, curves, strict=True) if own.actions}) < 2:
         return list(curves)
     return [
@@ -329,7 +328,7 @@ def _actions_by_control(
 
 
 class SeparateResults(NamedTuple):
-    """Data of one competitor over flights, a recording or one episode, which are resampled with those of the others."""
+    """Reduced results of one competitor over flights, a recording or one episode; all are resampled together."""
 
     reduced: Reduced
     flights: list[Reduced]
@@ -339,11 +338,13 @@ class SeparateResults(NamedTuple):
     losses: Losses | None
     curves: CompetitorCurves | None
     head: xarray.Dataset
-    """Its part of the evaluation, without the values of every episode, at ``DRAWN_TIMES`` measurements at most."""
+    """The competitor's part of the evaluation at no more than ``DRAWN_TIMES`` measurements, without the values of
+    every episode.
+    """
 
 
 def reduce_alone(run: xarray.Dataset, request: EvaluationRequest) -> SeparateResults:
-    """Reduce one competitor's part of an evaluation."""
+    """Return the results of one competitor, from its part of an evaluation over flights, a recording or one episode."""
     episodes, times = run.sizes["episode"], run.sizes["time"]
     flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
     if not run.attrs["truth"] or (recorded and episodes > MOST_RECORDINGS):
@@ -351,7 +352,7 @@ def reduce_alone(run: xarray.Dataset, request: EvaluationRequest) -> SeparateRes
     costs = mean_over_time(run, run["cost"].values) if "cost" in run else None
     if costs is not None and numpy.isnan(costs).all():  # bounds have no cost
         costs = None
-    chosen, curves = spread(times, DRAWN_TIMES), None
+    chosen, curves = evenly_spaced(times, DRAWN_TIMES), None
     if request.curves:
         declare = functools.partial(curve_statistics, episodes=episodes)
         results = reduce_run(run, declare, bootstrap_of_episodes(run)).results()
@@ -393,7 +394,7 @@ def _combine_alone(
         if record.metric in PER_FLIGHT
     ]
     shown = evaluation.drop_vars(list(evaluation.data_vars))
-    shown = shown.isel(time=spread(shown.sizes["time"], DRAWN_TIMES))
+    shown = shown.isel(time=evenly_spaced(shown.sizes["time"], DRAWN_TIMES))
     return Evaluation(
         evaluation,
         records_of_reduced(reduced, evaluation, metrics),
@@ -411,7 +412,7 @@ def run_requests(
     store: Store | None = None,
     whole: bool = False,
 ) -> Evaluation:
-    """Evaluate the competitors of one experiment.
+    """Evaluate the competitors of one experiment; return records, curves and costs.
 
     Args:
         requests: one request for each competitor.

@@ -15,23 +15,23 @@ import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 
-from .parallel import end_with
+from .parallel import end_with_parent
 from .rollout import Progress
 
 POLLING = 0.5
-"""Interval, s, at which the parent checks that its child runs."""
+"""Interval at which the parent process checks that its child runs, s."""
 START_SECONDS = 60.0
-"""Least time limit of the first measurement, s: the world's code is compiled before it."""
+"""Least time limit of the first measurement, s; it includes compilation of the world's code."""
 STEP = 0.1
-"""Time between two reports of a competitor in progress, s."""
+"""Least interval between two progress reports of a running competitor, s."""
 _supervised: frozenset[str] = frozenset()
 """Names of the supervised competitors of this process."""
 _reports = -1
-"""Pipe to the parent."""
+"""File handle of the pipe to the parent process."""
 
 
 def supervise(names: Collection[str], seconds: float) -> dict[str, str]:
-    """Continue in a child process, and in another one after a competitor has ended it.
+    """Continue the program in a child process; repeat that without a competitor whose code has ended the child.
 
     Args:
         names: names of the competitors whose classes run in this process.
@@ -58,7 +58,7 @@ def supervise(names: Collection[str], seconds: float) -> dict[str, str]:
         if (child := os.fork()) == 0:
             os.close(reports)
             _supervised, _reports = left, writing
-            end_with(parent)
+            end_with_parent(parent)
             return failures
         os.close(writing)
         name, words = _watch(child, reports, seconds)
@@ -68,16 +68,16 @@ def supervise(names: Collection[str], seconds: float) -> dict[str, str]:
 
 
 def is_supervised() -> bool:
-    """Return whether a competitor that ends this process loses only its own row."""
+    """Return whether this process is a supervised child, where a crash of a competitor loses only its own row."""
     return bool(_supervised)
 
 
 @contextmanager
-def running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
-    """Report to the parent that the code of a competitor runs; yields the progress function to call meanwhile.
+def report_running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
+    """Report to the parent process that a competitor's code runs inside the context; yield its progress function.
 
     Args:
-        name: of the competitor.
+        name: name of the competitor.
         progress: a progress function to call as well.
         timed: whether the competitor is ended if the progress is not called in time.
     """
@@ -107,7 +107,7 @@ def _report(line: str) -> None:
 
 
 def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
-    """Wait for the end of a child, and end it where a competitor is late; return the competitor and the reason.
+    """Wait for the end of a child, or kill it where a competitor is late; return that competitor and the reason.
 
     Raises:
         SystemExit: if it ended elsewhere, with its status.
@@ -143,6 +143,6 @@ def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
     if not running:
         raise SystemExit(code if code >= 0 else 128 - code)
     if is_late:
-        return running[1:], f"it has not answered within {limit:g} s, see --time-limit"
+        return running[1:], f"it has not responded within {limit:g} s, see --time-limit"
     ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
     return running[1:], f"it has ended the process {ending}"

@@ -1,4 +1,4 @@
-"""Restriction of libraries to one thread.
+"""Restriction of numerical libraries to one thread.
 
 Products of many small matrices are slower on several threads than on one, most of all where other work needs the cores;
 and the division of a product between threads may change its last bit.
@@ -21,7 +21,9 @@ _INSIDE = ContextVar("inside", default=False)
 
 @functools.lru_cache(1)
 def _controller(modules: int) -> ThreadpoolController:
-    """Return the libraries with threads of their own; a search takes 1.5 ms, so it is repeated only after imports.
+    """Return the controller of the loaded libraries that have threads; cached until more modules are imported.
+
+    A search takes 1.5 ms.
 
     Args:
         modules: number of imported modules.
@@ -31,7 +33,7 @@ def _controller(modules: int) -> ThreadpoolController:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Restrict BLAS and torch to one thread each, also where they are loaded inside the context."""
+    """Restrict BLAS and torch to one thread each inside the context, also where they are loaded inside it."""
     if _INSIDE.get():  # another search of the loaded libraries takes longer than some pieces of work
         yield
         return

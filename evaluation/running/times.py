@@ -1,7 +1,7 @@
 """Processor times of competitors, as coordinates of an evaluation, and the Pareto front of cost and time.
 
-The time of a measurement is that of the simulated world and of the competitor up to its estimate, on one core, of many
-episodes side by side (:func:`.rollout.measure_time`). It excludes tracing, compilation, and the computation of errors.
+The time of a measurement is that of the competitor up to its estimate, on one core, of many episodes side by side
+(:func:`.rollout.measure_time`). It excludes the simulated world, tracing, compilation, and the computation of errors.
 It differs from run to run: an evaluation contains it only on request; all other results have the same bits in every
 run.
 """
@@ -27,22 +27,27 @@ PYTHON_MARK, OWN_MARK, FRONT_MARK = "py", "own", "*"
 TIME_TITLE = "ns"
 """Title of the column of times."""
 TIME_NOTE = (
-    f"{TIME_TITLE} is the processor time of a measurement on one core, of simulated world and competitor together. "
+    f"{TIME_TITLE} is the processor time of a competitor for a measurement on one core, without the simulated world. "
     "An asterisk marks the front, where no other ranked competitor has a lower error cost in as much time or less. "
     f"{PYTHON_MARK} marks competitors that run in Python, which takes most of their time."
 )
 OWN_NOTE = (
-    f"{OWN_MARK} marks programs: the time of their own process, without the world, which is on no front."
+    f"{OWN_MARK} marks programs: the time of their own process with its messages, which is on no front."
 )
-EQUAL_TIMES = 1.1
-"""Ratio up to which two times count as equal: the difference from run to run."""
+EQUAL_TIMES, EQUAL_NANOSECONDS = 1.1, 3.0
+"""Ratio, and difference in ns, up to which two times count as equal: those from run to run."""
+
+
+def longest_equal(nanoseconds: float) -> float:
+    """Return the longest time, ns, that counts as equal to a time."""
+    return max(EQUAL_TIMES * nanoseconds, nanoseconds + EQUAL_NANOSECONDS)
 
 
 def with_times(dataset: "xarray.Dataset", times: Sequence[ProcessorTime | None]) -> "xarray.Dataset":
     """Return an evaluation with the time of each of its competitors, or one competitor's part of one."""
     values = [math.nan if time is None else time.nanoseconds for time in times]
     compiled = [0 if time is None else WAYS.index(way_of(time)) for time in times]
-    attrs = {"units": "ns", "long_name": "processor time of a measurement, of world and competitor"}
+    attrs = {"units": "ns", "long_name": "processor time of the competitor for a measurement"}
     of_one = "policy" not in dataset.dims
     nanoseconds, ways = (((), each[0]) if of_one else ("policy", each) for each in (values, compiled))
     return dataset.assign_coords(nanoseconds=(*nanoseconds, attrs), compiled=ways)
@@ -83,7 +88,7 @@ def times_of_records(records: Sequence[Any]) -> dict[str, ProcessorTime]:
 def points_of_records(records: Sequence[Any]) -> list[Point]:
     """Return the points of all competitors with known cost and time, except programs.
 
-    The cost is relative to the paper's algorithm, in %. The time of a program does not include the world.
+    The cost is relative to the paper's algorithm, in %. The time of a program includes the exchange of messages.
 
     Args:
         records: tidy records of one environment and scenario.
@@ -101,15 +106,15 @@ def front(points: Sequence[Point]) -> list[str]:
     """Return the names of the ranked competitors that no other beats in cost and time, the quickest first (Pareto
     front).
 
-    A competitor with a similar time, within :data:`EQUAL_TIMES`, and a lower cost also dominates; so noise of the clock
-    puts no competitor on the front. Of equal costs the quickest is on the front, of similar times the first by name.
+    A competitor with an equal time by :func:`longest_equal` and a lower cost also dominates; so noise of the clock puts
+    no competitor on the front. Of equal costs the quickest is on the front, of similar times the first by name.
     """
     ranked = [point for point in points if point.kind in RANKED and math.isfinite(point.cost)]
     found = [
         one
         for one in ranked
         if not any(
-            other.cost < one.cost and other.time.nanoseconds <= EQUAL_TIMES * one.time.nanoseconds
+            other.cost < one.cost and other.time.nanoseconds <= longest_equal(one.time.nanoseconds)
             for other in ranked
         )
     ]
@@ -117,7 +122,7 @@ def front(points: Sequence[Point]) -> list[str]:
     for cost in {point.cost for point in found}:
         equal = [point for point in found if point.cost == cost]
         quickest = min(point.time.nanoseconds for point in equal)
-        longest = max(quickest, EQUAL_TIMES * quickest)  # a difference of two clocks may be below zero
+        longest = longest_equal(quickest)
         chosen.append(min((p for p in equal if p.time.nanoseconds <= longest), key=lambda p: p.name))
     return [point.name for point in sorted(chosen, key=lambda point: point.time.nanoseconds)]
 

@@ -1,4 +1,4 @@
-"""Transitions in episodes of a policy: observations, actions and rewards, as Gymnasium returns them."""
+"""Transitions in episodes of a policy, as Gymnasium returns them: observations, actions and rewards."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,10 +11,10 @@ from .rollout import Progress
 
 
 class Transitions(NamedTuple):
-    """One episode of T decisions, of an environment and its seed."""
+    """Observations, actions and rewards in one episode of T decisions."""
 
     seed: int
-    """``env.reset(seed=...)`` begins the same episode."""
+    """Seed of the episode, for ``env.reset(seed=...)``."""
     observations: numpy.ndarray
     """Observations, ``(T + 1, fields)``, the last one after the last action, in the type of the observation space."""
     actions: numpy.ndarray
@@ -22,7 +22,7 @@ class Transitions(NamedTuple):
     rewards: numpy.ndarray
     """Rewards, ``(T,)``."""
     truncations: numpy.ndarray
-    """Truncations, ``(T,)``, true at the last decision only; no episode of these environments is terminated."""
+    """Truncation flags, ``(T,)``, true at the last decision only; no episode of these environments is terminated."""
 
 
 def transitions_of(
@@ -32,7 +32,9 @@ def transitions_of(
     tick: Progress = lambda decisions: None,
     **keywords: Any,
 ) -> list[Transitions]:
-    """Step a policy through one episode for each seed, side by side in the native vector environment.
+    """Return the transitions of a policy in one episode for each seed.
+
+    The episodes run in parallel in the native vector environment.
 
     Actions are clipped to the action space and cast to its type before they are applied, as a learning agent must: they
     may differ from those of an evaluation by rounding.
@@ -40,7 +42,7 @@ def transitions_of(
     Args:
         id: environment id.
         policy: policy made for the environment; its ``keywords`` make the environment.
-        seeds: of the episodes.
+        seeds: seeds of the episodes.
         tick: called with the number of decisions done.
         **keywords: further keywords of ``gymnasium.make_vec``, such as ``reward`` or ``dtype``.
 
@@ -54,7 +56,7 @@ def transitions_of(
     finished = numpy.zeros(len(seeds), dtype=bool)
     while not finished.all():  # flights differ in length: finished ones start again, and are cut below
         action, memory = policy.predict(observation, memory)
-        action = member(envs.single_action_space, action)
+        action = clip_to_space(envs.single_action_space, action)
         observation, reward, _, truncated, _ = envs.step(action)
         for values, latest in zip(kept, (observation, action, reward, truncated), strict=True):
             values.append(latest)
@@ -69,8 +71,8 @@ def transitions_of(
     return found
 
 
-def member(space: gymnasium.Space[Any], action: numpy.ndarray) -> numpy.ndarray:
-    """Return actions of a policy, batch first, clipped to the limits of the action space and in its type."""
+def clip_to_space(space: gymnasium.Space[Any], action: numpy.ndarray) -> numpy.ndarray:
+    """Return a batch of actions, clipped to the limits of the action space and cast to its type."""
     if isinstance(space, gymnasium.spaces.Box):
         action = numpy.clip(action, space.low, space.high)
     return numpy.asarray(action).astype(space.dtype)

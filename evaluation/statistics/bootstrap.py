@@ -25,18 +25,18 @@ import numpy
 
 RESAMPLES = 1000
 BLOCK = 2048
-"""Number of episodes that are weighted in one block."""
+"""Maximal number of episodes in one block of weights."""
 SEPARATE = 2**15
 """Maximal number of resampled episodes or groups of them: each takes a byte in every resample."""
 AT_ONCE, SEGMENTS = 32, 64
 """Number of resamples in one search of quantiles, and number of segments of the sorted values in the search."""
 FEWEST, MEASUREMENTS = 256, 2**20
-"""Minimal number of episodes in one block of a run, and the number of their measurements."""
+"""Minimal number of episodes in one block of a run, and number of their measurements."""
 CONFIDENCE = 0.95
 
 
 class IntervalEstimate(NamedTuple):
-    """A value and its bootstrap interval; NaN where there is none."""
+    """A value and the ends of its 95 % bootstrap interval; NaN where there is none."""
 
     value: float
     low: float
@@ -44,20 +44,20 @@ class IntervalEstimate(NamedTuple):
 
 
 def ratio(sums: numpy.ndarray) -> numpy.ndarray:
-    """Return the ratio of the first to the second entry of the second axis, ``(n, 2, ...)``; NaN where the second is
-    zero.
-    """
+    """Return the first entry of the second axis over the second, ``(n, 2, ...)`` to ``(n, ...)``; NaN over zero."""
     first, second = sums[:, 0], sums[:, 1]
     return numpy.divide(first, second, out=numpy.full(first.shape, numpy.nan), where=second > 0.0)
 
 
 def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
-    """Return the means from the :meth:`Bootstrap.sums` of all episodes; NaN where no episode has a number."""
+    """Return the means ``(1 + resamples, ...)`` from the sums :meth:`Bootstrap.sums` of all episodes; NaN for none."""
     return sums[:, 0] if sums.shape[1] == 1 else ratio(sums)
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
-    """Return the values and their 95 % percentile intervals; NaN where a resample is not finite, or missing.
+    """Return the value and its 95 % percentile interval, from the values of all bootstrap resamples.
+
+    The ends are NaN where a resample is not finite, or without resamples.
 
     Args:
         samples: value of the data and of every resample, ``(1 + resamples, ...)``.
@@ -75,7 +75,9 @@ def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
 
 
 def share_interval(share: float, number: int) -> IntervalEstimate:
-    """Return a share of independent episodes and its 95 % interval, which has a width also for shares 0 and 1.
+    """Return a share of independent episodes with its 95 % Wilson score interval.
+
+    The interval has a width also for the shares 0 and 1.
 
     Wilson's score interval (E. B. Wilson, Probable inference, the law of succession, and statistical inference, Journal
     of the American Statistical Association 22, 1927): all shares p with ``|share - p| <= z sqrt(p (1 - p) / n)``.
@@ -93,8 +95,9 @@ def share_interval(share: float, number: int) -> IntervalEstimate:
 
 
 def block_of(times: int) -> int:
-    """Return the number of episodes that are run and reduced in one block: enough to be fast, few enough for the
-    memory.
+    """Return the number of episodes to run and reduce in one block, given their number of measurements.
+
+    It is large enough to be fast and small enough for the memory.
 
     Args:
         times: number of measurements of an episode.
@@ -103,7 +106,7 @@ def block_of(times: int) -> int:
 
 
 class Bootstrap:
-    """Resampling of M episodes, the same for every statistic.
+    """Bootstrap resamples of M episodes, the same for every statistic.
 
     Args:
         episodes: number of episodes M.
@@ -120,7 +123,7 @@ class Bootstrap:
         generator = numpy.random.default_rng(seed)
         self.ragged: bool = clusters is not None
         self._group = 1 if self.ragged else -(-episodes // SEPARATE)
-        """Number of successive episodes that are resampled together."""
+        """Number of successive episodes in a resampled group."""
         self._clusters = None
         number = -(-episodes // self._group)
         if clusters is not None and len(set(clusters)) > 1:
@@ -134,40 +137,38 @@ class Bootstrap:
                 counts = counts.astype(numpy.min_scalar_type(int(drawn.max())))
             counts[first : first + len(drawn)] = drawn
         self._counts = counts
-        """Counts of every cluster, group or episode in the data and in every resample."""
+        """Counts of every cluster, group or episode in the data and every resample, ``(1 + resamples, number)``."""
         # Clusters may differ in size: the mean is over the episodes of the drawn clusters.
         self.totals: numpy.ndarray = self._weigh(numpy.bincount(self._resampled(numpy.arange(episodes))))
         self._last: tuple[slice, numpy.ndarray] | None = None
 
     def _resampled(self, episodes: numpy.ndarray) -> numpy.ndarray:
-        """Return the number of the cluster or group with which each of these episodes is resampled."""
+        """Return the number of the cluster or group of each of these episodes."""
         return episodes // self._group if self._clusters is None else self._clusters[episodes]
 
     def _weigh(self, numbers: numpy.ndarray) -> numpy.ndarray:
-        """Return the exact sum of whole numbers ``(clusters, ...)`` in every resample, ``(1 + resamples, ...)``."""
+        """Return sums ``(1 + resamples, ...)`` of integers ``(clusters, ...)``, with the counts of each resample."""
         numbers = numbers.astype(float)
         parts = (self._counts[i : i + AT_ONCE] for i in range(0, len(self._counts), AT_ONCE))
         return numpy.concatenate([part.astype(float) @ numbers for part in parts])
 
     @property
     def weights(self) -> numpy.ndarray:
-        """Share of every episode in the data and in every resample, ``(1 + resamples, episodes)``."""
+        """Weight of every episode in the mean of the data and of each resample, ``(1 + resamples, episodes)``."""
         return self._counts[:, self._resampled(numpy.arange(self.episodes))] / self.totals[:, None]
 
-    def weights_of(self, some: slice) -> numpy.ndarray:
-        """Return the shares of some episodes, or of those of some groups, ``(1 + resamples, some)``; the last are
-        cached.
-        """
-        if self._last is None or self._last[0] != some:
+    def weights_of(self, part: slice) -> numpy.ndarray:
+        """Return the weights of a slice of episodes or groups, ``(1 + resamples, some)``; the last are cached."""
+        if self._last is None or self._last[0] != part:
             self._last = None  # so that only one block of weights is in memory
-            which = some if self._clusters is None else self._clusters[some]
-            self._last = some, self._counts[:, which] / self.totals[:, None]
+            which = part if self._clusters is None else self._clusters[part]
+            self._last = part, self._counts[:, which] / self.totals[:, None]
         return self._last[1]
 
     def sums(
         self, values: Sequence[numpy.ndarray], first: int = 0, resamples: int | None = None
     ) -> list[numpy.ndarray]:
-        """Sum the contributions of some episodes to means, with one matrix product for all arrays.
+        """Return the weighted sums over some episodes in the data and every resample, for several arrays at once.
 
         Args:
             values: arrays ``(some, ...)`` of the same episodes, at most ``BLOCK``.
@@ -199,7 +200,7 @@ class Bootstrap:
         ]
 
     def means(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Return the means over the episodes and over every resample of them.
+        """Return the means over the episodes of the data and of every resample.
 
         Args:
             values: ``(episodes, ...)``.
@@ -210,24 +211,24 @@ class Bootstrap:
         return self.means_of(lambda part: values[part])
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Return the means over the episodes and over every resample, of values that a function computes in blocks."""
+        """Return the means over the data and every resample, of values that a function gives for episode slices."""
         parts = (self.sums([values(slice(i, i + BLOCK))], i)[0] for i in range(0, self.episodes, BLOCK))
         return mean_of_sums(functools.reduce(operator.add, parts))
 
     def quantiles(
-        self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
+        self, values: numpy.ndarray, share: float = 0.5, mask: numpy.ndarray | None = None
     ) -> numpy.ndarray:
-        """Return the quantiles over the episodes and over every resample of them, ``(1 + resamples,)``.
+        """Return a quantile over the episodes of the data and of every resample, ``(1 + resamples,)``.
 
         A quantile is the smallest value that at least that share of the weight does not exceed; NaN without chosen
         episodes.
 
         Args:
             values: one for each episode, ``(episodes,)``.
-            share: share, such as 0.5 for the median.
-            chosen: true for episodes that count, ``(episodes,)`` booleans; None: all.
+            share: share of the weight below the quantile, such as 0.5 for the median.
+            mask: true for episodes that count, ``(episodes,)`` booleans; None: all.
         """
-        which = numpy.arange(len(values)) if chosen is None else numpy.flatnonzero(chosen)
+        which = numpy.arange(len(values)) if mask is None else numpy.flatnonzero(mask)
         found = numpy.full(len(self._counts), numpy.nan)
         if not len(which):
             return found
@@ -253,25 +254,21 @@ class Bootstrap:
         return found
 
     def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
-        """Return the percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``; none for one
-        episode.
-        """
+        """Return the percentile interval of a statistic in the data and its resamples, ``(1 + resamples,)``."""
         if self._counts.shape[1] == 1:
             statistics = statistics[:1]
         return IntervalEstimate(*percentile_interval(statistics).tolist())
 
     def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
-        """Return the paired relative difference of means to those of another competitor, both from :meth:`means`."""
+        """Return the paired relative difference of two competitors' :meth:`means`, with its interval."""
         return self.interval(means / others - 1.0)
 
     def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
-        """Return the geometric mean of the ratios of two competitors' costs in every episode, ``(episodes,)``, less
-        one.
-        """
+        """Return the geometric mean of two competitors' cost ratios by episode, minus one, with its interval."""
         return self.estimate(numpy.log(costs / others), numpy.expm1)
 
     def estimate(
         self, values: numpy.ndarray, of_means: Callable[[numpy.ndarray], numpy.ndarray] = lambda m: m
     ) -> IntervalEstimate:
-        """Return the interval of a function of the means of ``values`` over the episodes."""
+        """Return a function of the means of ``values`` over the episodes, with its bootstrap interval."""
         return self.interval(of_means(self.means(values)))

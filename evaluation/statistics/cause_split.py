@@ -18,42 +18,43 @@ if TYPE_CHECKING:
     import xarray
 
 EVERYTHING, START, OTHER = RESERVED
-"""Name of the whole, in place of a cause, and names of the causes that every evaluation adds."""
+"""Name for all measurements in place of a cause, and names of the causes that every evaluation adds."""
 CAUSE_METRICS = "cause_"
 """Prefix of the names of metrics by cause."""
 VARIABLE = "causes"
-"""Variable of an evaluation: causes that hold, see :func:`.envs.causes.cause_number`."""
+"""Name of the dataset variable with the active causes as a bit field, see :func:`.envs.causes.cause_number`."""
 COUNT, COST, NEES, JUDGED = range(4)
-"""Columns of the sums where a cause holds: one, the cost, the NEES over its dimension, and one where there is a
-NEES."""
+"""Columns of the sums over the measurements under a cause: their number, cost, NEES over its dimension, number with a
+NEES.
+"""
 
 
 class CauseMeasure(NamedTuple):
-    """A number of one competitor under one cause."""
+    """A statistic of one competitor over the measurements under one cause."""
 
     metric: str
     cause: str
     estimate: IntervalEstimate
     opponent: str = ""
-    """Competitor with which it is compared."""
+    """Name of the competitor with which it is compared; empty without comparison."""
 
 
 class CauseCosts(NamedTuple):
-    """Mean cost of a measurement under each cause, in the data and in every resample."""
+    """Mean cost of a measurement under each cause, in the data and in every bootstrap resample."""
 
     names: list[str]
-    """Names of the causes without those that never hold; first ``EVERYTHING``."""
+    """Names of the causes that occur; the first is ``EVERYTHING``."""
     means: numpy.ndarray
     """Mean costs, ``(1 + resamples, causes)``."""
 
     def of(self, cause: str) -> numpy.ndarray:
-        """Return the mean costs under a cause, ``(1 + resamples,)``."""
+        """Return the mean costs under one cause, ``(1 + resamples,)``."""
         found: numpy.ndarray = self.means[:, self.names.index(cause)]
         return found
 
 
 def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Return a phrase for each cause of an evaluation, by name; empty for an evaluation without causes."""
+    """Return a mapping from each cause of an evaluation to a phrase for tables; empty without causes."""
     if "cause" not in dataset.coords:
         return {}
     declared = zip(dataset["cause"].values.tolist(), dataset["cause_phrase"].values.tolist(), strict=True)
@@ -61,8 +62,10 @@ def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
     return {**dict(declared), START: first, OTHER: "where none of the causes holds"}
 
 
-def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
-    """Yield every cause and whether it holds at each measurement, booleans ``(episodes, time)``; the whole first.
+def active_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
+    """Yield the name of each cause and the measurements at which it is active, booleans ``(episodes, time)``.
+
+    The first is ``EVERYTHING``.
 
     Args:
         run: one competitor's part of an evaluation with causes.
@@ -80,15 +83,15 @@ def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
 def cause_sums(
     run: "xarray.Dataset", nees: numpy.ndarray | None, units: TimeUnits | None = None
 ) -> numpy.ndarray:
-    """Return the sums over the measurements in which each cause holds.
+    """Return number, cost and NEES of the measurements under each cause, summed over every episode.
 
     Args:
         run: one competitor's part of some episodes.
         nees: NEES over its dimension, ``(episodes, time)``, NaN where there is none; None without NEES.
-        units: units of time of one episode, which take the place of episodes; None: episodes.
+        units: units of time of one episode, in place of episodes; None: episodes.
 
     Returns:
-        ``(episodes, causes, 4)``, in the order of :func:`held_causes`.
+        ``(episodes, causes, 4)``, in the order of :func:`active_causes`.
     """
     cost = run["cost"].values
     known = ~numpy.isnan(cost)
@@ -96,20 +99,20 @@ def cause_sums(
     values = numpy.stack([known, numpy.where(known, cost, 0.0), numpy.zeros(cost.shape), judged])
     if nees is not None:
         values[NEES] = numpy.where(judged, nees, 0.0)
-    holding = (held for _, held in held_causes(run))
+    holding = (held for _, held in active_causes(run))
     if units is not None:
         values, holding = units.cut(values[:, 0]), (units.cut(held)[0] for held in holding)
     return numpy.stack([numpy.einsum("set,et->es", values, held) for held in holding], axis=1, dtype=float)
 
 
-def split(
+def split_by_cause(
     sums: numpy.ndarray, run: "xarray.Dataset", bootstrap: Bootstrap
 ) -> tuple[list[CauseMeasure], CauseCosts]:
-    """Split a competitor's cost and consistency by cause; causes that never hold are left out.
+    """Return the shares of cost, mean costs and ANEES of a competitor under each cause that occurs.
 
     Args:
         sums: means over the episodes of :func:`cause_sums`, ``(1 + resamples, causes, 4)``.
-        run: its part of an evaluation, of which only coordinates and attributes are needed.
+        run: the competitor's part of an evaluation, of which only coordinates and attributes are needed.
         bootstrap: bootstrap over the episodes.
 
     Returns:
@@ -135,10 +138,10 @@ def split(
 
 
 def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -> numpy.ndarray:
-    """Return weights of causes by their share of the cost and their mean cost of a measurement.
+    """Return weights that order causes by importance: share of the cost times log of the relative mean cost.
 
-    A weight is the share of the cost times the logarithm of the mean cost under the cause over that of all
-    measurements. A large cost in few measurements has the largest weight, a cause that nearly always holds a small one.
+    The relative mean cost is that under the cause over that of all measurements. A large
+    cost in few measurements has the largest weight, a cause that nearly always holds a small one.
 
     Args:
         cost_share: share of the whole cost, of any shape.
@@ -153,7 +156,9 @@ def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -
 
 
 def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) -> str:
-    """Return the opponent of a competitor: the ranked one with the lowest cost among the others; empty without one.
+    """Return the name of the competitor to compare with: the ranked one with the lowest cost among the others.
+
+    Empty without another competitor.
 
     Args:
         name: name of the competitor.
@@ -164,11 +169,11 @@ def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) ->
     return min([other for other in others if other in ranked] or others, key=costs.__getitem__, default="")
 
 
-def compare(
-    own: CauseCosts, other: CauseCosts, opponent: str, bootstrap: Bootstrap
+def compare_by_cause(
+    costs: CauseCosts, opponent_costs: CauseCosts, opponent: str, bootstrap: Bootstrap
 ) -> Iterator[CauseMeasure]:
-    """Return the paired ratio of a competitor's cost to its opponent's under every cause, ``cause_cost_ratio``."""
-    for name in own.names:
-        if name in other.names:
-            both = numpy.stack([own.of(name), other.of(name)], axis=1)
+    """Yield the paired ratio of a competitor's mean cost to its opponent's, for each cause that both have."""
+    for name in costs.names:
+        if name in opponent_costs.names:
+            both = numpy.stack([costs.of(name), opponent_costs.of(name)], axis=1)
             yield CauseMeasure("cause_cost_ratio", name, bootstrap.interval(ratio(both)), opponent)

@@ -1,4 +1,4 @@
-"""Innovations of recorded measurements: measurement minus prediction, in the sensor's units, for every estimator.
+"""Innovations of recorded measurements for every estimator: measurement minus prediction, in the sensor's units.
 
 The prediction follows from the estimate after the previous measurement, by the log format of the environment. A filter
 with the right model has white innovations: successive ones are not correlated. Intervals are those of
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 
 def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
-    """Return an evaluation of a recording with the variable ``prediction_error`` (policy, episode, time, measured).
+    """Return the evaluation of a recording with the innovations added as the variable ``prediction_error``.
+
+    Its dimensions are policy, episode, time and measured.
 
     It is NaN for missing measurements, at the first measurement, and for a smoother, which does not predict. Without a
     log format with predictions, or without estimates, the evaluation is returned unchanged.
@@ -49,8 +51,8 @@ def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
     )
 
 
-def received(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
-    """Return the measurements that estimates predict, ``(m, episodes, time)``; None without predictions.
+def measured_quantities(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
+    """Return the measured quantities that a log format can predict, ``(m, episodes, time)``; None without predictions.
 
     Args:
         run: one competitor's part of an evaluation with tracks.

@@ -1,4 +1,4 @@
-"""Likelihood and correlation of the predicted measurements of a recording, with intervals for a single recording, too.
+"""Intervals for log-likelihoods and correlations of innovations, also for a single recording.
 
 Neighbouring measurements are not independent, so whole stretches of them are resampled for intervals.
 """
@@ -22,11 +22,11 @@ UNKNOWN = IntervalEstimate(math.nan, math.nan, math.nan)
 
 
 def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
-    """Return the correlation of successive prediction errors; zero where they are white.
+    """Return the lag-one correlation of innovations with its 95 % interval; zero if they are white.
 
     Args:
-        errors: prediction errors, ``(m, episodes, time)``.
-        mask: true for measurements that count, ``(episodes, time)``.
+        errors: innovations, ``(m, episodes, time)``.
+        mask: true for the measurements to use, ``(episodes, time)``.
     """
     before = numpy.roll(errors, 1, axis=2)
     before[:, :, 0] = math.nan
@@ -37,12 +37,11 @@ def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
 def stretch_interval(
     mask: numpy.ndarray, values: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
 ) -> IntervalEstimate:
-    """Return the value and 95 % interval of a function of two means over measurements, by resampling stretches of
-    them.
+    """Return a function of two means over measurements, with a 95 % interval from resampled stretches of them.
 
     Args:
-        mask: true for measurements that count, ``(episodes, time)``.
-        values: ``(episodes, time, 2)``; a measurement with a NaN is left out.
+        mask: true for the measurements to use, ``(episodes, time)``.
+        values: values to average, ``(episodes, time, 2)``; a measurement with a NaN is left out.
         function: function of means ``(n, 2)``.
     """
     there = mask & numpy.isfinite(values).all(axis=-1)
@@ -55,7 +54,7 @@ def stretch_interval(
 
 
 def stretches_of(mask: numpy.ndarray) -> numpy.ndarray:
-    """Return the number of the stretch of each measurement of a mask, and -1 for the others, ``(episodes, time)``."""
+    """Return the number of the stretch to which each measurement belongs, ``(episodes, time)``; -1 outside the mask."""
     total = int(mask.sum())
     stretch = numpy.full(mask.shape, -1, dtype=numpy.int16)
     stretch[mask] = numpy.arange(total) // max(SHORTEST_STRETCH, -(-total // STRETCHES))
@@ -65,7 +64,7 @@ def stretches_of(mask: numpy.ndarray) -> numpy.ndarray:
 def interval_of_sums(
     sums: numpy.ndarray, counts: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
 ) -> IntervalEstimate:
-    """Return the value and 95 % interval of a function of two means, by resampling stretches.
+    """Return a function of two means, with a 95 % interval, from the sums over each stretch of measurements.
 
     Args:
         sums: sums over each stretch, ``(stretches, 2)``.
@@ -82,7 +81,7 @@ def interval_of_sums(
 
 
 class LikelihoodSums(NamedTuple):
-    """Log-likelihoods of one competitor, summed over stretches of all measurements."""
+    """Log-likelihoods of one competitor, summed over each stretch of measurements."""
 
     sums: numpy.ndarray
     counts: numpy.ndarray
@@ -97,10 +96,10 @@ class LikelihoodSums(NamedTuple):
 
 
 def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
-    """Return the sums of one competitor's log-likelihoods; None where it has none.
+    """Return the sums of one competitor's log-likelihoods over stretches; None if it reports none.
 
     Args:
-        run: its part of an evaluation.
+        run: the competitor's part of an evaluation.
     """
     if "log_likelihood" not in run:
         return None
@@ -115,16 +114,16 @@ def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
     return LikelihoodSums(sums, counts, zlib.crc32(numpy.packbits(there).tobytes()))
 
 
-def likelihood_differences(found: Mapping[str, LikelihoodSums]) -> dict[str, IntervalEstimate]:
-    """Return the log-likelihood per measurement less that of the best, by name.
+def likelihood_differences(sums_by_name: Mapping[str, LikelihoodSums]) -> dict[str, IntervalEstimate]:
+    """Return each competitor's mean log-likelihood of a measurement minus the best one's, by name.
 
-    The interval is paired; there is none where the two have log-likelihoods of different measurements.
+    The interval is paired; there is none if the two have log-likelihoods of different measurements.
     """
-    if not found:
+    if not sums_by_name:
         return {}
-    best = max(found.values(), key=lambda one: one.mean)
+    best = max(sums_by_name.values(), key=lambda one: one.mean)
     differences = {}
-    for name, one in found.items():
+    for name, one in sums_by_name.items():
         if one.known == best.known:
             sums = numpy.stack([one.sums - best.sums, best.counts], axis=1)
             differences[name] = interval_of_sums(sums, best.counts, ratio)

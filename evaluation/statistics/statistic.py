@@ -1,4 +1,4 @@
-"""Statistics of the episodes of one competitor: declared once, reduced block by block of episodes by one engine.
+"""Statistics over the episodes of one competitor, declared one by one and computed block by block of episodes.
 
 Records, curves and the metrics of an environment are computed from means over episodes, one for every bootstrap
 resample, and from samples: values of every episode, as quantiles require. A :class:`Statistic` declares the
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 ALL = sys.maxsize
 """Value of ``sample`` for all episodes."""
 COLUMNS = 512
-"""Approximate number of columns of one matrix product: enough to be fast, few enough for the memory."""
+"""Approximate number of columns in one matrix product: large enough to be fast, small enough for the memory."""
 
 Key = tuple[str, ...]
 Function = Callable[[numpy.ndarray], Any]
 
 
 def identity(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the means, or the sample, unchanged."""
+    """Return the array unchanged."""
     return values
 
 
 class Statistic(NamedTuple):
-    """A statistic before its reduction: the contributions of some episodes."""
+    """Declaration of a statistic: the contributions of some episodes and the function of their mean or sample."""
 
     key: Key
     values: numpy.ndarray
@@ -44,32 +44,33 @@ class Statistic(NamedTuple):
     function: Function = identity
     """Function from the means, ``(1 + resamples, ...)``, or the sample, ``(episodes, ...)``, to the statistic."""
     resamples: int | None = None
-    """Number of resamples with a mean; None: those of the bootstrap."""
+    """Number of bootstrap resamples; None: those of the bootstrap."""
     sample: int = 0
-    """Number of first episodes whose values are stored, in place of means of all; zero: means."""
+    """Number of first episodes whose values are stored instead of a mean; zero: the mean is computed."""
     optional: bool = False
-    """Whether a block without it adds nothing to the means; otherwise it then exists for no episode."""
+    """Whether blocks without this statistic are left out of the mean; otherwise one such block removes the statistic.
+    """
     of_units: Callable[[TimeUnits], numpy.ndarray] | None = None
     """Contribution of each unit of time where one episode is resampled over time, ``(units, ...)``: that of an episode,
     or for a mean the sum and the number of terms; None: it is one number of the whole episode."""
 
 
 class Reduction(NamedTuple):
-    """Contributions of some episodes of one competitor to its statistics."""
+    """Sums and samples over some episodes of one competitor for its statistics, which can be merged."""
 
     functions: dict[Key, Function]
     sums: dict[Key, numpy.ndarray]
     """Weighted sums, from :meth:`.bootstrap.Bootstrap.sums`."""
     samples: dict[Key, list[numpy.ndarray]]
-    """Samples, ``(episodes, ...)``, as a list of pieces."""
+    """Samples, ``(episodes, ...)``, each as a list of arrays."""
     optional: set[Key]
     of_units: dict[Key, numpy.ndarray]
     """Contributions of the units of time of one episode, for statistics that can be resampled over time."""
     known: dict[Key, Any]
-    """Other statistics of one episode."""
+    """Values of the statistics of one episode that cannot be resampled over time."""
 
     def merge(self, later: "Reduction") -> "Reduction":
-        """Add the episodes that come next."""
+        """Return the sums and samples of these and the next episodes together."""
         optional = self.optional | later.optional
         sums = {key: own for key, own in (self.sums | later.sums).items() if key in optional}
         sums |= {key: own + later.sums[key] for key, own in self.sums.items() if key in later.sums}
@@ -77,7 +78,7 @@ class Reduction(NamedTuple):
         return Reduction(self.functions | later.functions, sums, samples, optional, {}, {})
 
     def results(self, blocks: BlockBootstrap | None = None) -> dict[Key, Any]:
-        """Return every statistic of all episodes; only once, since it empties the samples.
+        """Return a mapping from the key of each statistic to its value; call it once, since it empties the samples.
 
         Args:
             blocks: for one episode, the bootstrap over its units.
@@ -103,7 +104,7 @@ def reduce_run(
     bootstrap: Bootstrap | TimeUnits,
     first: int = 0,
 ) -> Reduction:
-    """Reduce some episodes of one competitor.
+    """Return the sums and samples over some episodes of one competitor for the declared statistics.
 
     Args:
         run: one competitor's part of an evaluation.
@@ -137,7 +138,7 @@ def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap | TimeUn
                 found.known[s.key] = s.function(s.values)
 
     def product(s: Statistic) -> tuple[int | None, int]:
-        """Return the key of a statistic's matrix product."""
+        """Return a key that is equal for statistics computed in one matrix product."""
         nonlocal columns
         columns += s.values[0].size
         return s.resamples, columns // COLUMNS

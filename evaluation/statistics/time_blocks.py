@@ -1,4 +1,4 @@
-"""Intervals of one episode by resampling blocks of successive measurements, since there are no other episodes.
+"""Bootstrap intervals for one episode, from resampled blocks of successive measurements.
 
 A circular block bootstrap (Politis and Romano: A circular block-resampling procedure for stationary data, in LePage and
 Billard, Exploring the Limits of Bootstrap, 1992): a resample consists of blocks with random beginnings, which wrap
@@ -23,13 +23,13 @@ import numpy
 from .bootstrap import RESAMPLES, Bootstrap, ratio
 
 UNITS = 2048
-"""Maximal number of places in an episode at which a block may begin."""
+"""Maximal number of measurements at which a block may begin."""
 FEWEST, FEWEST_BLOCKS = 16, 50
-"""Minimal numbers of measurements of an episode, and of blocks, for an interval."""
+"""Minimal numbers of measurements of an episode, and of blocks in it, for an interval."""
 
 
 class TimeUnits:
-    """An episode cut into units of successive measurements.
+    """Division of an episode into units of successive measurements.
 
     Args:
         times: number of measurements of the episode.
@@ -44,16 +44,16 @@ class TimeUnits:
         self.units: int = -(-times // self.unit)
 
     def cut(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Cut values ``(n, time)`` into units, ``(n, units, unit)``; zero beyond the end."""
+        """Return values ``(n, time)`` divided into units, ``(n, units, unit)``; zeros after the end."""
         beyond = self.units * self.unit - values.shape[1]
         return numpy.pad(values, [(0, 0), (0, beyond)]).reshape(len(values), self.units, self.unit)
 
     def sums_of_present(self, values: numpy.ndarray, times: slice = slice(None)) -> numpy.ndarray:
-        """Return the sum of every unit and the number of terms, ``(units, 2)``.
+        """Return the sum of the values in every unit and their number, ``(units, 2)``, without NaN.
 
         Args:
             values: ``(1, time)``; NaN stands for no measurement, or no event.
-            times: measurements that count.
+            times: measurements to use.
         """
         within = numpy.zeros(values.shape, dtype=bool)
         within[:, times] = True
@@ -63,7 +63,7 @@ class TimeUnits:
 
 
 class BlockBootstrap(Bootstrap):
-    """Resampling of blocks of successive measurements of one episode; the rows of :meth:`sums` are its units.
+    """Bootstrap resamples of one episode, of blocks of successive measurements; the rows of :meth:`sums` are units.
 
     Args:
         units: units of the episode.
@@ -94,7 +94,7 @@ class BlockBootstrap(Bootstrap):
         self.totals = self._counts.sum(axis=1)
 
     def resample(self, values: numpy.ndarray, of_units: numpy.ndarray) -> numpy.ndarray:
-        """Return the mean over the episode and over every resample of its blocks, ``(1 + resamples, ...)``.
+        """Return the mean over the episode and over every resample of blocks, ``(1 + resamples, ...)``.
 
         Args:
             values: values of the episode, ``(1, ...)``.
@@ -106,19 +106,19 @@ class BlockBootstrap(Bootstrap):
         return found
 
     def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
-        """Return the values of the episode, as their means; NaN in every resample."""
+        """Return the episode's own values in the first row and NaN for every resample."""
         own = values(slice(0, 1))
         return numpy.concatenate([own, numpy.full((len(self._counts) - 1, *own.shape[1:]), math.nan)])
 
     def quantiles(
-        self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
+        self, values: numpy.ndarray, share: float = 0.5, mask: numpy.ndarray | None = None
     ) -> numpy.ndarray:
-        """Return the value of the episode, as any quantile; NaN in every resample."""
-        return self.means(values if chosen is None else numpy.where(chosen, values, math.nan))
+        """Return the episode's own value in the first row and NaN for every resample."""
+        return self.means(values if mask is None else numpy.where(mask, values, math.nan))
 
     @property
     def sentence(self) -> str:
-        """Return a sentence on the intervals, or on the reason why there are none."""
+        """Sentence that describes the intervals, or the reason why there are none."""
         blocks = f"blocks of {self.block:,} measurements, by the rule of Politis and White (2004)"
         rule = f"{blocks} from the autocorrelation"
         if self.blocks < FEWEST_BLOCKS:
@@ -133,10 +133,10 @@ class BlockBootstrap(Bootstrap):
 
 
 def block_length(series: numpy.ndarray) -> int:
-    """Return the length of the blocks of a circular block bootstrap of the mean, by the rule of Politis and White.
+    """Return the number of values in a block of the circular block bootstrap of a mean (Politis and White 2004).
 
     Args:
-        series: values, ``(n,)``; NaN adds nothing to an autocovariance.
+        series: values, ``(n,)``; NaN is left out of the autocovariances.
     """
     n, known = len(series), ~numpy.isnan(series)
     centred = numpy.where(known, series - (series[known].mean() if known.any() else 0.0), 0.0)

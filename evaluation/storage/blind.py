@@ -1,4 +1,4 @@
-"""A recording without its truth, in files that any program reads, as input of programs that write estimates."""
+"""Export of a recording without its truth, as CSV and NetCDF files for programs that compute estimates from it."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ MEASUREMENTS, START, NETCDF = "measurements.csv", "start.csv", "measurements.nc"
 
 
 def write_blind(folder: Path, recording: Recording, task: Task) -> None:
-    """Write the measurements of a recording and the initial estimates, without the truth.
+    """Write the measurements and initial estimates of a recording to CSV and NetCDF files, without its truth.
 
     ``measurements.csv`` has a row for each measurement: ``track``, ``measurement`` from 1 on, ``seconds`` since the
     start of the track, and the numbers of every field, ``position_1``, ``position_2`` and so on; missing measurements
@@ -65,6 +65,6 @@ def write_blind(folder: Path, recording: Recording, task: Task) -> None:
 
 
 def _numbered(name: str, values: numpy.ndarray) -> Iterator[tuple[str, numpy.ndarray]]:
-    """Return the columns of an array ``(..., rows)`` by name, numbered from 1 on where a field has several numbers."""
+    """Yield name and values of each entry of a field ``(..., rows)``; several entries are numbered from 1 on."""
     for place in numpy.ndindex(values.shape[:-1]):
         yield "_".join([name, *(str(i + 1) for i in place)]), values[place] * 1

@@ -1,4 +1,4 @@
-"""Digest of the code that computes results: stored unfinished work is valid for that code only."""
+"""Digest of the package's code, by which stored unfinished work is recognised as that of the same code."""
 
 import functools
 import hashlib
@@ -9,21 +9,21 @@ from pathlib import Path
 from platform import python_version
 
 ROOMS = ("", ".filters", ".compiler", ".envs", ".evaluation", ".baselines", ".agents")
-"""Packages below the package."""
+"""Endings of the names of the packages that contain the code."""
 SUFFIXES = frozenset((".py", ".json", ".yml", ".safetensors"))
 """Suffixes of files on which results depend."""
 LIBRARIES = ("numpy", "scipy", "xarray", "llvmlite", "torch", "stable-baselines3")
 
 
 def package_folders() -> list[Path]:
-    """Return the folders of the package; for an editable installation those of the working copy."""
+    """Return the paths of the package's source folders; for an editable installation those of the working copy."""
     package = __name__.partition(".")[0]
     specs = [find_spec(package + room) for room in ROOMS]
     return [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
 
 
 def files_digest(folders: Iterable[Path]) -> str:
-    """Return a digest of names and contents of the files in some folders on which results depend."""
+    """Return a hexadecimal SHA-256 digest of the names and contents of the code and data files in some folders."""
     digest = hashlib.sha256()
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.suffix in SUFFIXES):
@@ -34,7 +34,7 @@ def files_digest(folders: Iterable[Path]) -> str:
 
 
 def library_versions(libraries: Iterable[str]) -> dict[str, str]:
-    """Return the versions of the installed ones by name."""
+    """Return a mapping from each installed library among ``libraries`` to its version."""
     versions = {}
     for library in libraries:
         try:
@@ -46,10 +46,7 @@ def library_versions(libraries: Iterable[str]) -> dict[str, str]:
 
 @functools.cache
 def code_digest() -> str:
-    """Return a digest of the package's files and of the versions of Python and of numerical libraries.
-
-    It is computed once for a process, which does not run later edits.
-    """
+    """Return a cached SHA-256 digest of the package's files and the versions of Python and numerical libraries."""
     installed = library_versions(LIBRARIES)
     versions = [python_version(), *(installed.get(library, "") for library in LIBRARIES)]
     return hashlib.sha256(f"{versions} {files_digest(package_folders())}".encode()).hexdigest()

@@ -29,29 +29,31 @@ FAULTS = (
     "the covariance is not symmetric",
     "the estimate is not finite after a missed measurement (missing measurements are NaN: predict without it)",
     "the program ended",
-    "the program did not answer in time",
+    "the program did not respond in time",
     "the program wrote no valid estimate",
     "the file contains no more estimates of the track",
 )
-"""Reasons why an estimator loses an episode; ``lost`` contains their numbers from 1 on, and 0 where none is lost."""
+"""Reasons why an episode of an estimator is lost. The variable ``lost`` contains their numbers from 1 on, and 0 before
+a loss.
+"""
 NO_ROW = 1.0 + FAULTS.index("the file contains no more estimates of the track")
-"""Number of the reason that a file has no more estimates."""
+"""Number in the variable ``lost`` for the reason that a file has no more estimates of a track."""
 
 
 class Losses(NamedTuple):
-    """Episodes that an estimator has lost."""
+    """Number of lost episodes of an estimator, and place and reason of the first loss."""
 
     number: int
     """Number of lost episodes."""
     episode: int
-    """Number of the first lost episode."""
+    """Number of the first lost episode, from 0 on."""
     measurement: int
-    """Measurement at which it was lost, from 1 on."""
+    """Measurement at which that episode was lost, from 1 on."""
     fault: int
     """Number of the reason among ``FAULTS``, from 1 on."""
 
     def sentence(self, name: str, episodes: int) -> str:
-        """Return a sentence on the number of lost episodes, and the reason of the first."""
+        """Return a sentence with the number of lost episodes, and place and reason of the first loss."""
         return (
             f"{name}: {self.number} of {episodes} episode{'s' if episodes > 1 else ''} lost: {FAULTS[self.fault - 1]} "
             f"in episode {self.episode} at measurement {self.measurement}; the last valid estimate "
@@ -60,7 +62,7 @@ class Losses(NamedTuple):
 
 
 def losses_in(run: "xarray.Dataset") -> numpy.ndarray:
-    """Return the measurement at which each episode was lost, and the reason, ``(episodes, 2)``; zeros where it was not.
+    """Return the measurement of each episode's loss and the number of its reason, ``(episodes, 2)``; zeros for none.
 
     Args:
         run: one policy's part of an evaluation.
@@ -72,10 +74,10 @@ def losses_in(run: "xarray.Dataset") -> numpy.ndarray:
 
 
 def count_losses(losses: numpy.ndarray) -> Losses | None:
-    """Count lost episodes; None if none is.
+    """Return the number of lost episodes, with the first loss; None if no episode is lost.
 
     Args:
-        losses: losses of all episodes, as :func:`losses_in` returns them.
+        losses: measurement and reason of each episode's loss, ``(episodes, 2)``, from :func:`losses_in`.
     """
     lost = losses[:, 1] > 0.0
     if not lost.any():
@@ -85,7 +87,9 @@ def count_losses(losses: numpy.ndarray) -> Losses | None:
 
 
 def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
-    """Write an evaluation in NetCDF's classic format with 64-bit offsets, which R, MATLAB and most others open.
+    """Write the dataset of an evaluation to a NetCDF file, in the classic format with 64-bit offsets.
+
+    R, MATLAB and most other programs open it.
 
     Raises:
         ValueError: if a variable is too large for it, or the file cannot be written.
@@ -99,7 +103,7 @@ def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
 
 
 def windows_of(dataset: "xarray.Dataset") -> dict[str, tuple[int, int]]:
-    """Return the windows by name: first and last measurement of each, both included, from 1 on.
+    """Return a mapping from the name of each window to its first and last measurement, both included, from 1 on.
 
     Args:
         dataset: evaluation, in memory or read from a file.
@@ -109,24 +113,24 @@ def windows_of(dataset: "xarray.Dataset") -> dict[str, tuple[int, int]]:
 
 
 def slices_of(dataset: "xarray.Dataset") -> dict[str, slice]:
-    """Return the windows by name, as parts of the time axis."""
+    """Return a mapping from the name of each window to its slice of the time axis."""
     return {name: slice(first - 1, last) for name, (first, last) in windows_of(dataset).items()}
 
 
 def with_windows(dataset: "xarray.Dataset", windows: Mapping[str, tuple[int, int]]) -> "xarray.Dataset":
-    """Return a dataset with its windows replaced."""
+    """Return the dataset with its windows replaced by these."""
     dataset = dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore")
     return dataset.assign_coords(window_coords(windows))
 
 
 def window_coords(windows: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return the coordinates that describe the windows."""
+    """Return the dataset coordinates that store the windows: their names, first and last measurements."""
     first, last = (numpy.array([ends[i] for ends in windows.values()], dtype=numpy.int64) for i in (0, 1))
     return {"window": list(windows), "window_first": ("window", first), "window_last": ("window", last)}
 
 
 def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
-    """Return the components of every group, such as ``position``, in the order of the components."""
+    """Return a mapping from each group of components, such as ``position``, to the names of its components."""
     found: dict[str, list[str]] = {}
     for name, group in zip(
         dataset["component"].values.tolist(), dataset["group"].values.tolist(), strict=True
@@ -137,7 +141,7 @@ def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
 
 
 def keywords_of(dataset: "xarray.Dataset") -> dict[str, Any]:
-    """Return the task parameters of the evaluation; sequences are lists, as in JSON.
+    """Return the task parameters of the evaluation by name, read from its attribute; sequences are lists.
 
     Other objects, of a user's task, are text, as Python's ``repr`` gives them.
     """
@@ -146,7 +150,7 @@ def keywords_of(dataset: "xarray.Dataset") -> dict[str, Any]:
 
 
 def keywords_as_text(keywords: Mapping[str, Any]) -> str:
-    """Return parameters as a JSON object; values that JSON does not have are text, as Python's ``repr`` gives them."""
+    """Return parameters as the text of a JSON object; values that JSON cannot store become their ``repr``."""
     return json.dumps(keywords, default=_plain)
 
 
@@ -157,17 +161,17 @@ def _plain(value: Any) -> Any:
 
 
 def whole_number(value: int) -> int | str:
-    """Return a whole number for an attribute: as text if it is too large for NetCDF's classic format."""
+    """Return an integer for a NetCDF attribute: as text if it is too large for the classic format."""
     return value if abs(value) <= MOST_WHOLE else str(value)
 
 
 def seed_of(dataset: "xarray.Dataset") -> int:
-    """Return the seed of the experiment."""
+    """Return the seed of the experiment, from the dataset's attributes."""
     return int(dataset.attrs["seed"])
 
 
 def notes_of(dataset: "xarray.Dataset") -> list[str]:
-    """Return notes on the scenario and on lost episodes, one line each."""
+    """Return the dataset's notes on the scenario and a sentence for each competitor with lost episodes."""
     notes = str(dataset.attrs["notes"]).splitlines()
     for name in dataset["policy"].values.tolist() if "lost" in dataset else ():
         if (losses := count_losses(losses_in(dataset.sel(policy=name)))) is not None:

@@ -30,11 +30,11 @@ SECONDS = ("seconds", "time", "t")
 LOG_TIME = "log_time"
 LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 AXES = ("position_x", "position_y", "position_z")
-"""Components of a position; a trajectory has the first two or all three."""
+"""Names of the components of a position; a trajectory has the first two or all three."""
 
 
 class EstimateTable(NamedTuple):
-    """Estimates of all tracks of a file, R rows of C components."""
+    """Estimates of C components for all tracks of a file, in R rows."""
 
     track: numpy.ndarray
     """Name of the track of each row, ``(R,)``; empty strings where the file names none."""
@@ -50,13 +50,13 @@ class EstimateTable(NamedTuple):
     deviations: tuple[bool, ...]
     """Whether the file contains a variance of each component, ``(C,)``."""
     covariance: numpy.ndarray
-    """Covariances, ``(C, C, R)``; NaN for components without."""
+    """Covariances, ``(C, C, R)``; NaN for components without a variance."""
     likelihood: Mapping[str, numpy.ndarray]
-    """Columns of :data:`LIKELIHOOD` that it contains, ``(R,)`` each."""
+    """Columns of the file among :data:`LIKELIHOOD`, ``(R,)`` each."""
 
 
 def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
-    """Read the estimates of a file, or of a folder of trajectories.
+    """Read the estimates of one competitor from a file, or from a folder of trajectories.
 
     Args:
         path: path of the file; a folder contains ``NAME.TRACK.tum``, a file for each track.
@@ -79,7 +79,7 @@ def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
 
 
 def _table_columns(path: Path, components: Sequence[str]) -> dict[str, Any]:
-    """Return the columns of a table, numbers or words."""
+    """Return the columns of a CSV or Parquet table by name, as numbers, or as text for tracks and times."""
     pairs = [f"covariance_{a}_{b}" for a in components for b in components]
     forms = [form + name for name in components for form in ("estimate_", "mean_", "sigma_", "")]
     columns, names, _ = read_table(path, {*TRACK, *SECONDS, LOG_TIME, "policy", *LIKELIHOOD, *forms, *pairs})
@@ -93,7 +93,10 @@ def _table_columns(path: Path, components: Sequence[str]) -> dict[str, Any]:
 
 
 def _netcdf_columns(path: Path) -> dict[str, Any]:
-    """Return the columns from the variables of a NetCDF file, over policy, episode, time and component."""
+    """Return the columns of a flat table by name, from the variables of a NetCDF file.
+
+    The variables are over episode, time and component, and optionally over one policy.
+    """
     import pandas
 
     with open_netcdf(path, decode_times=False) as data:
@@ -173,7 +176,7 @@ def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> Estima
 
 
 def _track_name(value: Any) -> str:
-    """Return the name of a track; for a number without a fraction the whole number."""
+    """Return the name of a track as text, without the fraction of a whole number: "3" for 3.0."""
     text = str(value).strip()
     return text.removesuffix(".0") if text.removesuffix(".0").isdigit() else text
 
@@ -181,8 +184,9 @@ def _track_name(value: Any) -> str:
 def _covariance(
     columns: Mapping[str, Any], components: Sequence[str], rows: int
 ) -> tuple[tuple[bool, ...], numpy.ndarray]:
-    """Read the columns ``covariance_A_B`` and ``sigma_A``: components with a variance, and covariances ``(C, C,
-    R)``.
+    """Return which components have a variance, and the covariances ``(C, C, R)`` from the columns of a table.
+
+    NaN for components without a variance, zero for pairs without a covariance.
     """
     count = len(components)
     found = numpy.full((count, count, rows), numpy.nan)
@@ -200,7 +204,10 @@ def _covariance(
 
 
 def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
-    """Return the positions of one file, or of a folder with a file for each track; the orientation is not read."""
+    """Return the table of positions from one TUM file, or from a folder with a file for each track.
+
+    The orientation is not read.
+    """
     import pandas
 
     axes = [components.index(name) for name in AXES if name in components]
@@ -229,7 +236,7 @@ def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
 
 
 def _trajectory(file: Path) -> numpy.ndarray:
-    """Return the time and position of every line, ``(rows, 4)``."""
+    """Return the time and position of every line of a TUM file, ``(rows, 4)``, s and m."""
     found = []
     for number, line in enumerate(read_content(file).decode("utf-8").splitlines()):
         words = line.split()

@@ -1,4 +1,4 @@
-"""Estimates of every competitor, as a file for other programs."""
+"""Export of every competitor's estimates as CSV, NetCDF or trajectories, for other programs."""
 
 import re
 from pathlib import Path
@@ -11,11 +11,11 @@ from .estimate_tables import AXES
 from .files import whole_file, whole_files
 
 SERIES = ("seconds", "nis", "nis_degrees", "log_likelihood")
-"""Variables that are written with the estimates, where they exist."""
+"""Names of the variables that are written with the estimates, where the evaluation has them."""
 
 
 def check_estimates(path: Path) -> None:
-    """Raise ValueError for a file of another kind."""
+    """Raise ValueError if a path for estimates does not end in ``.csv``, ``.nc`` or ``.tum``."""
     if path.suffix not in (".csv", ".nc", ".tum"):
         raise ValueError(
             f"estimates are written as .csv or .nc, or as trajectories into a folder .tum, got {str(path)!r}"
@@ -23,8 +23,10 @@ def check_estimates(path: Path) -> None:
 
 
 def estimates_of(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return estimates of an evaluation with tracks: ``estimate`` and ``sigma`` over policy, recording, time and
-    component, ``seconds``, and where they are known ``nis``, ``nis_degrees``, ``log_likelihood`` and ``truth``.
+    """Return the dataset of the estimates of an evaluation with tracks, for export.
+
+    Its variables are ``estimate`` and ``sigma`` over policy, recording, time and component, ``seconds``, and where the
+    evaluation has them ``nis``, ``nis_degrees``, ``log_likelihood`` and ``truth``.
 
     ``seconds`` count from the start of the track; for a recording from the first measurement of the log, and
     ``log_time`` is the time in the log, so that rows can be joined with those of the log.
@@ -48,10 +50,10 @@ def estimates_of(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def write_estimates(path: Path, dataset: xarray.Dataset) -> None:
-    """Write the estimates of every competitor, a line or an entry for each measurement of each episode.
+    """Write the estimates of every competitor to a file, one entry for each measurement of each episode.
 
     Args:
-        path: ending in ``.csv`` or ``.nc``; or a folder ending in ``.tum``, see :func:`write_trajectories`.
+        path: path that ends in ``.csv`` or ``.nc``; or a folder that ends in ``.tum``, see :func:`write_trajectories`.
         dataset: evaluation with ``tracks=True``.
 
     Raises:
@@ -87,7 +89,7 @@ def _write_csv(path: Path, found: xarray.Dataset) -> None:
 
 
 def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
-    """Write positions as trajectories in the format of the TUM RGB-D benchmark, which ``evo`` reads.
+    """Write estimated and true positions as trajectory files in the TUM RGB-D format, which ``evo`` reads.
 
     A file has the lines ``time x y z qx qy qz qw``, s and m; the orientation is the identity, and a z that is not
     estimated is zero. The time is that of the log, of dates since 1970; without a log it counts from the start of the
@@ -120,7 +122,7 @@ def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
 
 
 def _log_seconds(own: xarray.Dataset) -> numpy.ndarray:
-    """Return the times of the log in s, ``(T,)``; NaN beyond the end of a shorter episode."""
+    """Return the times of an episode in its log, s, ``(T,)``; NaN beyond its end."""
     import pandas
 
     found = numpy.full(own.sizes["time"], numpy.nan)

@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders: written next to their place, then moved into it.
+"""Atomic writing of files and folders: they are written under another name, then renamed.
 
 An error of the operating system, such as a full disk, becomes one sentence with the path. Locks, which end with their
 process, exclude two writers of the same file.
@@ -21,11 +21,11 @@ except ImportError:  # Windows, where a folder cannot be locked, and a file that
 UNIX = fcntl is not None
 
 UNFINISHED = ".unfinished-"
-"""Prefix of the name of a folder whose files wait until all of them are complete."""
+"""Prefix of the name of the temporary folder in which files are written until all of them are complete."""
 LOCK = ".lock"
-"""Lock file in such a folder, locked as long as its writer is alive."""
+"""Name of the lock file in a temporary folder; it is locked as long as its writer runs."""
 YOUNG = 60.0
-"""Age of a folder, s, up to which it may not have its lock yet."""
+"""Age of a temporary folder, s, up to which its lock file may not exist yet."""
 
 
 @contextmanager
@@ -37,10 +37,10 @@ def _explain_refusals(place: str) -> Iterator[None]:
 
 
 def writable_folder(path: Path) -> Path:
-    """Check that a folder can be written to, before any long work begins; a missing one is not made yet.
+    """Return the path unchanged if files can be written to this folder; a missing folder is not created.
 
     Raises:
-        ValueError: if it cannot.
+        ValueError: if no file can be written there.
     """
     with _explain_refusals(f"to folder {path}"):
         there = next(place for place in (path, *path.absolute().parents) if place.exists())
@@ -51,7 +51,7 @@ def writable_folder(path: Path) -> Path:
 
 @contextmanager
 def _make_folder(path: Path) -> Iterator[None]:
-    """Make a folder; remove it again if writing into it fails."""
+    """Create a folder and its parents; remove those created if the context raises an error."""
     made = [place for place in (path, *path.parents) if not place.exists()]
     path.mkdir(parents=True, exist_ok=True)
     try:
@@ -64,7 +64,7 @@ def _make_folder(path: Path) -> Iterator[None]:
 
 
 def _lock(handle: int) -> bool:
-    """Lock an open file or folder, unless it is locked; the lock ends when it is closed, or with the process."""
+    """Try to lock an open file or folder until it is closed; return False if another process has locked it."""
     try:
         if fcntl is None:
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
@@ -78,11 +78,11 @@ def _lock(handle: int) -> bool:
 
 
 _CLAIMED: dict[str, int] = {}
-"""Folders that this process writes, and the file handles of their locks."""
+"""Paths of the folders that this process has locked, and the handles of their locks."""
 
 
 def claim_folder(folder: Path) -> None:
-    """Claim a folder for this process until it ends: no other process may write a run or a benchmark there.
+    """Lock a folder until this process ends, so that no other process writes a run or a benchmark there.
 
     Raises:
         ValueError: if another process has claimed it, or it cannot be made.
@@ -102,7 +102,9 @@ def claim_folder(folder: Path) -> None:
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Claim a folder inside the context; folders made for it that are empty afterwards are removed.
+    """Lock a folder inside the context, so that no other process writes there.
+
+    Folders that were created for it are removed if they are empty afterwards.
 
     Raises:
         ValueError: as of :func:`claim_folder`.
@@ -122,7 +124,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 
 def _sweep_unfinished(folder: Path) -> None:
-    """Remove unfinished folders whose writers are dead."""
+    """Remove the temporary folders in a folder whose writing processes have ended."""
     for place in folder.glob(f"{UNFINISHED}*"):
         with suppress(OSError):
             if not (place / LOCK).exists():
@@ -141,7 +143,7 @@ def _sweep_unfinished(folder: Path) -> None:
 
 
 def writable_file(path: Path) -> Path:
-    """Check that a file can be written, before any long work begins; its folder is not made yet.
+    """Return the path unchanged if a file can be written there; its folder is not created.
 
     Raises:
         ValueError: if it cannot, or if a folder or a device has its name.
@@ -163,9 +165,9 @@ def _partial(path: Path) -> Path:
 
 @contextmanager
 def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
-    """Yield a new file that replaces an old one only when it is complete.
+    """Yield the path of a temporary file that replaces the file at ``path`` when the context ends without error.
 
-    Meanwhile no other process writes the file, so the old contents read inside the context are those that it replaces.
+    A lock excludes other writers meanwhile, so the old contents read inside the context are those that are replaced.
 
     Args:
         path: path of the file.
@@ -187,7 +189,7 @@ def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
 
 @contextmanager
 def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
-    """Open a file that no other process writes, with its lock; arguments and errors as of :func:`whole_file`."""
+    """Create and lock the temporary file of :func:`whole_file` inside the context."""
     held = partial if UNIX else partial.with_name(partial.name + LOCK)
     handle = _open_locked(held, partial.name[1:-8], time.monotonic() + patience)
     try:
@@ -201,7 +203,7 @@ def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
 
 
 def _open_locked(partial: Path, name: str, until: float) -> int:
-    """Open a file that no other process writes, and lock it; try again until a time of the monotonic clock.
+    """Open and lock a file, with attempts until a time of the monotonic clock; return its handle.
 
     Args:
         partial: the file.
@@ -238,9 +240,9 @@ def _hold(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
-    """Yield a new folder whose files are moved into another one together, when all of them are complete.
+    """Yield a temporary folder; its files are moved into ``folder`` when the context ends without error.
 
-    Files of its subfolders go into the same subfolders there.
+    Files in its subfolders go into the same subfolders of ``folder``.
 
     Raises:
         ValueError: if they cannot be written.
@@ -268,7 +270,7 @@ def _beside(folder: Path) -> tuple[Path, Path]:
 
 
 def find_folder(folder: Path) -> Path:
-    """Return the path of a folder of :func:`whole_folder`: next to its place after a crash during the move.
+    """Return the path that has a folder's contents: itself, or a neighbour after a crash of :func:`whole_folder`.
 
     The old one is moved away only when the new one is complete, so without the folder both others are whole.
     """
@@ -279,7 +281,7 @@ def find_folder(folder: Path) -> Path:
 
 
 def settle_folder(folder: Path) -> None:
-    """Finish a move that a crash interrupted, and remove its remains.
+    """Finish replacing a folder if a crash interrupted it, and remove the leftover copies.
 
     Raises:
         ValueError: if it cannot be moved into its place.
@@ -294,7 +296,7 @@ def settle_folder(folder: Path) -> None:
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """Yield a new folder that replaces an old one only when it is complete.
+    """Yield the path of a temporary folder that replaces ``folder`` when the context ends without error.
 
     Raises:
         ValueError: if it cannot be written.
@@ -315,7 +317,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file.
+    """Write a text to a file, in UTF-8, atomically.
 
     Raises:
         ValueError: if it cannot be written.

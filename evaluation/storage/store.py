@@ -1,4 +1,4 @@
-"""Store of unfinished work: after an interruption the same command computes only the missing results.
+"""Store of results on disk, so that after an interruption the same command computes only the missing ones.
 
 The result of each piece of work is one file. Its name ends with a digest of everything that determines the result: the
 request and the code. A changed request or code has another name, and is computed again.
@@ -26,22 +26,22 @@ UNFINISHED = "unfinished"
 """Folder of a store, beside the results of a command."""
 SUFFIX = ".msgpack"
 DIGITS = 32
-"""Hexadecimal digits of a digest in the name of a file: 128 bits."""
+"""Number of hexadecimal digits of the digest in the name of a file: 128 bits."""
 
 Result = TypeVar("Result")
 
 
 class Work(NamedTuple):
-    """A piece of work, identified by everything that its result depends on."""
+    """Name and identity of a unit of work whose result is stored."""
 
     name: str
-    """Beginning of the name of its file. Files with the same name are removed together."""
+    """First part of the name of its file. Files with the same name are removed together."""
     content: str
-    """Everything that its result depends on apart from the code of the package."""
+    """Text that contains all that its result depends on, apart from the code of the package."""
 
 
 class Store:
-    """Results of pieces of work in a folder.
+    """Results of pieces of work, stored in a folder as one file each.
 
     Args:
         folder: folder, made with the first result; None: nothing is stored.
@@ -63,7 +63,7 @@ class Store:
         return self.folder / f"{name}.{digest[:DIGITS]}{SUFFIX}"
 
     def read(self, work: Work | None, kind: type[Result]) -> Result | None:
-        """Return the result of a piece of work; None where there is none.
+        """Return the stored result of a unit of work; None if it is not stored.
 
         Args:
             work: the piece; None for one that is never stored, since changes of its code cannot be recognised.
@@ -78,7 +78,7 @@ class Store:
             return None  # of another program, or damaged: it is computed again
 
     def write(self, work: Work | None, result: Any) -> None:
-        """Store the result of a piece of work: numbers, strings, arrays and datasets, in containers of declared types.
+        """Write the result of a piece of work to its file: numbers, strings, arrays or datasets in typed containers.
 
         A result that cannot be written, for example on a full disk, is computed again after an interruption, with a
         warning.
@@ -93,7 +93,7 @@ class Store:
                 warnings.warn(f"{error}: after an interruption it is computed again", stacklevel=2)
 
     def result(self, work: Work | None, kind: type[Result], make: Callable[[], Result]) -> Result:
-        """Return the result of a piece of work; compute and store it where there is none."""
+        """Return the stored result of a piece of work, or compute it with ``make`` and store it."""
         found = self.read(work, kind)
         if found is None:
             found = make()
@@ -101,7 +101,7 @@ class Store:
         return found
 
     def clear(self) -> None:
-        """Remove the files with the names of the requested work, and the folder if it is empty."""
+        """Remove the files of all work that this store has read or written, and the folder if it is empty."""
         if self.folder is None or not self.folder.is_dir():
             return
         own = rf"\.?(.+)\.[0-9a-f]{{{DIGITS}}}{re.escape(SUFFIX)}(\.partial)?"  # a crash leaves partial ones
@@ -114,7 +114,7 @@ class Store:
 
 
 def _encode(value: Any) -> Any:
-    """Encode a value that MessagePack does not have."""
+    """Return a NumPy or xarray value as one that MessagePack can store."""
     if isinstance(value, numpy.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
     if isinstance(value, numpy.generic):

@@ -1,4 +1,4 @@
-"""Reading of JSON files with checks of types and limits."""
+"""Reading of JSON files, with checks of their types and limits."""
 
 import types
 from pathlib import Path
@@ -11,7 +11,7 @@ Stored = TypeVar("Stored")
 
 
 def read_json(path: Path) -> Any:
-    """Return the contents of a JSON file.
+    """Return the contents of a JSON file, as Python values.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -26,7 +26,7 @@ def read_json(path: Path) -> Any:
 
 
 def restore(cls: type[Stored], values: Any) -> Stored:
-    """Make a dataclass or named tuple from its fields.
+    """Make a dataclass or named tuple from a dictionary of its fields, with a check of their types.
 
     Raises:
         ValueError: if a field is missing, unknown, or not of its declared type.
@@ -39,30 +39,30 @@ def restore(cls: type[Stored], values: Any) -> Stored:
         raise ValueError(str(error)) from error
     for name, hint in get_type_hints(cls).items():
         value = getattr(found, name)
-        if not fits(value, hint):
+        if not has_type(value, hint):
             raise ValueError(
                 f"{name} must be {getattr(hint, '__name__', hint)}, got {quote_shortened(value)}"
             )
     return found
 
 
-def fits(value: Any, hint: Any) -> bool:
-    """Return whether a value from JSON has a declared type; a whole number is a float, too."""
+def has_type(value: Any, hint: Any) -> bool:
+    """Return whether a value read from JSON has the type of a hint; an integer also counts as a float."""
     origin, of = get_origin(hint), get_args(hint)
     if hint is Any:
         return True
     if origin is types.UnionType:
-        return any(fits(value, other) for other in of)
+        return any(has_type(value, other) for other in of)
     if origin is list:
-        return isinstance(value, list) and all(fits(item, of[0]) for item in value)
+        return isinstance(value, list) and all(has_type(item, of[0]) for item in value)
     if origin is dict:
-        return isinstance(value, dict) and all(fits(item, of[1]) for item in value.values())
+        return isinstance(value, dict) and all(has_type(item, of[1]) for item in value.values())
     if is_typeddict(hint):
         hints = get_type_hints(hint)
         return (
             isinstance(value, dict)
             and hint.__required_keys__ <= value.keys() <= hints.keys()
-            and all(fits(item, hints[name]) for name, item in value.items())
+            and all(has_type(item, hints[name]) for name, item in value.items())
         )
     if isinstance(value, bool):
         return hint is bool

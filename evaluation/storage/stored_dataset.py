@@ -1,4 +1,4 @@
-"""Small datasets as JSON: curves and tracks, for users without NetCDF or Python."""
+"""Conversion of small datasets, such as curves and tracks, to JSON and back."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,13 +7,13 @@ import numpy
 import xarray
 
 from ...envs.contract.parameters import quote_shortened
-from .stored import fits
+from .stored import has_type
 
 PARTS = ("coords", "variables", "attrs")
 
 
 def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwise: int) -> dict[str, Any]:
-    """Return a dataset of numbers and strings as JSON values, null for NaN.
+    """Return a dataset of numbers and strings as a dictionary of JSON values; NaN becomes null.
 
     Args:
         dataset: values that are no numbers become strings.
@@ -42,7 +42,7 @@ def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwis
 
 
 def dataset_from_json(stored: Any) -> xarray.Dataset:
-    """Return the dataset from the JSON values of :func:`dataset_as_json`.
+    """Return the dataset stored in the JSON values of :func:`dataset_as_json`.
 
     Raises:
         ValueError: if it is no dataset: its parts do not fit together, or contain other types than numbers and strings.
@@ -51,19 +51,19 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
         raise ValueError(f"expected {', '.join(PARTS)} of a dataset, got {quote_shortened(stored)}")
 
     def read(name: str, entry: Any) -> tuple[list[str], numpy.ndarray]:
-        if not (isinstance(entry, list) and len(entry) == 2 and fits(entry[0], list[str])):
+        if not (isinstance(entry, list) and len(entry) == 2 and has_type(entry[0], list[str])):
             raise ValueError(f"{name!r} needs dimensions and values")
         values = entry[1]
         if isinstance(values, dict):
             shape, numbers = values.get("shape"), values.get("numbers")
-            if not (isinstance(shape, list) and fits(shape, list[int]) and min(shape, default=0) >= 0):
+            if not (isinstance(shape, list) and has_type(shape, list[int]) and min(shape, default=0) >= 0):
                 raise ValueError(f"{name!r} needs a shape")
-            if not fits(numbers, list[float | None]):
+            if not has_type(numbers, list[float | None]):
                 raise ValueError(f"{name!r} needs its numbers")
             array = _array(numbers, float).reshape(shape)
-        elif fits(values, list[str]) or isinstance(values, str):
+        elif has_type(values, list[str]) or isinstance(values, str):
             array = numpy.array(values)
-        elif fits(values, list[int]) or isinstance(values, int):
+        elif has_type(values, list[int]) or isinstance(values, int):
             array = _array(values, numpy.int64)
         else:
             raise ValueError(f"{name!r} must contain numbers or strings")
@@ -74,13 +74,13 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
     coords, variables = (
         {name: read(name, entry) for name, entry in stored[part].items()} for part in PARTS[:2]
     )
-    if not fits(stored["attrs"], dict[str, str | int | float]):
+    if not has_type(stored["attrs"], dict[str, str | int | float]):
         raise ValueError("attributes must be words or numbers")
     return xarray.Dataset(variables, coords, stored["attrs"])
 
 
 def _array(values: Any, kind: Any) -> numpy.ndarray:
-    """Return numbers as an array; NaN for None.
+    """Return a list of numbers as an array; None becomes NaN.
 
     Raises:
         ValueError: if one is too large.

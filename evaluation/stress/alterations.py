@@ -1,7 +1,7 @@
-"""Alterations of measurements between the sensors and a filter, as a list with names.
+"""Alterations of measurements between the sensors and a filter, such as gaps, outliers and wrong clocks.
 
 Each is a pure function of a :class:`.streams.Stream` and a generator of random numbers. It returns another stream, or
-None where it does not apply: the environment's measurements have no time, or no mark of received measurements. The
+None where it does not apply: the environment's measurements have no time, or no flag for received measurements. The
 world declares the meaning of fields (:class:`~filtergym.envs.contract.world.World`).
 """
 
@@ -22,23 +22,23 @@ AFTERWARDS = 100
 LASTING = 200
 """Number of measurements of a stream with a lasting alteration."""
 EVERY = 10
-"""One in this number of measurements is delivered twice or late."""
+"""Period, in measurements, with which one is delivered twice or late."""
 
 Function = Callable[[Stream, numpy.random.Generator], Stream | None]
 
 
 class Alteration(NamedTuple):
-    """One alteration of measurements, as it happens in the field."""
+    """Name, description and function of one alteration of measurements."""
 
     name: str
     description: str
     function: Function
     length: int = SETTLED + LASTING
-    """Number of measurements that it requires of a stream."""
+    """Number of measurements that the stream must have."""
 
 
 def _cut(stream: Stream, begin: int, end: int | None) -> Stream:
-    """Return a stream that ends soon after a temporary alteration, or has a lasting one."""
+    """Return a stream cut some measurements after the end of a temporary or the beginning of a lasting alteration."""
     length = LASTING if end is None else end + AFTERWARDS
     return replace(stream.select(numpy.arange(min(length, len(stream)))), begin=begin, end=end)
 
@@ -49,12 +49,12 @@ def _unaltered(stream: Stream, generator: numpy.random.Generator) -> Stream:
 
 def _gap(scans: int) -> Function:
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-        """Remove measurements from a timed stream; in others mark them as not received."""
+        """Remove measurements from a timed stream; in others set them to not received."""
         if stream.is_timed:
             seconds = stream.seconds
             kept = numpy.r_[:SETTLED, SETTLED + scans : len(stream)]
             found = stream.select(kept).with_times(seconds[kept])
-            return _cut(found.renumbered(), SETTLED, SETTLED + 1)
+            return _cut(found.renumber(), SETTLED, SETTLED + 1)
         field = type(stream.task.world).received_field
         if not field:
             return None
@@ -85,13 +85,13 @@ def _reordered(order: Callable[[int], list[int]]) -> Function:
         numbers = [*range(SETTLED)]
         for first in range(SETTLED, len(stream) - EVERY, EVERY):
             numbers += order(first)
-        return _cut(stream.select(numbers).with_times(stream.seconds[numbers]).renumbered(), SETTLED, None)
+        return _cut(stream.select(numbers).with_times(stream.seconds[numbers]).renumber(), SETTLED, None)
 
     return alter
 
 
 def _stamped(change: Callable[[numpy.ndarray], numpy.ndarray], passes: bool = True) -> Function:
-    """Return an alteration of time stamps; ``change`` takes the times from ``SETTLED - 1`` on."""
+    """Return an alteration of the time stamps; ``change`` takes the times from index ``SETTLED - 1`` on."""
 
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
         if not stream.is_timed:
@@ -132,7 +132,7 @@ def _outlier(sigmas: float) -> Function:
 
 def _wrong_noise(factor: float) -> Function:
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-        """Change the stated R; where none is stated, enlarge the errors."""
+        """Scale the noise covariance that the measurements state; if they state none, enlarge the errors."""
         field = type(stream.task.world).stated_field
         if field:
             stated = getattr(stream.measurements, field).copy()
@@ -161,9 +161,7 @@ def _frozen(stream: Stream, generator: numpy.random.Generator) -> Stream:
 
 
 def _not_a_number(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-    """Set readings to NaN; it does not apply where measurements cannot be marked as missing, since the input rejects
-    NaN.
-    """
+    """Set one measurement to NaN; None if measurements cannot be missing, since the input then rejects NaN."""
     if not type(stream.task.world).received_field:
         return None
     readings = stream.readings.copy()
@@ -180,7 +178,7 @@ def _initial_covariance(factor: float) -> Function:
 
 
 def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
-    """Restart in the middle: from the truth there, with errors of the initial covariance."""
+    """Return a stream that starts in the middle: from the truth there, with errors of the initial covariance."""
     before, initial = stream.at(SETTLED - 1), stream.initial
     root = semidefinite_root(initial.covariance)
     errors = numpy.einsum("ijn,jn->in", root, generator.standard_normal(initial.mean.shape))
@@ -191,7 +189,7 @@ def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
             others[name] = before if isinstance(value, type(before)) else getattr(before, name, value)
     begun = initial._replace(mean=stream.truth[SETTLED - 1] + errors, **others)
     later = stream.select(numpy.arange(SETTLED, len(stream)))
-    return _cut(replace(later, initial=begun).renumbered(), Causes.of(stream.task).start, 1)
+    return _cut(replace(later, initial=begun).renumber(), Causes.of(stream.task).start, 1)
 
 
 def _rounded(stream: Stream, generator: numpy.random.Generator) -> Stream:
@@ -249,4 +247,4 @@ ALTERATIONS: tuple[Alteration, ...] = (
     Alteration("restart", "the track begins anew in the middle", _restart),
     Alteration("rounded-readings", "readings and start are rounded to single precision", _rounded),
 )
-"""All alterations, in the order of the table."""
+"""All alterations, in the order of the table of results."""

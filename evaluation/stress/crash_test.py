@@ -1,4 +1,4 @@
-"""Run of a filter under every alteration of its measurements, with a verdict in one word and one sentence.
+"""Stress test of a filter: it runs under every alteration of its measurements, with a verdict for each.
 
 The test checks at every measurement that mean and covariance are finite, and the covariance symmetric and positive
 definite. It compares the error with that of the same filter on unaltered measurements of the same episodes, and checks
@@ -34,25 +34,24 @@ from .alterations import AFTERWARDS, ALTERATIONS, SETTLED, Alteration
 from .streams import Stream, record_streams
 
 RECOVERY = 50
-"""Number of measurements after a temporary alteration within which a filter must recover the errors that it has
-without; evaluated over as many that follow."""
+"""Number of measurements after a temporary alteration within which the errors must return to those without it."""
 BACK = 3.0
-"""Ratio of errors up to which an episode has recovered."""
+"""Ratio of errors below which an episode counts as recovered."""
 FEW = 0.1
-"""Share of the episodes that need not recover."""
+"""Largest permitted share of episodes that do not recover."""
 HARM = 1.25
-"""Ratio of errors from which on a filter is degraded."""
+"""Ratio of errors above which a filter counts as degraded."""
 INCONSISTENT = 2.0
-"""Factor by which ANEES may differ from one, or from that of unaltered measurements."""
+"""Factor by which ANEES may differ from one, or from that without alteration."""
 SLOW, SLOW_SECONDS, HICCUPS = 50.0, 0.1, 3
-"""Multiple of the median update, time in s, and number of updates above both from which on updates count as slow."""
+"""Limits for slow updates: multiple of the median time, time in s, and number of exceptions."""
 MOST_WORDS = 160
-"""Maximal number of characters of a filter's error in a report."""
+"""Maximal number of characters of an error message in a report."""
 CHUNK = 1000
-"""Measurements of a long run in memory at a time."""
+"""Number of measurements of a long run in memory at a time."""
 LONG_EPISODES = 8
 MOST_KEPT = 20_000
-"""Maximal number of measurements of a long run that are recorded once for all filters."""
+"""Maximal number of measurements of a long run that are stored for all filters."""
 UNALTERED, RESTORE, LONG = ALTERATIONS[0].name, "restore", "long-run"
 DESCRIPTIONS: Mapping[str, str] = {
     **{one.name: one.description for one in ALTERATIONS},
@@ -64,7 +63,7 @@ PASSED, DEGRADED, FAILED, NOTHING = "passed", "degraded", "failed", "does not ap
 
 
 class Finding(NamedTuple):
-    """Result of a filter under one alteration."""
+    """Verdict on a filter under one alteration, with its errors."""
 
     competitor: str
     alteration: str
@@ -73,10 +72,11 @@ class Finding(NamedTuple):
     reason: str
     """One sentence; for a passed test empty, or a remark."""
     error: float | None
-    """Error over that on unaltered measurements, for unaltered ones over that of the reference; geometric mean over
-    episodes."""
+    """Error over that without alteration, geometric mean over episodes; for unaltered measurements over that of the
+    reference.
+    """
     reference_error: float | None
-    """Same ratio of the reference filter."""
+    """The same ratio of the reference filter."""
     anees: float | None
     """Mean NEES over its dimension, from the alteration on."""
     anees_low: float | None
@@ -87,34 +87,34 @@ class Finding(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Results of a filter on a stream of N episodes."""
+    """Errors, faults and times of a filter on a stream of N episodes."""
 
     size: numpy.ndarray
-    """Size of the error, ``(K, N)``."""
+    """Normalised size of the error, ``(K, N)``."""
     nees: numpy.ndarray
     """NEES over its dimension, ``(K, N)``."""
     fault: numpy.ndarray
-    """Number among ``FAULTS`` of the reason why an estimate is invalid, 0 where it is valid, ``(K, N)``."""
+    """Number among ``FAULTS`` of the reason why an estimate is invalid, ``(K, N)``; 0 where it is valid."""
     slow: float
-    """Time of the slowest update except for a few, s."""
+    """Time of the slowest update without a few exceptions, s."""
     median: float
     """Median time of an update, s."""
     error: str = ""
-    """Error that the filter raised, if any."""
+    """Message of the error that the filter raised; empty without one."""
 
 
 class StreamFilter(OnlineFilter):
-    """An online filter that receives measurements of the task unchecked."""
+    """Online filter that receives the task's measurements without checks."""
 
     def begin(self, initial: Any) -> None:
-        """Start the tracks from the task's own initial estimate."""
+        """Start the tracks with the task's initial estimate."""
         self._set_state(self._begin(initial, {}))
 
     def _check_input(self, memory: Any) -> None:
-        """Do nothing: without an input there is no memory of it to check."""
+        """Do nothing, since there is no memory of an input to check."""
 
     def take(self, measurement: Any) -> dict[str, numpy.ndarray]:
-        """Update with a measurement; return mean, covariance and the other reported quantities, arrays ``(..., N)``."""
+        """Update with a measurement; return mean, covariance and statistics by name, arrays ``(..., N)``."""
         if self.tracks > 1:
             return self._advance(measurement, {})
         found = self._advance(select_lanes(measurement, 0), {})
@@ -122,16 +122,16 @@ class StreamFilter(OnlineFilter):
 
 
 def _subtract(stream: Stream, means: numpy.ndarray) -> numpy.ndarray:
-    """Return the errors ``(K, C, N)`` of means at the first K measurements; for angles the shortest differences."""
+    """Return the errors ``(K, C, N)`` of means at the first K measurements; of angles the shortest differences."""
     means, truth = (numpy.moveaxis(values, 1, 0) for values in (means, stream.truth[: len(means)]))
     return numpy.moveaxis(stream.task.subtract(means, truth), 0, 1)
 
 
 class CrashTest:
-    """Streams of measurements with every alteration, and the reference filter for comparisons.
+    """Streams with every alteration for an experiment, and the verdicts on filters.
 
     Args:
-        experiment: gives environment, scenario, seed, split and parameters; its episodes are the streams.
+        experiment: environment, scenario, seed, split and parameters; its episodes are the streams.
         steps: number of measurements of the long run.
         reference: name of the reference filter and its maker; None in an environment without one.
         alterations: alterations to apply; the first must change nothing.
@@ -140,7 +140,7 @@ class CrashTest:
         ValueError: if the environment does not declare the readings of its sensors.
 
     Attributes:
-        streams: streams by the names of the alterations; None where one does not apply.
+        streams: streams by the name of the alteration; None where it does not apply.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class CrashTest:
         for one in alterations:
             generator = numpy.random.default_rng([experiment.seed, *one.name.encode()])
             altered = one.function(whole, generator)
-            self.streams[one.name] = None if altered is None else altered.received_as_live()
+            self.streams[one.name] = None if altered is None else altered.mark_missing()
         self.scale: numpy.ndarray = numpy.ones(len(whole.task.components))
         self._bootstrap = Bootstrap(experiment.episodes)
         self._kept: list[Stream] = []
@@ -192,7 +192,7 @@ class CrashTest:
         return record_streams(model, seeds, length, chunk)
 
     def filter_of(self, name: str, maker: Any, tracks: int) -> StreamFilter:
-        """Make a competitor as an online filter.
+        """Return a competitor as an online filter without checks of its input.
 
         Raises:
             ValueError: for a competitor that needs the truth or later measurements, or cannot be made.
@@ -257,15 +257,15 @@ class CrashTest:
     def findings(
         self, name: str, maker: Any, tick: Callable[[int], None] = lambda done: None
     ) -> Iterator[Finding]:
-        """Run a competitor under all alterations.
+        """Run a competitor under all alterations; yield the verdict under each.
 
         Args:
-            name: its name.
+            name: name of the competitor.
             maker: its maker, or the competitor itself.
             tick: called with the number of alterations done.
 
         Yields:
-            Result under each alteration.
+            Verdict under each alteration.
 
         Raises:
             ValueError: for a competitor that needs the truth or later measurements, or cannot be made.
@@ -294,7 +294,7 @@ class CrashTest:
         return Finding(name, alteration, verdict, reason, **numbers, episodes=self.experiment.episodes)
 
     def _judge(self, name: str, alteration: str, stream: Stream, run: Run, plain: Run) -> Finding:
-        """Return the verdict on a filter under one alteration."""
+        """Return the verdict on a filter under one alteration, from its run and that without alteration."""
         reference = self._reference.get(alteration)
         if alteration == UNALTERED:
             ratio = self._ratio(run, reference, stream, slice(SETTLED, None))
@@ -327,7 +327,7 @@ class CrashTest:
         return self._finding(name, alteration, DEGRADED if words else PASSED, "; ".join(words), **fields)
 
     def _failure(self, run: Run, plain: Run, stream: Stream, lost: numpy.ndarray) -> str:
-        """Return a sentence on the failure; empty without one."""
+        """Return a sentence that describes why the filter failed; empty if it did not."""
         count = stream.episodes
         if run.error:
             return f"stops at measurement {len(run.size) + 1}: {run.error}"
@@ -350,7 +350,7 @@ class CrashTest:
         return ""
 
     def _harm(self, alteration: str, fields: Mapping[str, Any]) -> Iterator[str]:
-        """Yield sentences on the increase of the errors, and of those of the reference."""
+        """Yield a sentence on the increase of the competitor's error, if it is above the limit ``HARM``."""
         error, other = fields["error"], fields["reference_error"]
         if not error > HARM:
             return
@@ -361,7 +361,7 @@ class CrashTest:
             yield f"error {_text(error)} times that without{beside}"
 
     def _inconsistency(self, alteration: str, anees: IntervalEstimate, plain: Run) -> Iterator[str]:
-        """Yield sentences on an inconsistent covariance."""
+        """Yield a sentence on ANEES, if the covariance is inconsistent."""
         usual = 1.0 if alteration == UNALTERED else max(1.0, float(numpy.nanmean(plain.nees[SETTLED:])))
         if anees.low > INCONSISTENT * usual:
             yield f"overconfident, {_anees_text(anees)}"
@@ -369,9 +369,7 @@ class CrashTest:
             yield f"cautious, {_anees_text(anees)}"
 
     def _ratio(self, run: Run | None, other: Run | None, stream: Stream, part: slice) -> numpy.ndarray:
-        """Return the error of each episode over that of another run at the same measurements of the recorded
-        stream, ``(N,)``.
-        """
+        """Return the ratio of each episode's RMS error in two runs, at the same measurements, ``(N,)``."""
         if run is None or other is None:
             return numpy.full(stream.episodes, numpy.nan)
         chosen = numpy.arange(len(stream))[part]
@@ -387,13 +385,13 @@ class CrashTest:
         return ratio
 
     def _mean(self, values: numpy.ndarray) -> IntervalEstimate:
-        """Return the mean over measurements and episodes, with its interval."""
+        """Return the mean over measurements ``(K, N)`` and episodes, with its bootstrap interval over episodes."""
         with numpy.errstate(all="ignore"):
             each = values.mean(axis=0) if len(values) else numpy.full(values.shape[1], numpy.nan)
             return self._bootstrap.estimate(each)
 
     def _restore(self, name: str, maker: Any) -> Finding:
-        """Save the state in the middle, and continue from it with another filter."""
+        """Return the verdict on a state saved in the middle and restored in another filter."""
         count, stream = self.experiment.episodes, self._stream(UNALTERED)
         first = self.filter_of(name, maker, count)
         second = self.filter_of(name, maker, count)
@@ -419,7 +417,7 @@ class CrashTest:
         return self._finding(name, RESTORE, PASSED)
 
     def _long_streams(self) -> Iterable[Stream]:
-        """Return the streams of the long run; they are stored for the next filter unless they are very long."""
+        """Return the streams of the long run; they are stored for the next filter unless they are too long."""
         streams = self._record(self._seeds[:LONG_EPISODES], self.steps, CHUNK)
         if self.steps > MOST_KEPT:
             return streams
@@ -452,7 +450,7 @@ class CrashTest:
 
 
 def _geometric_mean(ratio: Any) -> float:
-    """Return the geometric mean without NaN; NaN where there are no numbers."""
+    """Return the geometric mean of the finite values; NaN without any."""
     with numpy.errstate(all="ignore"):
         logs = numpy.log(numpy.atleast_1d(ratio))
     logs = logs[numpy.isfinite(logs)]
@@ -468,5 +466,5 @@ def _shortened(raised: Exception) -> str:
 
 
 def _text(value: float) -> str:
-    """Return a number with three digits."""
+    """Return a number as text with three digits."""
     return f"{value:.3g}" if value < 1e4 else f"{value:.1e}"

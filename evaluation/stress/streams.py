@@ -1,7 +1,7 @@
-"""Measurements of episodes as arrays with a time axis, which can be altered before a filter receives them.
+"""Simulated measurements of episodes as arrays over time, which can be altered before a filter receives them.
 
-A :class:`Stream` is recorded once from the simulation. In a closed loop the paper's algorithm closes it, and all
-filters receive the same measurements.
+A :class:`Stream` is recorded once from the simulation. The paper's algorithm closes the loop, and all filters receive
+the same measurements.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,13 +25,13 @@ class Stream:
     task: Task
     """Task on NumPy arrays; its world declares the meaning of the fields."""
     initial: Any
-    """The initial estimate given to every filter, arrays ``(..., N)``."""
+    """Initial estimate given to every filter, arrays ``(..., N)``."""
     measurements: Any
     """The task's ``Measurement``, arrays ``(K, ..., N)``."""
     truth: numpy.ndarray
     """True values of the components at the measurements, ``(K, C, N)``."""
     source: numpy.ndarray
-    """Index of each measurement in the recorded stream, ``(K,)``."""
+    """Index of each measurement in the recorded stream without alterations, ``(K,)``."""
     begin: int = 0
     """Index of the first altered measurement."""
     end: int | None = None
@@ -47,25 +47,25 @@ class Stream:
 
     @property
     def reading_field(self) -> str:
-        """Name of the field with the readings of sensors."""
+        """Name of the measurement's field with the readings of the sensors."""
         world = type(self.task.world)
         return world.reading_field or world.received_field
 
     @property
     def readings(self) -> numpy.ndarray:
-        """Readings of sensors, ``(K, m, N)``."""
+        """Readings of the sensors, ``(K, m, N)``."""
         values: numpy.ndarray = getattr(self.measurements, self.reading_field)
         return values
 
     @property
     def deviations(self) -> numpy.ndarray:
-        """Stated or nominal standard deviations of the errors of the readings, ``(K, m, N)``."""
+        """Standard deviations of the readings' errors, as the measurements or the model state them, ``(K, m, N)``."""
         world = self.task.world
         return numpy.stack([world.reading_deviations(self.at(k)) for k in range(len(self))])
 
     @property
     def is_timed(self) -> bool:
-        """Whether measurements contain the time since the last one."""
+        """Whether measurements contain the time since the previous one."""
         return getattr(self.measurements, "interval", None) is not None
 
     @property
@@ -74,11 +74,11 @@ class Stream:
         return numpy.cumsum(self.measurements.interval, axis=0)
 
     def at(self, number: int) -> Any:
-        """Return one measurement, arrays ``(..., N)``."""
+        """Return the measurement with this index, arrays ``(..., N)``."""
         return map_arrays(lambda values: values[number], self.measurements)
 
     def select(self, numbers: Sequence[int] | numpy.ndarray) -> "Stream":
-        """Return the stream with these measurements, in this order; intervals do not change."""
+        """Return a stream of the measurements with these numbers, in this order; intervals do not change."""
         index = numpy.asarray(numbers)
         return replace(
             self,
@@ -88,16 +88,16 @@ class Stream:
         )
 
     def with_fields(self, **fields: Any) -> "Stream":
-        """Return the stream with other values in some fields of the measurement."""
+        """Return a stream with some fields of the measurements replaced."""
         return replace(self, measurements=self.measurements._replace(**fields))
 
     def with_readings(self, readings: numpy.ndarray) -> "Stream":
-        """Return the stream with other readings, where readings are received."""
+        """Return a stream with the readings replaced, where readings were received."""
         return self.with_fields(**{self.reading_field: numpy.where(self.received, readings, self.readings)})
 
     @property
     def received(self) -> numpy.ndarray:
-        """Whether each reading is received, ``(K, m, N)``."""
+        """Mask of the readings that were received, ``(K, m, N)``."""
         available = getattr(self.measurements, "available", None)
         if available is None:
             return numpy.ones(self.readings.shape, dtype=bool)
@@ -106,7 +106,7 @@ class Stream:
         return numpy.broadcast_to(available > 0.0, self.readings.shape)
 
     def with_times(self, seconds: numpy.ndarray) -> "Stream":
-        """Return a timed stream with other times of the measurements, s, ``(K, N)``."""
+        """Return a timed stream with the times of the measurements replaced, s, ``(K, N)``."""
         interval = numpy.diff(seconds, axis=0, prepend=0.0 * seconds[:1])
         fields = {"interval": interval}
         elapsed = type(self.task.world).elapsed_field
@@ -114,8 +114,8 @@ class Stream:
             fields[elapsed] = _since_received(seconds, numpy.asarray(self.received.any(axis=1)))
         return self.with_fields(**fields)
 
-    def received_as_live(self) -> "Stream":
-        """Return the stream as the input for live measurements passes it on: NaN is marked as not received."""
+    def mark_missing(self) -> "Stream":
+        """Return a stream in which readings of NaN are set to not received, as the input of an online filter does."""
         field, missing = type(self.task.world).received_field, numpy.isnan(self.readings)
         if not field or not missing.any():
             return self
@@ -123,8 +123,8 @@ class Stream:
         available[missing if available.ndim == missing.ndim else missing.any(axis=1)] = 0
         return self.with_fields(**{field: numpy.where(missing, 0.0, self.readings), "available": available})
 
-    def renumbered(self) -> "Stream":
-        """Return the stream with its measurements numbered from 1 on, where they have numbers."""
+    def renumber(self) -> "Stream":
+        """Return a stream with the scan numbers counted from 1 on, if measurements have such numbers."""
         counter = LiveReader.of(self.task).input.counter
         values = getattr(self.measurements, counter, None)
         if values is None:
@@ -134,7 +134,7 @@ class Stream:
 
 
 def _since_received(seconds: numpy.ndarray, received: numpy.ndarray) -> numpy.ndarray:
-    """Return the time since the last received measurement before, or the start, s, ``(K, N)``."""
+    """Return the time since the previous received measurement, or the start, s, ``(K, N)``."""
     last, found = 0.0 * seconds[0], []
     for now, there in zip(seconds, received, strict=True):
         found.append(now - last)
@@ -143,7 +143,7 @@ def _since_received(seconds: numpy.ndarray, received: numpy.ndarray) -> numpy.nd
 
 
 def record_streams(model: Model, seeds: Sequence[int], length: int, chunk: int) -> Iterator[Stream]:
-    """Record the measurements in episodes of these seeds, with the paper's algorithm in the loop.
+    """Simulate episodes with the paper's algorithm in the loop; yield successive streams of their measurements.
 
     Args:
         model: model of the control of the paper's algorithm, with a horizon of at least ``length``.

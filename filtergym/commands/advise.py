@@ -59,7 +59,7 @@ def price_words(price: Mapping[str, int] | None) -> str:
 
 
 def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any], Mapping[str, int] | None]:
-    """Return a function of a competitor's name and maker that gives the cost of an update in C, in words."""
+    """Return a function from a competitor's name and maker to the cost of an update in C: operations and bytes."""
     parameters = log_setup(problem, recording).parameters
 
     def price(name: str, maker: Any) -> Mapping[str, int] | None:
@@ -71,24 +71,24 @@ def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any]
     return price
 
 
-def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path, seed: int) -> None:
-    """Fit one filter to a whole recording, print its parameters, and write them.
+def fit_to_recording(problem: Problem, name: str, recording: Recording, folder: Path, seed: int) -> None:
+    """Fit one filter to a whole recording, print its parameters, and write them to a file.
 
     Args:
-        problem: of the recording.
-        name: of what can be fitted, or ``module:Class``.
-        found: the recording.
-        folder: for the file.
-        seed: of the starts of the fit.
+        problem: environment of the recording.
+        name: name of a filter that can be fitted, or ``module:Class``.
+        recording: the recording.
+        folder: folder of the file.
+        seed: seed of the starts of the fit.
     """
-    families = families_of(problem, found)
+    families = families_of(problem, recording)
     if ":" not in name and name not in families:
         raise nearest("filter that can be fitted to a recording", name, families)
     family = families[name] if name in families else own_family(name, find_competitor(problem, name).maker)
     out = folder / f"{short_name(problem.id)}.{name}{SUFFIX}"
     if name in families:
         writable_file(out)
-    tunable, fitted, intervals = fit_all(FittedLog(problem, found, seed=seed), family)
+    tunable, fitted, intervals = fit_all(FittedLog(problem, recording, seed=seed), family)
     likelihood = fitted.log_likelihood / fitted.measurements
     console.print(
         f"{name}, fitted to {fitted.measurements:,} measurements, {likelihood:.3f} nats per measurement:",
@@ -99,7 +99,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
     if name not in families:
         console.print(OWN)
         return
-    write_advised(out, problem, name, found, fitted, intervals, command_line())
+    write_advised(out, problem, name, recording, fitted, intervals, command_line())
     console.print(f"saved in {out}; filtergym evaluate {problem.name} --policy {out} runs it", soft_wrap=True)
 
 
@@ -225,7 +225,7 @@ def advise_on_log(
 
 
 def _advice_maker() -> Callable[..., str]:
-    """Return the function that makes the report of an advice; errors as of :func:`.result_output.report_maker`."""
+    """Return :func:`.advice_html`; raise ValueError if the packages of HTML reports are not installed."""
     report_maker()
     from ..reports.pages.advice_report import advice_html
 

@@ -39,7 +39,7 @@ def _machine() -> Iterator[tuple[str, str]]:
 
 
 def _cache() -> str:
-    """Return the folder and the size of the cache of compiled code."""
+    """Return a line with the folder and the size of the cache of compiled code."""
     place = cache.folder()
     if place is None:
         return f"off by {cache.SWITCH}"
@@ -48,7 +48,7 @@ def _cache() -> str:
 
 
 def _libraries() -> Iterator[tuple[str, str]]:
-    """Return the versions of the required packages and of each extra, or the packages that are missing."""
+    """Yield name and text of each extra: the versions of its packages, or which of them are missing."""
     requirements = [Requirement(text) for text in importlib.metadata.requires(PACKAGE) or ()]
     extras = importlib.metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()
     for extra in ("", *(name for name in extras if name not in DEVELOPMENT)):
@@ -58,7 +58,7 @@ def _libraries() -> Iterator[tuple[str, str]]:
 
 
 def _is_in_extra(requirement: Requirement, extra: str) -> bool:
-    """Return whether a requirement belongs to an extra; the empty name means the packages that are always required."""
+    """Return whether a requirement belongs to an extra; the extra "" is the packages that are always required."""
     if requirement.marker is None:
         return not extra
     return bool(extra) and requirement.marker.evaluate({"extra": extra})

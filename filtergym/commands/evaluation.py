@@ -35,7 +35,7 @@ from ..evaluation.storage.store import Store
 from ..extensions import DEPARTURES, load_present
 from ..names import find_competitors, ranked_names, shipped_names
 from ..reports.pages.outcome import own_sentences
-from ..reports.tables.benchmark import result_of, without_smoothers_of_closed_loops
+from ..reports.tables.benchmark import drop_smoothers_of_closed_loops, result_of
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv, write_records
 from ..reports.tables.reasons import reason_sentences
 from ..reports.tables.recording_tables import recording_tables
@@ -82,7 +82,7 @@ class FileOptions(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Files that an evaluation writes."""
+    """Files that an evaluation writes, with their formats."""
 
     folder: Path | None
     """Folder for records, a table, the whole result and figures."""
@@ -96,7 +96,7 @@ class Outputs(NamedTuple):
     estimates: Path | None
 
     def check(self) -> None:
-        """Raise ValueError for an output that cannot be written."""
+        """Raise ValueError for an output file or folder that cannot be written."""
         check_formats(list(self.formats))
         check_columns(self.columns)
         if self.folder is not None:
@@ -130,7 +130,7 @@ def find_data(
     options: FileOptions,
     keywords: Mapping[str, Any],
 ) -> tuple[Problem, Any]:
-    """Return the problem and the data: the name of a scenario, flights, or a recording.
+    """Return the problem, and its data: the name of a scenario, flights, or a recording, read from the files.
 
     Raises:
         ValueError: if the environment is not named, or a file cannot be read.
@@ -176,7 +176,7 @@ def _no_flights(name: str | None) -> ValueError:
 
 
 def assumed_parameters(environment: str | None, names: Sequence[str]) -> dict[str, float]:
-    """Return the parameters for a log without standard deviations, from the first named file of an advised filter."""
+    """Return the noise levels by parameter that the first advised filter among ``names`` assumed for its log."""
     if environment is None:
         return {}
     advised = [name for name in names if name.endswith(SUFFIX)]
@@ -191,9 +191,9 @@ def find_participants(
 
     Args:
         problem: the environment with its competitors.
-        data: of :func:`find_data`. On a recording every shipped competitor runs that can, tuned and learned ones, too;
-            references and bounds need the truth.
-        policies: names that are given.
+        data: data from :func:`find_data`. On a recording all shipped competitors run except references and bounds,
+            which need the truth.
+        policies: names from the command line; empty or None: the default ones.
         trust: load models that can execute code.
     """
     known = problem.baselines
@@ -201,7 +201,7 @@ def find_participants(
         return find_competitors(problem, policies, trust)
     if not isinstance(data, Recording):
         return find_competitors(
-            problem, without_smoothers_of_closed_loops(problem, known.benchmark or known.names, data)
+            problem, drop_smoothers_of_closed_loops(problem, known.benchmark or known.names, data)
         )
     return [*causal_competitors(problem, data), *find_competitors(problem, [*known.smoothers])]
 
@@ -219,7 +219,7 @@ def causal_competitors(problem: Problem, recording: Recording, agents: bool = Tr
 
 
 def _has_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
-    """Return whether an agent was trained on the fields that a recording with these axes gives."""
+    """Return whether a recording supplies all observation fields on which an agent was trained."""
     stored = getattr(maker, "policy", maker)
     header, control = getattr(stored, "header", None), getattr(stored, "control", None)
     if header is None or control is None:
@@ -229,12 +229,12 @@ def _has_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
 
 
 def has_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
-    """Return whether estimates are stored to score their predictions: for recordings that are not huge.
+    """Return whether the competitors' predictions of a recording are scored; not for more than MOST_PREDICTIONS.
 
     Args:
-        problem: that is evaluated.
-        data: of :func:`find_data`.
-        names: of competitors.
+        problem: the environment with its competitors.
+        data: data from :func:`find_data`.
+        names: names of the competitors.
     """
     log_format = find_companion(problem.task, LogFormat)
     if not isinstance(data, Recording) or log_format is None or log_format.predict is None:
@@ -244,31 +244,37 @@ def has_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
 
 def tables_of(
     problem: Problem,
-    found: Evaluation,
+    evaluation: Evaluation,
     width: int,
-    own: Sequence[str] = (),
+    user_names: Sequence[str] = (),
 ) -> list[Table]:
-    """Return the tables in at most so many columns, widest first, with the rows of the user's competitors marked."""
-    tables = [flights_table(found.dataset, found.flights, found.records, width)] if found.flights else []
-    if found.has_truth:
-        paper = found.dataset.attrs["paper"]
-        compared = results_tables(found.records, problem.knows, width, paper, own)
-        if paper not in {record.policy for record in found.records}:
-            compared[-1].caption = f"{_without_comparison(problem)}\n{compared[-1].caption}"
+    """Return an evaluation's tables, at most ``width`` columns wide; rows of the user's competitors are marked."""
+    tables = (
+        [flights_table(evaluation.dataset, evaluation.flights, evaluation.records, width)]
+        if evaluation.flights
+        else []
+    )
+    if evaluation.has_truth:
+        paper = evaluation.dataset.attrs["paper"]
+        compared = results_tables(evaluation.records, problem.knows, width, paper, user_names)
+        if paper not in {record.policy for record in evaluation.records}:
+            compared[-1].caption = f"{_missing_comparison(problem)}\n{compared[-1].caption}"
         tables += compared
-    if found.recorded:
-        tables += recording_tables(found.records, found.differences, found.has_truth, width, own)
+    if evaluation.recorded:
+        tables += recording_tables(
+            evaluation.records, evaluation.differences, evaluation.has_truth, width, user_names
+        )
     return tables
 
 
 def own_names(problem: Problem, policies: Sequence[str]) -> list[str]:
-    """Return the names that are not shipped: the user's own competitors."""
+    """Return those of the given names that are not shipped with the package: the user's own competitors."""
     shipped = shipped_names(problem)
     return [name for name in dict.fromkeys(policies) if name not in shipped]
 
 
-def _without_comparison(problem: Problem) -> str:
-    """Explain why costs are not compared where no reading of the paper's algorithm takes part."""
+def _missing_comparison(problem: Problem) -> str:
+    """Return the sentence that explains why costs are not compared where the paper's algorithm does not take part."""
     paper = problem.baselines.compared_paper
     if not paper:
         return "Costs are not compared: the environment names no paper's algorithm."
@@ -278,7 +284,7 @@ def _without_comparison(problem: Problem) -> str:
 def run(
     requests: Sequence[EvaluationRequest], outputs: Outputs, workers: Workers, store: Store
 ) -> tuple[Evaluation, str, dict[str, str]]:
-    """Run the competitors of an evaluation; one that fails loses only its own row.
+    """Run the competitors of an evaluation, and return the results; a failing one loses only its own row.
 
     Every number of every episode is stored only on request.
 
@@ -329,56 +335,60 @@ def run(
     return found, refusal, failures
 
 
-def check_explained(wanted: Sequence[str], names: Sequence[str]) -> None:
-    """Raise ValueError if a name to explain is not evaluated."""
-    for name in wanted:
+def check_explained(explained: Sequence[str], names: Sequence[str]) -> None:
+    """Raise ValueError if a competitor whose cost is to be explained is not among the evaluated ones."""
+    for name in explained:
         if name not in names:
             raise nearest("competitor to explain", name, names)
 
 
 def write(
     problem: Problem,
-    found: Evaluation,
+    evaluation: Evaluation,
     refusal: str,
     outputs: Outputs,
     learned: list[str],
     worst: Mapping[str, Sequence[WorstTrack]],
-    own: Sequence[str],
+    user_names: Sequence[str],
 ) -> None:
-    """Write the requested files; print sentences on the user's own competitors, the tables, the largest reasons, and
-    the paths of the files.
+    """Write the requested files of an evaluation, and print its tables, sentences and the files' paths.
 
     Args:
         problem: the evaluated problem.
-        found: the evaluation of :func:`run`.
+        evaluation: the evaluation of :func:`run`.
         refusal: why the whole of it is not written, from :func:`run`.
         outputs: files to write.
         learned: names of learned agents.
         worst: worst episodes of the competitors whose cost is explained, by name.
-        own: names of the user's own.
+        user_names: names of the user's own competitors.
     """
     printed, in_file = (
-        tables_of(problem, found, width, marked)
-        for width, marked in ((console.width, own), (LATEX_WIDTH, ()))
+        tables_of(problem, evaluation, width, marked)
+        for width, marked in ((console.width, user_names), (LATEX_WIDTH, ()))
     )
-    sentences = own_sentences(found.records, own, found.dataset.attrs["paper"]) if found.has_truth else []
+    sentences = (
+        own_sentences(evaluation.records, user_names, evaluation.dataset.attrs["paper"])
+        if evaluation.has_truth
+        else []
+    )
     for sentence in sentences:  # before anything is written, which can fail
         print_sentence(sentence.replace("`", ""), bold=sentence.rindex(": ") - 2)
     if sentences:
         console.print()
     for table in printed:
         print_table(table)
-    records = [*found.records, *found.flights]
+    records = [*evaluation.records, *evaluation.flights]
     if outputs.records is not None:
         write_records(outputs.records, records)
     if outputs.estimates is not None:
-        write_estimates(outputs.estimates, found.dataset)
+        write_estimates(outputs.estimates, evaluation.dataset)
     results: list[Result] = []
-    if outputs.folder is not None and found.curves is not None:
-        if found.has_truth:
+    if outputs.folder is not None and evaluation.curves is not None:
+        if evaluation.has_truth:
             settings = settings_of(command_line())
-            results = [result_of(problem, found, learned, worst, own)]
-        whole = found.dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
+            results = [result_of(problem, evaluation, learned, worst, user_names)]
+        # The track is for the report alone.
+        whole = evaluation.dataset.drop_dims("drawn_episode", errors="ignore")
         if not refusal:  # a summary has no variables
             largest = max(v.nbytes for v in whole.data_vars.values())
             refusal = _size_warning(whole.nbytes, largest, outputs.netcdf)
@@ -388,21 +398,23 @@ def write(
             write_text(place / "table.tex", "\n".join(map(latex_table, in_file)))
             if not refusal:
                 write_dataset(place / "results.nc", whole)
-            points = points_of_records(found.records)
-            for name, figure in evaluation_figures(found.curves, outputs.columns, None, learned, own, points):
+            points = points_of_records(evaluation.records)
+            for name, figure in evaluation_figures(
+                evaluation.curves, outputs.columns, None, learned, user_names, points
+            ):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
-            for name, figure in worst_figures(worst, phrases_of(found.dataset), outputs.columns):
+            for name, figure in worst_figures(worst, phrases_of(evaluation.dataset), outputs.columns):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
             if results:
                 write_results(place / RESULTS, results, settings)
-    phrases = phrases_of(found.dataset)
+    phrases = phrases_of(evaluation.dataset)
     console.print()
     for name in worst:
-        for sentence in reason_sentences(found.records, phrases, name):
+        for sentence in reason_sentences(evaluation.records, phrases, name):
             print_sentence(sentence)
-    for note in [*notes_of(found.dataset), *missing_rows(found.records)]:
+    for note in [*notes_of(evaluation.dataset), *missing_rows(evaluation.records)]:
         print_sentence(note, bold=len(note) if note.startswith(WARNING_PREFIX) else 0)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"
@@ -416,7 +428,7 @@ def write(
 
 
 def missing_rows(records: Sequence[Any]) -> Iterator[str]:
-    """State in a sentence how many measurements a file of estimates lacks."""
+    """Yield a sentence for each competitor whose file of estimates lacks measurements, with their number."""
     for record in records:
         if record.metric == "missing" and record.value:
             yield (
@@ -428,10 +440,10 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
 def departure_lines(
     problem: Problem, data: Any, learned: Sequence[Competitor], keywords: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Return lines that state which deviations agents observe from a log, and how it departs from their training.
+    """Yield lines on the noise levels that agents observe of a log, and on how the log departs from their training.
 
     Args:
-        problem: whose agents they are.
+        problem: environment of the agents.
         data: scenario, flights or recording.
         learned: the agents.
         keywords: parameters of the task.
@@ -450,9 +462,7 @@ def departure_lines(
 
 
 def _size_warning(size: int, largest: int, asked: bool | None) -> str:
-    """Explain why a dataset of so many bytes, and so many in its largest variable, is not written as NetCDF; empty if
-    it is.
-    """
+    """Return why a dataset of ``size`` bytes is not written as NetCDF; empty if it is written."""
     if asked is False:
         return "--no-netcdf"
     if largest > MOST_BYTES:

@@ -111,7 +111,8 @@ def train(
     algo: Annotated[
         str,
         typer.Option(
-            help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small, bptt-linear, kalman-net or student."
+            help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small, bptt-linear, bptt-strongest, kalman-net, student, "
+            "ma-ukf or rl-ukf."
         ),
     ] = "ppo",
     control: TrainedControl = None,

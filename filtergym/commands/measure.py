@@ -438,11 +438,13 @@ def benchmark(
                 f"{first.episodes:,} episodes"
             )
 
-        def save_figures(cell: Cell, found: Evaluation) -> None:
-            if found.curves is None or not formats:
+        def save_figures(cell: Cell, evaluation: Evaluation) -> None:
+            if evaluation.curves is None or not formats:
                 return
-            learned, points = learned_names(cell.environment), points_of_records(found.records)
-            for name, figure in evaluation_figures(found.curves, columns, learned=learned, points=points):
+            learned, points = learned_names(cell.environment), points_of_records(evaluation.records)
+            for name, figure in evaluation_figures(
+                evaluation.curves, columns, learned=learned, points=points
+            ):
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
 

@@ -14,14 +14,14 @@ STEP = 0.05
 
 
 class _Bar(Progress):
-    """A progress bar that disappears at the end; it shows by itself what :class:`ProgressLines` writes."""
+    """A progress bar that disappears at the end."""
 
     def write_line(self, text: str) -> None:
         """Ignore the line: the bar shows the progress."""
 
 
 class ProgressLines:
-    """Few lines with the remaining time; none for tasks of seconds.
+    """Progress as few lines of text with the remaining time, where there is no terminal; none for tasks of seconds.
 
     Args:
         write: function that writes a line.
@@ -44,7 +44,7 @@ class ProgressLines:
         pass
 
     def add_task(self, description: str, *, total: float | None) -> TaskID:
-        """Begin to show a task, in place of the one before."""
+        """Begin to show a task, in place of the one before, and return its id."""
         self._begin(description, total or 0.0)
         return TaskID(0)
 
@@ -57,7 +57,7 @@ class ProgressLines:
         completed: float | None = None,
         description: str | None = None,
     ) -> None:
-        """Set the progress of the task and its description; a new description is written at once."""
+        """Set the task's progress and description; write a line when one is due, at once for a new description."""
         self._done = self._done + (advance or 0.0) if completed is None else completed
         if description is not None and description != self._description:
             self._description = description
@@ -70,7 +70,7 @@ class ProgressLines:
             self._reported_at, self._reported = self._clock(), self._done
 
     def write_line(self, text: str) -> None:
-        """Write a line of its own."""
+        """Write a line of text between the lines of progress."""
         standing = f" ({self._standing()})" if 0.0 < self._done < self._total else ""
         self._write(f"{text}{standing}")
         self._reported_at, self._reported = self._clock(), self._done
@@ -83,7 +83,7 @@ class ProgressLines:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in words: ``42 s``, ``3 min 20 s``, ``2 h 5 min``."""
+    """Return a duration in seconds as text: ``42 s``, ``3 min 20 s``, ``2 h 5 min``."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

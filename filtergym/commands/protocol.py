@@ -32,7 +32,7 @@ OPTIONS = {
 
 
 def check_options(ctx: typer.Context) -> None:
-    """Raise ValueError for options beside ``--protocol`` that the protocol itself fixes."""
+    """Raise ValueError for an option of the command line that the protocol itself fixes."""
     for parameter in ctx.command.params:
         source = ctx.get_parameter_source(str(parameter.name))
         if parameter.name not in OPTIONS and source is not None and source.name == "COMMANDLINE":
@@ -53,15 +53,15 @@ def evaluate_protocol(
 
     Args:
         name: name of the protocol, or a path.
-        policies: words as of :func:`..protocol.find_entries`.
+        policies: competitors, see ``words`` of :func:`..protocol.find_entries`.
         workers: processes that share the work.
         json: file for the records of all scenarios; None: none.
         trust: load models that can execute code.
-        rename: as of :func:`..protocol.find_entries`.
-        **options: as of :func:`..protocol.run_protocol`.
+        rename: function that replaces names, see :func:`..protocol.find_entries`.
+        **options: further arguments of :func:`..protocol.run_protocol`.
 
     Raises:
-        ValueError: as of these.
+        ValueError: as these functions raise it.
     """
     if json is not None:
         writable_file(json)
@@ -81,16 +81,16 @@ def evaluate_protocol(
     console.print(bib_entry(found, __version__), soft_wrap=True)
 
 
-def quoted_row(found: ProtocolResult) -> list[str]:
-    """Return the row to quote with its head, in Markdown; the time, which differs from run to run, stands last."""
+def quoted_row(result: ProtocolResult) -> list[str]:
+    """Return the lines of a Markdown table with one row, the result to quote; its last column is the time."""
     cells = {
-        found.protocol.name: found.title,
-        "cost against the papers, %": _percent(found.cost),
-        "lost tracks, %": "-" if found.lost is None else f"{100.0 * found.lost:.2g}",
-        "environments": f"{len(found.environments)} of {len(found.protocol.environments)}",
-        "protocol SHA-256": found.digest[:12],
+        result.protocol.name: result.title,
+        "cost against the papers, %": _percent(result.cost),
+        "lost tracks, %": "-" if result.lost is None else f"{100.0 * result.lost:.2g}",
+        "environments": f"{len(result.environments)} of {len(result.protocol.environments)}",
+        "protocol SHA-256": result.digest[:12],
         "filtergym": __version__,
-        "ns here": time_text(found.time),
+        "ns here": time_text(result.time),
     }
     return [f"| {' | '.join(words)} |" for words in (cells, ["---"] * len(cells), cells.values())]
 
@@ -121,8 +121,8 @@ def _table(found: ProtocolResult) -> Table:
         "stands below the environment, less one. "
         "A track is lost where an episode's mean cost is beyond the bound of the environment. ANEES is 1 if errors are "
         "as large as the covariance states; ! marks a factor above two or below a half. Of the scenarios that "
-        "are held out from training the worst is named. ns is the processor time of a measurement on one core of this "
-        "machine, of world and competitor."
+        "are held out from training the worst is named. ns is the competitor's processor time of a measurement on one "
+        "core of this machine."
     )
     if not found.complete:
         table.caption += "\nNot all environments were entered: there is no number over all."

@@ -1,4 +1,4 @@
-"""Commands on existing results: one page of them, and a paper's experiments again."""
+"""Commands that make a page of existing results, and that run a paper's experiments again."""
 
 from pathlib import Path
 from typing import Annotated

@@ -14,7 +14,7 @@ REPORT = "report.html"
 
 
 def print_outcome(results: Sequence[Result]) -> None:
-    """Print a sentence for each environment, and the basis of these."""
+    """Print a sentence on the best competitor of each environment, and one on the basis of the comparison."""
     for sentence in outcome_sentences(results):
         plain = sentence.replace("`", "")
         print_sentence(plain, bold=plain.index(":"))
@@ -32,10 +32,10 @@ def print_headline(results: Sequence[Result]) -> None:
 
 
 def report_maker() -> Callable[[Sequence[Result], Settings], str]:
-    """Return the function that makes a report.
+    """Return :func:`.report_html`, which makes a page of results.
 
     Raises:
-        ValueError: if it needs packages that are not installed.
+        ValueError: if the packages that it needs are not installed.
     """
     try:
         from ..reports.pages.html_report import report_html
@@ -45,7 +45,7 @@ def report_maker() -> Callable[[Sequence[Result], Settings], str]:
 
 
 def make_report(results: Sequence[Result], settings: Settings, out: Path) -> None:
-    """Make a report and print its path; beside other results it may be missing, with a printed reason.
+    """Write a report and print its path; print the reason if packages for it are missing.
 
     Raises:
         ValueError: if it cannot be written.

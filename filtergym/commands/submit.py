@@ -152,7 +152,7 @@ def verify_file(
             f"{found.fresh_deviation.sentence} ({versions})"
         )
     fresh = (
-        "the episodes are those of the file, and stored answers would hold, too"
+        "the episodes are those of the file, so stored results would pass, too"
         if found.fresh is None
         else f"on fresh ones they differ by {found.fresh_deviation.size:.2g} of what chance explains"
     )
@@ -164,9 +164,7 @@ def verify_file(
 
 
 def _results_table(title: str, protocol: Protocol, columns: dict[str, tuple[Figure, ...]]) -> Table:
-    """Return the cost against the paper's algorithm and the consistency in every scenario, of several runs side by
-    side.
-    """
+    """Return a table of several runs: cost against the paper's algorithm and ANEES in every scenario."""
     [own] = protocol.environments
     held_out = f" and {protocol.held_out_episodes:,} of every other scenario" if own.held_out else ""
     table = plain_table(
@@ -200,7 +198,7 @@ def _percent(figure: Figure | None) -> str:
 
 
 def _time_line(columns: dict[str, tuple[Figure, ...]]) -> str:
-    """Return the times of a measurement in words; each run may be from another machine."""
+    """Return the processor time of a measurement in each run, ns, as one line of text."""
     times = {
         name: f.value for name, figures in columns.items() for f in figures if f.metric == TIME and f.value
     }

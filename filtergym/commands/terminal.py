@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def complete_environment(incomplete: str) -> list[str]:
-    """Return the environment ids; without ``filtergym/`` where that is how a word begins."""
+    """Return the environment ids that complete a word of the command line, with or without ``filtergym/``."""
     from ..envs.engine.catalogue import catalogue
 
     ids = list(catalogue())
@@ -34,18 +34,18 @@ def complete_environment(incomplete: str) -> list[str]:
     return found or [short for id in ids if (short := id.removeprefix("filtergym/")).startswith(incomplete)]
 
 
-def import_environments(given: Any) -> Any:
-    """Import the modules of environments that the command line names as ``module:id``; return the ids unchanged."""
+def import_environments(value: Any) -> Any:
+    """Import the module of each environment given as ``module:id``; return the argument unchanged."""
     from ..envs.engine.catalogue import import_task
 
-    for word in [given] if isinstance(given, str) else given or ():
+    for word in [value] if isinstance(value, str) else value or ():
         if ":" in word:
             import_task(word)
-    return given
+    return value
 
 
 def _environments_of(ctx: typer.Context) -> list[str]:
-    """Return the environment id of the words so far, or all ids if they contain none."""
+    """Return the environment id in a command line that is being completed, or all ids if it contains none."""
     from ..envs.engine.catalogue import catalogue, task_class
 
     named = ctx.params.get("environment")
@@ -58,7 +58,7 @@ def _environments_of(ctx: typer.Context) -> list[str]:
 
 
 def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return the names of the environment's scenarios."""
+    """Return the names of scenarios of the named environment that complete a word of the command line."""
     from ..envs.engine.catalogue import catalogue
 
     names = dict.fromkeys(name for id in _environments_of(ctx) for name in catalogue()[id].scenarios)
@@ -66,7 +66,7 @@ def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return the names of the environment's scenarios that agents may be trained on."""
+    """Return the names of training scenarios of the named environment that complete a word of the command line."""
     from ..envs.engine.catalogue import catalogue
 
     scenarios = [own for id in _environments_of(ctx) for own in catalogue()[id].scenarios.values()]
@@ -75,9 +75,7 @@ def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]
 
 
 def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return the names of the environment's policies, estimators, references and bounds, tuned ones, and shipped
-    agents.
-    """
+    """Return the names of competitors of the named environment that complete a word of the command line."""
     from ..baselines.problem import problem_of
     from ..names import shipped_names
 
@@ -87,7 +85,7 @@ def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def complete_from(*words: str) -> Callable[[str], list[str]]:
-    """Return a function that completes one of a few words."""
+    """Return a function that completes a word of the command line to one of a few words."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in words if word.startswith(incomplete)]
@@ -195,17 +193,17 @@ Split = Annotated[
 
 
 PAGE_WIDTH = 100
-"""Columns of output into a file, and of sentences in a wide terminal."""
+"""Width of output into a file, and of sentences in a wide terminal, characters."""
 
 
 class Output(Console):
-    """Standard output whose failure does not stop the work: the rest is then not printed."""
+    """Console on standard output; after an error of writing it prints nothing more, and the command continues."""
 
     refusal: OSError | None = None
-    """Error that ended the output; None also where the reader of a pipe has closed it."""
+    """Error that ended the output; None while it works, and where the reader of a pipe has closed it."""
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print, unless standard output has failed."""
+        """Print objects as rich does, unless standard output has failed before."""
         try:
             super().print(*objects, **options)
         except OSError as error:
@@ -213,7 +211,7 @@ class Output(Console):
             self._end()
 
     def on_broken_pipe(self) -> None:
-        """Continue without a reader."""
+        """Print nothing more after the reader of a pipe has closed it; rich would exit."""
         self._end()
 
     def _end(self) -> None:
@@ -223,7 +221,7 @@ class Output(Console):
 
 
 def output_width() -> int | None:
-    """Return the width of the output, in characters; None: that of the terminal, or of the variable COLUMNS."""
+    """Return the width of the output, characters; None: rich finds it from the terminal or the variable COLUMNS."""
     columns = os.environ.get("COLUMNS", "")
     terminal = sys.stdout is not None and sys.stdout.isatty()
     return None if terminal or (columns.isdigit() and int(columns) > 0) else PAGE_WIDTH
@@ -234,20 +232,20 @@ console: Output = Output(width=output_width(), markup=False, emoji=False)
 
 
 def fill(sentence: str, width: int) -> str:
-    """Break a sentence into lines, with each number beside its unit and each interval whole."""
+    """Return a sentence broken into lines of ``width`` characters, never inside an interval or before a unit."""
     kept = re.sub(r"\[[^\]]*\]| %| ns\b", lambda found: found[0].replace(" ", "\xa0"), sentence)
     return textwrap.fill(kept, width, break_on_hyphens=False).replace("\xa0", " ")
 
 
 def print_sentence(sentence: str, width: int = PAGE_WIDTH, bold: int = 0) -> None:
-    """Print a sentence in lines of at most so many columns, each number beside its unit, its first letters bold."""
+    """Print a sentence in lines of at most ``width`` characters, the first ``bold`` ones in bold type."""
     text = Text(fill(sentence, min(console.width, width)))
     text.stylize("bold", 0, bold)
     console.print(text, soft_wrap=True)
 
 
 def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
-    """Print a table of any width, its title above and its notes below as sentences."""
+    """Print a table at its full width, with its title above and its notes below in lines of ``width``."""
     title, notes = table.title, table.caption
     table.title = table.caption = None
     if title:
@@ -262,16 +260,16 @@ def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
 
 
 def open_output() -> None:
-    """Escape characters that the encoding of standard output lacks, such as ASCII."""
+    """Make standard output escape the characters that its encoding lacks, such as ASCII."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def close_output(*_: Any, **__: Any) -> None:
-    """Report at the end of a command that its standard output failed.
+    """Raise the error that ended standard output, if there was one; called at the end of a command.
 
     Raises:
-        ValueError: if it could not be written.
+        ValueError: if the output could not be written.
     """
     if console.refusal is not None:
         raise ValueError(
@@ -280,17 +278,17 @@ def close_output(*_: Any, **__: Any) -> None:
 
 
 def check_no_recording_options(truth: Any, rename: str | None, sort: bool) -> None:
-    """Raise ValueError for options of a recording where there is none."""
+    """Raise ValueError for an option of recordings in a command that reads none."""
     for option, given in (("--truth", truth), ("--rename", rename), ("--sort", sort or None)):
         if given is not None:
             raise ValueError(f"{option} is for a recording: --recording FILE {option} ...")
 
 
 def parse_renames(text: str | None) -> dict[str, list[str]]:
-    """Return the columns of a file by their names in it, from an option such as ``t=time,pos=x``.
+    """Parse an option such as ``t=time,pos=x`` into the columns of the package by each name in the file.
 
     Raises:
-        ValueError: for what is none.
+        ValueError: for text in another form.
     """
     pairs = [part.split("=") for part in text.split(",")] if text else []
     if not all(len(pair) == 2 and all(map(str.strip, pair)) for pair in pairs):
@@ -305,7 +303,7 @@ def parse_renames(text: str | None) -> dict[str, list[str]]:
 
 
 def parse_pair(option: str, text: str) -> tuple[float, float]:
-    """Parse two numbers such as ``48.72,2.38``."""
+    """Parse two numbers such as ``48.72,2.38`` into a pair; ``option`` names it in errors."""
     try:
         first, second = map(float, text.split(","))
     except ValueError:

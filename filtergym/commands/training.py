@@ -19,7 +19,7 @@ Trainer = Callable[[TrainingRun, Session], TrainingRun]
 
 
 class Training(NamedTuple):
-    """A run and its session."""
+    """A training run with the settings of its session."""
 
     folder: Path
     """Folder of the run, as the user names it."""
@@ -50,7 +50,7 @@ def trainer_of(algo: str) -> Trainer:
 
 
 def open_run(problem: Problem, options: RunOptions, session: Session) -> Training:
-    """Begin a run in the folder of a session, or continue the one that is there.
+    """Return a training run, begun in the folder of a session or continued there, with its session.
 
     Args:
         problem: training problem.
@@ -98,29 +98,29 @@ def _training(run: TrainingRun, session: Session) -> Training:
     return Training(session.folder, run, replace(session, folder=session.folder.absolute()))
 
 
-def train_runs(opened: Sequence[Training], trainer: Trainer, workers: Workers) -> list[TrainingRun]:
+def train_runs(trainings: Sequence[Training], trainer: Trainer, workers: Workers) -> list[TrainingRun]:
     """Train the unfinished runs, and return the final state of all runs.
 
     Args:
-        opened: runs of one algorithm.
+        trainings: runs of one algorithm.
         trainer: of the algorithm.
         workers: processes that share the runs.
     """
     waiting = []
-    for training in opened:
+    for training in trainings:
         if training.session.resume and training.run.is_complete:
             console.print(f"{training.folder} is finished: {training.run.steps_done:,} steps")
         else:
             waiting.append(training)
     if workers.alone:
         _train_one_by_one(waiting, trainer)
-        return [training.run for training in opened]
+        return [training.run for training in trainings]
     trained = _train_side_by_side(waiting, workers)
-    return [trained.get(training.folder, training.run) for training in opened]
+    return [trained.get(training.folder, training.run) for training in trainings]
 
 
 def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
-    """Train in this process until a request to stop; each run stores its own state."""
+    """Train runs one after another in this process, until a request to stop."""
     for training in waiting:
         _train_here(training, trainer)
         if not training.run.is_complete:
@@ -142,7 +142,10 @@ def _train_here(training: Training, trainer: Trainer) -> None:
 
 
 def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[Path, TrainingRun]:
-    """Train in other processes; the reports of each are printed when it has ended."""
+    """Train runs in parallel processes, and return each finished run by its folder.
+
+    The reports of a run are printed when it has ended.
+    """
     found = {}
     sizes = [training.run.steps for training in waiting]
     with progress_bar() as bar:
@@ -162,7 +165,7 @@ def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[P
 
 
 def _train(training: Training, tick: Any) -> list[str]:
-    """Train in a separate process; return its reports."""
+    """Train a run in a separate process, and return its reports, sentences on its validations."""
     lines: list[str] = []
     _, run, session = training
     trainer_of(run.algorithm)(run, replace(session, report=lines.append))
@@ -173,19 +176,19 @@ def _print_done(folder: Path, run: TrainingRun) -> None:
     console.print(f"{run.steps_done:,} steps done; best agent in {folder / 'best'}, checkpoint beside it")
 
 
-def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> None:
+def print_standing(trainings: Sequence[Training], runs: Sequence[TrainingRun]) -> None:
     """Print how the best agents of runs that differ in their seed compare with untrained competitors.
 
     Args:
-        opened: of :func:`open_run`.
+        trainings: of :func:`open_run`.
         runs: of :func:`train_runs`.
     """
-    agents = [best_agent(training.folder) for training in opened]
-    trust = opened[0].session.trust
+    agents = [best_agent(training.folder) for training in trainings]
+    trust = trainings[0].session.trust
     if any(agent.suffix != ".safetensors" for agent in agents) and not trust:
         console.print("an agent that is not stored as plain arrays is compared with --trust only")
         return
-    names = [str(training.folder) for training in opened]
+    names = [str(training.folder) for training in trainings]
     found = standing.measure_standing(runs[0], dict(zip(names, agents, strict=True)), trust)
     print_table(
         standing.standing_table(found, {name: run.beat_paper for name, run in zip(names, runs, strict=True)})

@@ -29,16 +29,16 @@ from .traced_filter import (
 )
 
 TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
-"""File names that a filter must not have, since other files have them."""
+"""Names that a filter cannot have, since other files or functions of an export have them."""
 
 
 def file_stem(name: str) -> str:
-    """Return the common name of the files and functions of a filter."""
+    """Return the name of a filter's files, which also begins its functions: the competitor's as an identifier of C."""
     return identifier(name, TAKEN)
 
 
 class FilterText:
-    """A filter as text.
+    """The text of a filter in C: structs, ``start`` and ``update``, header and source.
 
     Args:
         name: name of the competitor.
@@ -68,7 +68,7 @@ class FilterText:
         self.update, self.update_source = self._update()
 
     def _parameters(self, *parts: str) -> list[Parameter]:
-        """Return the parameters that point to structs; read-only ones are ``const``."""
+        """Return function parameters of C that point to structs; those that are only read are ``const``."""
         return [
             Parameter(
                 f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *",
@@ -78,7 +78,7 @@ class FilterText:
         ]
 
     def _rows(self, part: str, name: str = "", qualifier: str = "const ") -> Rows:
-        """Return the numbers of a struct one after the other; it has no members of another kind."""
+        """Return a struct seen as one array of its numbers, in the order of a program's argument."""
         pointer = f"(({qualifier}{self.scalar.name} *){name or part})"
         return Rows(pointer, self.structs[part].numbers)
 
@@ -168,12 +168,12 @@ class FilterText:
                 *body,
                 *self._guard(),
                 "*state = after;",
-                self._taken(),
+                self._return_statement(),
             ]
         else:
             if "next" in " ".join(body):
                 body = [f"{state.name} *const next = state;", *body]
-            body.append(self._taken())
+            body.append(self._return_statement())
         if traced.network is not None:
             zero = literal(0.0, self.scalar)
             answers = f"{real} answer[{action_size(traced.network)}] = {{{zero}}};"
@@ -191,7 +191,7 @@ class FilterText:
         return f"{source.functions}\n{function_text('int', f'{own}_update', parameters, body)}", source
 
     def _guard(self) -> list[str]:
-        """Return the statements that leave the state unchanged where the estimate is not finite."""
+        """Return the C statements that reject an estimate that is not finite and leave the state unchanged."""
         zero = literal(0.0, self.scalar)
         C = len(self.components)
         mean, covariance = ("", "") if C == 1 else ("[i]", "[i][j]")
@@ -210,8 +210,8 @@ class FilterText:
             "}",
         ]
 
-    def _taken(self) -> str:
-        """Return the statement that returns whether there was a measurement."""
+    def _return_statement(self) -> str:
+        """Return the C statement that returns ``TAKEN`` after a received measurement, else ``MISSED``."""
         own, zero = self.name.upper(), literal(0.0, self.scalar)
         there = [
             p for p in self.structs["measurement"].places.values() if re.fullmatch(r"available(\[\d+\])*", p)
@@ -223,7 +223,7 @@ class FilterText:
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
-        """Operations, and bytes of state, weights and stack."""
+        """Operations of an update, and bytes of state, network weights and stack."""
         size = numpy.dtype(self.scalar.dtype).itemsize
         network = self.traced.network
         weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
@@ -234,18 +234,18 @@ class FilterText:
 
     @property
     def network_operations(self) -> int:
-        """Operations of a network, where it is evaluated."""
+        """Multiplications and additions of one evaluation of the network; 0 without one."""
         return 0 if self.traced.network is None else network_operations(self.traced.network)
 
     @property
     def replaced(self) -> tuple[float, ...]:
-        """Constants that the type of the numbers cannot represent."""
+        """Constants of the filter that the C type cannot represent, which the text replaces."""
         return tuple(sorted({*self.start_source.replaced, *self.update_source.replaced}))
 
     # --- files
 
     def header(self, notes: Sequence[str] = ()) -> str:
-        """Return the text of the header."""
+        """Return the text of the header file; ``notes`` are paragraphs for its comment."""
         own, scalar, structs = self.name, self.scalar, self.structs
         guard = f"{own.upper()}_H"
         listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
@@ -306,7 +306,7 @@ class FilterText:
         return "\n".join(text)
 
     def source(self) -> str:
-        """Return the text of the source."""
+        """Return the text of the source file."""
         parts = [
             comment(
                 "See the header. A loop goes over the members of array operations, k is the member; tables, whose "

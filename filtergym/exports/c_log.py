@@ -69,7 +69,7 @@ LOOK_VALUES = {
 
 
 class LogText(FilterText):
-    """A filter as text, and its input from the rows of a table.
+    """The text of a filter in C, and of the program that runs it over a user's log.
 
     Args:
         name: name of the competitor.
@@ -95,29 +95,29 @@ class LogText(FilterText):
         self.log_columns: Mapping[str, str] = columns or {}
 
     def columns(self, part: str) -> list[str]:
-        """Return the names of the columns of a table, in the order of the rows of an argument."""
+        """Return the column names of a table for a struct, in the order of its numbers."""
         names = self.structs[part].columns
         begin = "initial_" if part == "initial" else ""
         return [f"{begin}{names[row]}" for row in sorted(names)]
 
     @property
     def initial_estimate(self) -> list[float]:
-        """Initial estimate of all tracks of plain rows, in the order of the rows of its struct."""
+        """Initial estimate of the model, the same for all tracks, in the order of its struct; empty for other logs."""
         rows = self.plain_rows
         return [] if rows is None else [*rows.mean.tolist(), *rows.covariance.ravel().tolist()]
 
     def source_of(self, name: str) -> tuple[str, int]:
-        """Source of a measurement's number in a plain row: its kind and its place among those of that kind."""
+        """Return where a row of a log contains a number of a measurement: its kind, and its place in that kind."""
         kind, _, place = name.rpartition("_") if name[-1].isdigit() else (name, "", "0")
         kinds = {"values": "received", "available": "there", "inputs": "held", "interval": "interval"}
         return (kinds[kind], int(place)) if kind in kinds else ("other", 0)
 
-    def fill(self, received: str, held: str, interval: str, others: Sequence[str] = ()) -> str:
-        """Return the statements that fill a measurement ``given`` from a plain row.
+    def fill(self, received: str, inputs: str, interval: str, others: Sequence[str] = ()) -> str:
+        """Return the C statements that fill the measurement ``given`` from a row of a log.
 
         Args:
             received: expression of the first received number; the others follow it.
-            held: expression of the first input; the others follow it.
+            inputs: expression of the first input; the others follow it.
             interval: expression of the interval.
             others: expressions of all other numbers, in their order; default: zero.
         """
@@ -128,7 +128,7 @@ class LogText(FilterText):
             value = {
                 "received": f"{cell} == {cell} ? {cell} : 0.0",
                 "there": f"{cell} == {cell} ? 1.0 : 0.0",
-                "held": f"{held}[{place}]",
+                "held": f"{inputs}[{place}]",
                 "interval": interval,
             }.get(kind) or next(rest, "0.0")
             lines.append(f"given[{row}] = {value};")
@@ -137,9 +137,7 @@ class LogText(FilterText):
     # --- the program
 
     def log_program(self, request: "ExportRequest") -> str:
-        """Return the text of a program that reads a user's log; empty where its rows are no plain rows, and no filter
-        was advised for a table.
-        """
+        """Return the text of the C program that reads a user's log; empty where the log's format is not supported."""
         if self.plain_rows is not None:
             return self._plain_log(self.plain_rows, request.keywords.get("sampling_interval"))
         log, log_format = request.log, self.log_format
@@ -185,11 +183,11 @@ class LogText(FilterText):
         return f"{text}{READER}\n{follow}"
 
     def _plain_log(self, rows: PlainRows, interval: float | None) -> str:
-        """Return the text of the program for rows that are measurements as they stand.
+        """Return the text of the C program for a log whose rows are measurements without conversion.
 
         Args:
-            rows: how they are.
-            interval: between rows that a user has set, s.
+            rows: format of the rows.
+            interval: interval between rows that the user has set, s.
         """
         names = [self.log_columns.get(name.lower(), name).lower() for name in (*rows.received, *rows.inputs)]
         follow = PLAIN_ROWS.format(
@@ -206,9 +204,7 @@ class LogText(FilterText):
         return self._log(about, follow, names, len(names), limits)
 
     def _plot_log(self, rows: PlotRows, log: LogSetup) -> str:
-        """Return the text of the program for plots, as they were read when a filter was advised; empty for
-        other logs.
-        """
+        """Return the text of the C program for plots, read as for the filter's fit; empty for other logs."""
         names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
         measured = {*self.structs["measurement"].columns.values()}
         second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), None)
@@ -251,12 +247,11 @@ class LogText(FilterText):
         return self._log(about, follow, columns, 2, limits)
 
     def _regular_log(self, numbers: Mapping[str, float], log: LogSetup) -> str:
-        """Return the text of the program for rows at one rate, as they were read when a filter was advised; empty for
-        other logs.
+        """Return the text of the C program for rows at one rate, read as for the filter's fit; empty for other logs.
 
         Args:
-            numbers: that the reading needs.
-            log: how it was read.
+            numbers: constants of the reading.
+            log: options with which the log of the fit was read.
         """
         if "range_rate" in log.columns:
             rows = _rows_with_looks(log.columns, numbers)
@@ -278,12 +273,12 @@ class LogText(FilterText):
         return self._log(about, follow, columns, rows.needed, {"UNEVEN": UNEVEN, **rows.limits})
 
     def _assign(self, part: str, values: Mapping[str, str], indent: str) -> str:
-        """Return the statements that set every number of a struct; unnamed ones become zero."""
+        """Return the C statements that set every number of a struct; those not in ``values`` become zero."""
         columns = sorted(self.structs[part].columns.items())
         return f"\n{indent}".join(f"given[{row}] = {values.get(name, '0.0')};" for row, name in columns)
 
     def _plot_start(self) -> str:
-        """Return the statements that compute the ``initial`` estimate from two plots, as the reader does."""
+        """Return the C statements that compute the ``initial`` estimate from the first two plots of a track."""
         values = {"mean_0": "p[0]", "mean_1": "p[1]"}
         values |= {f"mean_{i + 2}": f"(p[{i}] - p0[{i}]) / lasted" for i in range(2)}
         for i in range(2):
@@ -294,10 +289,10 @@ class LogText(FilterText):
 
 
 class RegularReading(NamedTuple):
-    """Reading of rows at one rate."""
+    """Parts of the C program that reads a log of rows at one rate."""
 
     names: list[str]
-    """Names of the columns."""
+    """Names of the columns that the program reads."""
     needed: int
     """Number of required columns, which are the first ones."""
     reading: str
@@ -310,15 +305,13 @@ class RegularReading(NamedTuple):
     """Numbers of the reading; the first ``WHOLE`` columns have no empty cell."""
 
 
-def _with_others(first: list[str], columns: Mapping[str, str]) -> list[str]:
-    """Return the names of columns, and of all others of a log, since these decide which rows supply each other."""
+def _all_columns(first: list[str], columns: Mapping[str, str]) -> list[str]:
+    """Return the column names ``first``, then all others of a log except time and recording."""
     return [*first, *(name for name in columns if name not in (*first, "time", RECORDING))]
 
 
 def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading:
-    """Return the reading of positions by an INS and by a receiver, whose deviation, m, is the ``usual`` one without a
-    column of it.
-    """
+    """Return the reading of a log of INS and receiver positions; ``usual`` is the receiver's default deviation, m."""
     ends = [""] if "ins" in columns else sorted(name[3:] for name in columns if name.startswith("ins_"))
     A, stated = len(ends), int("sigma" in columns)
     first = [*(f"ins{end}" for end in ends), *["sigma"] * stated, *(f"fix{end}" for end in ends)]
@@ -330,7 +323,7 @@ def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading
         values[f"increment{end}"] = f"cell[{axis}] - before[{axis}]"
         values[f"fix{end}"] = f"found[0] > 0.0 ? cell[{A + stated + axis}] : 0.0"
     return RegularReading(
-        _with_others(first, columns),
+        _all_columns(first, columns),
         len(first),
         READ_FIXES.format(axes=A, check=CHECK_SIGMA.format(sigma=A) if stated else ""),
         values,
@@ -340,9 +333,9 @@ def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading
 
 
 def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -> RegularReading:
-    """Return the reading of radar and ESM reports, by the ``numbers`` that the format names."""
+    """Return the reading of rows of a radar with ESM reports; ``numbers`` are the format's constants."""
     first = ["range", "range_rate", *(name for name in columns if name == "looked")]
-    names = _with_others(first, columns)
+    names = _all_columns(first, columns)
     optional = ("looked", "decision", "bearing_difference", "radar_bearing", "esm_bearing")
     cells = {name: f"row->cell[{names.index(name)}]" if name in names else "(double)NAN" for name in optional}
     start = {"mean_0": "cell[0]", "mean_1": "cell[1]"}
@@ -355,12 +348,12 @@ def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -
 
 
 def _number(value: float) -> str:
-    """Return a literal of C, of a whole number without a point."""
+    """Return a number as a literal of C, a whole one without a decimal point."""
     return str(value) if isinstance(value, int) else literal(value)
 
 
 def _quote(text: str) -> str:
-    """Return a literal of C of any text, with characters other than letters, digits and plain signs in octal."""
+    """Return a text as a string literal of C, with all but letters, digits and plain signs in octal."""
     return (
         '"'
         + "".join(
@@ -372,7 +365,7 @@ def _quote(text: str) -> str:
 
 
 def name_list(text: str) -> str:
-    """Return a literal of C of identifiers, with commas between them."""
+    """Return a comma-separated text of identifiers as a string literal of C, broken into lines."""
     assert re.fullmatch(r"[A-Za-z0-9_,]*", text)
     pieces = [text[i : i + 80] for i in range(0, len(text), 80)] or [""]
     return "\n    ".join(f'"{piece}"' for piece in pieces)

@@ -50,7 +50,7 @@ for (i = 0; i < {units}; ++i) {{
 
 
 def memory_size(network: "LearnedPolicy") -> int:
-    """Return the size of a network's memory."""
+    """Return the number of values in a recurrent network's memory; 0 without recurrence."""
     arrays = network.arrays
     if "gru_memory_weight" in arrays:
         return int(arrays["gru_memory_weight"].shape[1])
@@ -71,13 +71,13 @@ def scratch_size(network: "LearnedPolicy") -> int:
 
 
 def _width(network: "LearnedPolicy") -> int:
-    """Return the size of its widest layer or of its input, whichever is larger."""
+    """Return the largest width of a network's layers and input, in values."""
     outputs = [len(values) for key, values in network.arrays.items() if "weight" in key]
     return max([len(network.arrays["observation_mean"]), *outputs])
 
 
 def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[str, int]:
-    """Write a network as ``NAME_network(shown, memory, answer)``.
+    """Return the C text of a network as ``NAME_network(shown, memory, answer)``, and the bytes of its constants.
 
     Args:
         network: network to write.
@@ -139,7 +139,7 @@ def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[s
 
 
 def _answer(network: "LearnedPolicy", count: int, scalar: Scalar) -> list[str]:
-    """Return the statements that compute an action from the last layer."""
+    """Return the C statements that compute the ``count`` action values from the last layer."""
     if network.output == "argmax":
         return [
             "{",

@@ -15,10 +15,10 @@ from .parameters import PARAMETER, SUMMED, Declared
 from .traced_filter import DERIVED, FreeParameters, Member
 
 
-def parameter_members(declared: Sequence[Declared]) -> list[Member]:
-    """Return the members of the struct, with the meaning, default and limits of each."""
+def parameter_members(declarations: Sequence[Declared]) -> list[Member]:
+    """Return the members of the parameters' struct, with the meaning, default and limits of each."""
     found = []
-    for one in declared:
+    for one in declarations:
         values = [f"{value:.6g}" for value in one.values]
         if one.limits == ParameterLimits():
             limits = [f"from {one.low:.6g} to {one.high:.6g}"] if abs(one.high) < LARGEST else []
@@ -41,7 +41,7 @@ def _limit_words(limits: ParameterLimits) -> list[tuple[str, float | None]]:
 
 
 def parameter_words(free: FreeParameters) -> str:
-    """Return the sentences about the struct."""
+    """Return the sentences about the parameters' struct, for the comment of the header."""
     text = (
         "Parameters, given at the start of a track. They have the names and limits of filtergym."
         if free.declared
@@ -61,40 +61,41 @@ def parameter_words(free: FreeParameters) -> str:
 
 
 def parameter_text(
-    own: str, free: FreeParameters, scalar: Scalar, struct: Structure
+    name: str, free: FreeParameters, scalar: Scalar, struct: Structure
 ) -> tuple[str, list[str]]:
-    """Return tables and functions of the parameters, and the first statements of start, which reject values outside the
-    limits and derive ``own``.
+    """Return the C tables and functions of the parameters, and the first statements of ``start``.
+
+    The statements reject values outside the limits, and compute the numbers ``own`` that the filter derives.
 
     Args:
-        own: name of the filter.
+        name: name of the filter.
         free: its parameters.
         scalar: type of the numbers.
         struct: struct of the parameters.
     """
     if free.derive is None:
         return "", []
-    real, refused, count = scalar.name, f"return {own.upper()}_REFUSED;", len(free.usual)
-    listed = [Parameter(f"const {own}_parameters *", "parameters"), Parameter(f"{real} *", "own")]
+    real, refused, count = scalar.name, f"return {name.upper()}_REFUSED;", len(free.usual)
+    listed = [Parameter(f"const {name}_parameters *", "parameters"), Parameter(f"{real} *", "own")]
     values = ", ".join(_value(one, scalar) for one in free.declared)
-    before = [f"const {own}_parameters {own}_defaults = {{{values}}};\n"]
+    before = [f"const {name}_parameters {name}_defaults = {{{values}}};\n"]
     before.append(
-        array_text(f"{own}_limits", numpy.array([_limits(one, scalar) for one in free.declared]), scalar)
+        array_text(f"{name}_limits", numpy.array([_limits(one, scalar) for one in free.declared]), scalar)
     )
     lengths = [len(one.values) for one in free.declared]
-    inner = f"if (!(*number >= {own}_limits[k][0] && *number <= {own}_limits[k][1])) {refused}"
+    inner = f"if (!(*number >= {name}_limits[k][0] && *number <= {name}_limits[k][1])) {refused}"
     loop = [f"    {inner}", "    ++number;"]
     if len(set(lengths)) > 1:
         inside = ", ".join(map(str, lengths))
-        before.append(f"static const unsigned short {own}_lengths[{len(lengths)}] = {{{inside}}};\n")
-    length = f"{own}_lengths[k]" if len(set(lengths)) > 1 else str(lengths[0])
+        before.append(f"static const unsigned short {name}_lengths[{len(lengths)}] = {{{inside}}};\n")
+    length = f"{name}_lengths[k]" if len(set(lengths)) > 1 else str(lengths[0])
     if length != "1":
         loop = [f"    for (int i = 0; i < {length}; ++i, ++number)", f"        {inner}"]
     body = [
         f"const {real} *number;",
         f"{real} own[{max(count, 1)}];",
-        "const int usual = !parameters;" if _stated(free, scalar) else "",
-        f"if (!parameters) parameters = &{own}_defaults;",
+        "const int usual = !parameters;" if _stored_rows(free, scalar) else "",
+        f"if (!parameters) parameters = &{name}_defaults;",
         f"number = (const {real} *)parameters;",
         f"for (int k = 0; k < {len(lengths)}; ++k) {{",
         *loop,
@@ -106,35 +107,33 @@ def parameter_text(
         return f"parameters->{struct.places[row]}"
 
     if free.condition is not None:
-        source = write_program(free.condition, f"{own}_holds", listed, read, lambda *_: "own[0]", scalar)
-        before += [source.functions, function_text("static void", f"{own}_holds", listed, source.body)]
-        body += [f"{own}_holds(parameters, own);", f"if (own[0] == {literal(0.0, scalar)}) {refused}"]
+        source = write_program(free.condition, f"{name}_holds", listed, read, lambda *_: "own[0]", scalar)
+        before += [source.functions, function_text("static void", f"{name}_holds", listed, source.body)]
+        body += [f"{name}_holds(parameters, own);", f"if (own[0] == {literal(0.0, scalar)}) {refused}"]
     rows = Rows(f"((const {real} *)parameters)", struct.numbers), Rows("own", range(count))
     arrays = Arrays({PARAMETER: rows[0]}, {DERIVED: rows[1]})
     sources = [
         write_program(
-            code, f"{own}_derive", listed, read, lambda _, row: f"own[{row}]", scalar, arrays=arrays
+            code, f"{name}_derive", listed, read, lambda _, row: f"own[{row}]", scalar, arrays=arrays
         )
-        for code in (free.derive, _by_depth(free.derive))
+        for code in (free.derive, _merge_by_depth(free.derive))
     ]
-    texts = [[s.functions, function_text("static void", f"{own}_derive", listed, s.body)] for s in sources]
+    texts = [[s.functions, function_text("static void", f"{name}_derive", listed, s.body)] for s in sources]
     before += min(texts, key=lambda parts: sum(map(len, parts)))
-    body.append(f"{own}_derive(parameters, own);")
-    if stated := _stated(free, scalar):
+    body.append(f"{name}_derive(parameters, own);")
+    if stated := _stored_rows(free, scalar):
         # The same bits for every library of functions.
         numbers = numpy.array([free.usual[row] for row in stated])
-        before.append(array_text(f"{own}_usual", numbers, scalar))
+        before.append(array_text(f"{name}_usual", numbers, scalar))
         place = f"own[{stated.start} + k]" if stated.start else "own[k]"
-        body.append(f"for (int k = 0; usual && k < {len(stated)}; ++k) {place} = {own}_usual[k];")
+        body.append(f"for (int k = 0; usual && k < {len(stated)}; ++k) {place} = {name}_usual[k];")
     if free.kept:
         body.append(f"for (int k = 0; k < {free.kept}; ++k) state->derived[k] = own[k];")
     return "\n".join(before), [line for line in body if line]
 
 
-def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
-    """Return the program with equally deep equal operations as one array operation: derivation in Python is number by
-    number, but loops run over array operations.
-    """
+def _merge_by_depth(code: StraightLineProgram) -> StraightLineProgram:
+    """Return a program with equal operations at equal depth joined into array operations, which C writes as loops."""
     depths: list[int] = []
     groups: dict[tuple[int, str], int] = {}
     own = []
@@ -144,15 +143,13 @@ def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
     return code._replace(origins=numpy.column_stack([own, range(len(own))]), callers={})
 
 
-def _stated(free: FreeParameters, scalar: Scalar) -> range:
-    """Return the rows that are stored where no parameter is chosen; of float all, which the filter converts from
-    double.
-    """
+def _stored_rows(free: FreeParameters, scalar: Scalar) -> range:
+    """Return the rows of derived numbers that the C text stores for the default parameters."""
     return free.stated if scalar is DOUBLE else range(len(free.usual))
 
 
 def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused: str) -> list[str]:
-    """Return the statements that reject pairs that do not ascend, and rows of probabilities that do not sum to one."""
+    """Return the C statements that reject pairs that do not ascend, and probabilities that do not sum to one."""
     checks, row = [], 0
     for one in free.declared:
         rows = [f"parameters->{struct.places[row + i]}" for i in range(len(one.values))]

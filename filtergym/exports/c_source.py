@@ -38,18 +38,18 @@ MOST_OPTIMISED = 10_000
 time and makes the code a tenth slower.
 """
 WORST = {"double": 1e-3, "float": 0.1}
-"""Largest accepted difference to the competitor itself, in its standard deviations."""
+"""Largest accepted difference of the C filter's mean to the Python competitor's, in its standard deviations."""
 EPISODES, MEASUREMENTS = 8, 200
 """Largest number of episodes and measurements that are compared before the export is written."""
 STEER = """
             for (i = 0; steers && i < FEEDBACK; ++i) *answer++ = (double)estimate.feedback[i];"""
-"""Output of the program around a filter whose report steers the world."""
+"""C text that writes the feedback of a filter in a closed loop."""
 VECTORS = 2, 50
 """Largest number of episodes and measurements among the test's vectors."""
 
 
 class Writer(LogText):
-    """The files of a filter: itself, and the programs around it.
+    """The C files of a filter: header, source, program for tables, test and its vectors.
 
     Args:
         name: name of the competitor.
@@ -76,7 +76,7 @@ class Writer(LogText):
         self.limit: float = WORST[scalar.name]
 
     def rows(self) -> str:
-        """Return the text of a header that fills structs from rows of numbers, for main.c and the test."""
+        """Return the text of a C header with functions that fill the structs from rows of a table."""
         own, real = self.name, self.scalar.name
         text = [
             comment("Structs from rows of a table."),
@@ -92,7 +92,7 @@ class Writer(LogText):
         return "\n".join(text)
 
     def main(self) -> str:
-        """Return the text of a program that reads a table of measurements and writes one of estimates."""
+        """Return the text of main.c, which reads a table of measurements and writes a table of estimates."""
         C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
         initial, measurement = self.columns("initial"), self.columns("measurement")
         given = self.table_columns()
@@ -145,7 +145,7 @@ class Writer(LogText):
         return [*map(identifier, ["recording", *timed, *rows.received, *rows.inputs]), *own]
 
     def _layout(self) -> str:
-        """Return the functions of main.c that locate the values in a row."""
+        """Return the C functions of main.c that read the initial estimate and the measurement of a row."""
         rows = self.plain_rows
         if rows is None:
             return INITIAL_IN_ROW.format()
@@ -162,7 +162,7 @@ class Writer(LogText):
         return INITIAL_OF_MODEL.format(estimate=", ".join(map(literal, self.initial_estimate)), fill=fill)
 
     def test(self) -> str:
-        """Return the text of a program that compares the filter with the vectors."""
+        """Return the text of the C test, which compares the filter with the stored estimates."""
         return TEST.format(
             own=self.name,
             upper=self.name.upper(),
@@ -172,7 +172,7 @@ class Writer(LogText):
         )
 
     def vectors(self, replayed: Replay) -> str:
-        """Return the text of the vectors of the test."""
+        """Return the text of the C header with the test's measurements and expected estimates."""
         E, T = min(VECTORS[0], replayed.initial.shape[1]), min(VECTORS[1], len(replayed.measurements))
         arrays = {
             "initials": replayed.initial[:, :E].T,
@@ -190,7 +190,7 @@ class Writer(LogText):
         return "\n".join(text)
 
     def table(self, replayed: Replay) -> str:
-        """Return the text of a table of measurements, as main.c reads it."""
+        """Return replayed measurements as a CSV table, as main.c reads it."""
         lines = [",".join(self.table_columns())]
         if self.plain_rows is not None:
             for episode in range(replayed.initial.shape[1]):
@@ -205,7 +205,7 @@ class Writer(LogText):
         return "\n".join([*lines, ""])
 
     def _plain_row(self, row: Sequence[float]) -> list[str]:
-        """Return the cells of a measurement in a table with the columns of a log, without its first one."""
+        """Return the cells of a measurement in a table with the columns of a log, except the first cell."""
         found: dict[str, list[str]] = {"interval": [], "received": [], "held": [], "other": []}
         there = [
             value > 0.0
@@ -220,7 +220,7 @@ class Writer(LogText):
 
 
 def export_c(request: ExportRequest, folder: Path, precision: str = "double", command: str = "") -> Figures:
-    """Write a competitor as C99 into a folder, after a comparison of its programs with the competitor itself.
+    """Write a competitor as C99 into a folder, after a comparison with the Python competitor; return the figures.
 
     Args:
         request: the competitor.
@@ -267,9 +267,7 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
 
 
 def price_of(request: ExportRequest) -> dict[str, int] | None:
-    """Return the cost of an update in C: operations, and bytes of state and stack; None for a competitor that cannot be
-    exported.
-    """
+    """Return the operations of an update in C, and bytes of state and stack; None if it cannot be exported."""
     try:
         traced, replayed = replay(request, EPISODES, 2)
     except ValueError:
@@ -279,7 +277,7 @@ def price_of(request: ExportRequest) -> dict[str, int] | None:
 
 
 def files_of(writer: Writer, replayed: Replay, notes: Sequence[str] = ()) -> dict[str, str]:
-    """Return the text of every file by its name."""
+    """Return the text of every file of an export, by the file's name."""
     return {
         f"{writer.name}.h": writer.header(notes),
         f"{writer.name}.c": writer.source(),
@@ -338,7 +336,7 @@ def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
 def compile_and_test(
     writer: Writer, replayed: Replay, compiler: str | None = None, flags: Sequence[str] = FLAGS
 ) -> str:
-    """Compile the test and run it.
+    """Compile the C test, run it, and return its output.
 
     Args:
         writer: writer of the filter.

@@ -10,7 +10,7 @@ from .traced_filter import Member
 
 
 class Structure(NamedTuple):
-    """A struct of C."""
+    """A struct of C: its arrays, and the places of numbers in it."""
 
     name: str
     arrays: list[tuple[str, tuple[int, ...], str, list[int]]]
@@ -22,15 +22,13 @@ class Structure(NamedTuple):
 
     @property
     def numbers(self) -> dict[int, int]:
-        """Row of the argument -> its place among the numbers of the struct, which come first."""
+        """For each row of the argument its place among the numbers of the struct."""
         rows = [row for _, _, _, own in self.arrays for row in own]
         return {row: place for place, row in enumerate(rows)}
 
 
 def structure(name: str, members: Sequence[Member]) -> Structure:
-    """Assign numbers to places in a struct: a complete array stays one, the entries of an incomplete one get names of
-    their own.
-    """
+    """Return the struct of C for numbers of arrays: a whole array is a member, of others each entry."""
     groups: dict[tuple[str, tuple[int, ...]], list[int]] = {}
     for row, member in enumerate(members):
         groups.setdefault((member.name, member.shape), []).append(row)
@@ -55,7 +53,7 @@ def structure(name: str, members: Sequence[Member]) -> Structure:
 
 
 def struct_text(struct: Structure, scalar: Scalar, title: str, extra: Sequence[str] = ()) -> str:
-    """Return the definition of a struct; ``extra`` are lines of further members."""
+    """Return the text of a struct's definition in C; ``extra`` are lines of further members."""
     lines = [comment(title), "typedef struct {"]
     words = ""
     for name, shape, text, _ in struct.arrays:

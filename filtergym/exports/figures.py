@@ -14,7 +14,7 @@ class Figures(NamedTuple):
     scratch_bytes: int
     """Bytes on the stack, beside the state."""
     difference: float
-    """Largest difference to the competitor itself, in its standard deviations, see :func:`~.replay.run_filter`."""
+    """Largest difference of the mean to the Python competitor's, in its standard deviations."""
     replaced: tuple[float, ...]
     """Constants that float cannot represent."""
     network_operations: int = 0
@@ -26,7 +26,7 @@ class Figures(NamedTuple):
 
 
 def operation_words(figures: Figures) -> str:
-    """Return the operations of an update in words, with those of a network apart."""
+    """Return the number of operations of an update as text, those of a network apart."""
     network = figures.network_operations
     return f"{figures.operations:,} operations an update" + (
         f" and {network:,} of the network where it is evaluated" if network else ""

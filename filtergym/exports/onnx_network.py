@@ -27,7 +27,7 @@ BATCH = "N"
 
 
 class _Graph:
-    """Nodes and constants of a graph, in their order.
+    """Nodes and constants of an ONNX graph under construction.
 
     Args:
         onnx: the package.
@@ -39,7 +39,7 @@ class _Graph:
         self.constants: dict[str, Any] = {}
 
     def constant(self, name: str, values: Any, dtype: Any = numpy.float32) -> str:
-        """Add an array, once."""
+        """Add an array as a constant, once for each name; return its name."""
         array = numpy.ascontiguousarray(values, dtype=dtype)
         self.constants.setdefault(name, self.onnx.numpy_helper.from_array(array, name))
         return name
@@ -51,19 +51,19 @@ class _Graph:
         return names[0]
 
     def split(self, whole: str, count: int, width: int, name: str) -> list[str]:
-        """Cut columns into equal parts."""
+        """Add a split of columns into ``count`` parts of ``width``; return their names."""
         parts = [f"{name}_{i}" for i in range(count)]
         sizes = self.constant(f"{name}_widths", [width] * count, numpy.int64)
         self.node("Split", [whole, sizes], *parts, axis=1)
         return parts
 
     def linear(self, rows: str, weight: str, bias: str) -> str:
-        """Return ``rows @ weight.T + bias``."""
+        """Add ``rows @ weight.T + bias``; return the name of the output."""
         return self.node("Gemm", [rows, weight, bias], transB=1)
 
 
 def _normalise(graph: _Graph, arrays: dict[str, numpy.ndarray]) -> str:
-    """Return the observation less its mean over its scale, clipped at the limit."""
+    """Add the normalisation of the observation ``(x - mean) / scale``, clipped; return its name."""
     limit = [graph.constant(n, v) for n, v in (("low", -OBSERVATION_LIMIT), ("high", OBSERVATION_LIMIT))]
     mean, scale = (graph.constant(n, arrays[n]) for n in ("observation_mean", "observation_scale"))
     centred = graph.node("Sub", ["observation", mean])
@@ -71,7 +71,7 @@ def _normalise(graph: _Graph, arrays: dict[str, numpy.ndarray]) -> str:
 
 
 def _gated_recurrent(graph: _Graph, x: str, width: int) -> str:
-    """Add one step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
+    """Add a step of the gated recurrent unit (Cho et al., 2014, torch's form); return the name of its output."""
     from_input = graph.split(graph.linear(x, "gru_input_weight", "gru_input_bias"), 3, width, "from_input")
     from_memory = graph.linear("memory", "gru_memory_weight", "gru_memory_bias")
     from_memory_parts = graph.split(from_memory, 3, width, "from_memory")
@@ -86,7 +86,9 @@ def _gated_recurrent(graph: _Graph, x: str, width: int) -> str:
 
 
 def _long_short_term(graph: _Graph, x: str, width: int) -> str:
-    """Add one step of the long short-term memory (Gers et al., 2000); memory contains its output, then its cells."""
+    """Add a step of the long short-term memory (Gers et al., 2000); return the name of its output. Its memory contains
+    the output, then the cells.
+    """
     shown, cells = graph.split("memory", 2, width, "memory_part")
     from_input = graph.linear(x, "lstm_input_weight", "lstm_input_bias")
     from_memory = graph.linear(shown, "lstm_memory_weight", "lstm_memory_bias")
@@ -100,7 +102,7 @@ def _long_short_term(graph: _Graph, x: str, width: int) -> str:
 
 
 def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
-    """Return the action of the last layer: clipped to the box, squashed into it, or the largest entry's index."""
+    """Add the conversion of the last layer to an action: clipped to the box, squashed, or the largest entry's index."""
     if output == "argmax":
         graph.node("ArgMax", [x], "action", axis=1, keepdims=0)
         return
@@ -115,7 +117,7 @@ def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
 
 
 def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
-    """Return the arrays of an agent, and the model of its environment.
+    """Return the stored arrays of an agent, and the model of its environment.
 
     Raises:
         ValueError: for an agent that has no plain arrays, or does not fit the environment.
@@ -133,7 +135,7 @@ def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
 
 
 def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
-    """Return the file's description of the network: names, units and meaning of inputs and outputs.
+    """Return the metadata of an ONNX file as texts by key: names, units and meaning of inputs and outputs.
 
     Args:
         stored: arrays of the agent.
@@ -166,7 +168,7 @@ def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
 
 
 def network_graph(stored: StoredPolicy, model: Model) -> Any:
-    """Return the ONNX model of a network.
+    """Return a network as an ONNX model: observation and memory in, action and memory out.
 
     Args:
         stored: arrays of the agent.
@@ -221,7 +223,7 @@ def network_graph(stored: StoredPolicy, model: Model) -> Any:
 
 
 def export_onnx(request: ExportRequest, path: Path) -> None:
-    """Write the network of an agent as ONNX.
+    """Write the network of an agent as an ONNX file.
 
     Args:
         request: request of an agent, shipped or in a file.

@@ -27,7 +27,7 @@ from ..envs.contract.parameters import LARGEST, ParameterLimits, field_limits
 from ..envs.contract.task import Task, field_words
 
 PARAMETER = 6
-"""Argument of the program that starts a track, beside those of :mod:`.traced_filter`."""
+"""Number of the parameters among the arguments of the program ``start``."""
 NUMBERS = {name: compute for name, compute in FUNCTIONS.items() if hasattr(math, name)}
 """Functions that :mod:`math` has, too."""
 EXACT = frozenset(OPERATIONS) - {"remainder"} | {"constant", "input", "take"}
@@ -57,30 +57,30 @@ class Declaration(NamedTuple):
     """The parameters of a competitor that can be set."""
 
     tuned: list[Declared]
-    """Values of its tuning."""
+    """Parameters of its tuning."""
     own: list[Declared]
     """Parameters of the task."""
     tunable: Tunable | None
 
     @property
     def all(self) -> list[Declared]:
-        """All parameters, values of the tuning first."""
+        """All parameters that can be set, values of the tuning first."""
         return [*self.tuned, *self.own]
 
 
-def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str) -> Declaration:
-    """Return the parameters of a competitor that can be set.
+def declaration(task: Task, maker: Any, tunables: Mapping[str, Tunable], name: str) -> Declaration:
+    """Return the parameters of an exported competitor that its user can set.
 
     Args:
         task: task with the current parameters.
         maker: maker of the competitor.
-        known: tunable parameters by the names of competitors.
+        tunables: tunable parameters by the names of competitors.
         name: name of the competitor.
     """
     if isinstance(maker, TunedPolicy):
         tunable, values = maker.tunable, maker.values
     else:
-        tunable = known.get(name)
+        tunable = tunables.get(name)
         values = tunable.start if tunable is not None else {}
     tuned, taken = [], set()
     arguments = _arguments(maker.make if isinstance(maker, TunedPolicy) else maker)
@@ -90,17 +90,17 @@ def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str)
         for key, (low, high) in tunable.limits.items():
             value, size, base = float(values[key]), None, key.removeprefix("log10_")
             if not isinstance(maker, TunedPolicy):
-                value, size = _in_force(arguments, key, value)
+                value, size = _untuned_value(arguments, key, value)
             unit = tunable.units.get(base, "")
             words = described.get(base, f"{base.replace('_', ' ')}{', ' if unit else ''}{unit}")
             words = f"Decimal logarithm: {words}" if base != key else words
             tuned.append(Declared(key, (), (value,), min(low, value), max(high, value), words, size=size))
         taken = {*tunable.apply(values)[0], *tunable.limits}
-    return Declaration(tuned, [p for p in _of_task(task.parameters) if p.name not in taken], tunable)
+    return Declaration(tuned, [p for p in _task_parameters(task.parameters) if p.name not in taken], tunable)
 
 
 def _arguments(maker: Any) -> dict[str, Any]:
-    """Return the arguments of a competitor's maker, and the fields of its prior."""
+    """Return the arguments of a competitor's maker and the fields of its prior, by name."""
     given: dict[str, Any] = {}
     while isinstance(maker, functools.partial):
         maker, given = maker.func, {**maker.keywords, **given}
@@ -110,10 +110,8 @@ def _arguments(maker: Any) -> dict[str, Any]:
     return {**(prior._asdict() if hasattr(prior, "_asdict") else {}), **given}
 
 
-def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
-    """Return the tuning value of an untuned filter, and the parameter of which it is the logarithm; the start of a
-    search may have fewer digits.
-    """
+def _untuned_value(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
+    """Return a tunable parameter's untuned value, and if that is a decimal logarithm, its argument, else None."""
     is_log = name.startswith("log10_")
     size = arguments.get(name.removeprefix("log10_"))
     if isinstance(size, int | float) and not (is_log and size <= 0.0):
@@ -121,8 +119,8 @@ def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[fl
     return start, float(f"{10.0**start:.15g}") if is_log else None
 
 
-def _of_task(parameters: Any) -> Iterator[Declared]:
-    """Return the numbers among the parameters of a task."""
+def _task_parameters(parameters: Any) -> Iterator[Declared]:
+    """Yield the numbers and arrays among the parameters of a task, with values, limits and meaning."""
     words = {
         name: text for base in reversed(type(parameters).__mro__) for name, text in field_words(base).items()
     }
@@ -148,7 +146,7 @@ def _of_task(parameters: Any) -> Iterator[Declared]:
 
 
 def _kinds(hint: Any) -> set[Any]:
-    """Return the types of the numbers and words of a value."""
+    """Return the scalar types within a type hint, inside tuples and unions."""
     inside = typing.get_args(hint)
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) in (tuple, typing.Union):
         return {kind for part in inside for kind in _kinds(part)}
@@ -156,7 +154,7 @@ def _kinds(hint: Any) -> set[Any]:
 
 
 class ParameterGraph(Graph):
-    """Expressions of which some depend on parameters alone.
+    """A graph of traced expressions in which parameters are inputs.
 
     Args:
         free: parameters whose numbers are the rows of ``PARAMETER``.
@@ -174,16 +172,16 @@ class ParameterGraph(Graph):
         self.conditions: dict[int, bool] = {}
         self.settled: set[int] = set()
         self.usual: dict[int, Any] = {}
-        """Values of expressions with the usual parameters, where they are known."""
+        """Values of expressions with the default parameters, where they are known."""
         self.ends: dict[int, tuple[float, float] | None] = {}
 
     def rows(self, nodes: Sequence[int]) -> set[int]:
-        """Return the rows of the parameters that expressions depend on."""
+        """Return the rows of the parameters on which some expressions depend."""
         inputs = [self.arguments[node] for node in self.live(nodes) if self.operations[node] == "input"]
         return {row for argument, row in inputs if argument == PARAMETER}
 
     def value(self, node: int) -> Any:
-        """Return the value of an expression with the usual parameters; None where it depends on other inputs."""
+        """Return the value of an expression with the default parameters; None where it depends on other inputs."""
         if node in self.usual:
             return self.usual[node]
         for part in self.live([node]):
@@ -213,8 +211,9 @@ class ParameterGraph(Graph):
             return ({**OPERATIONS, **FUNCTIONS}[operation])(*parts)
 
     def settle(self, node: int, use: str) -> Any:
-        """Return the value of an expression that must be plain: of a branch it becomes a condition, else its parameters
-        become constant; None where it depends on other inputs than parameters.
+        """Return the value of an expression that Python code uses as a number; None if it needs other inputs.
+
+        A branch becomes a condition of the program; parameters that are used as a plain number become constant.
         """
         found = self.value(node)
         if found is None:
@@ -227,11 +226,11 @@ class ParameterGraph(Graph):
         return found
 
     def is_exact(self, node: int) -> bool:
-        """Return whether an expression has the same bits on every machine."""
+        """Return whether an expression has the same bits on every machine: it uses exact operations alone."""
         return all(self.operations[part] in EXACT for part in self.live([node]))
 
     def _is_limited(self, node: int, holds: bool) -> bool:
-        """Return whether the limits of parameters alone decide a comparison."""
+        """Return whether a comparison has the value ``holds`` for all parameters within their limits."""
         name = self.operations[node]
         ends = [self._ends(part) for part in self.parts(node)]
         if name not in COMPARISONS or None in ends:
@@ -242,7 +241,7 @@ class ParameterGraph(Graph):
         return all(bool(OPERATIONS[name](x, y)) == holds for x in one for y in other)
 
     def _ends(self, node: int) -> tuple[float, float] | None:
-        """Return the limits of an expression over all parameters within their limits; None: unknown."""
+        """Return the smallest and largest value of an expression over the parameters' limits; None: unknown."""
         if node not in self.ends:
             self.ends[node] = self._ends_of_parts(node)
         return self.ends[node]
@@ -272,7 +271,7 @@ def _power(base: float, exponent: float) -> float:
 
 @contextmanager
 def traced_functions(graph: ParameterGraph) -> Iterator[None]:
-    """Make the functions of :mod:`math` return expressions of traced numbers, as those of NumPy do.
+    """Make :mod:`math`'s functions accept traced numbers and return expressions, inside a ``with`` block.
 
     Other arguments, and other threads, get numbers as before.
     """
@@ -309,22 +308,20 @@ def traced_functions(graph: ParameterGraph) -> Iterator[None]:
             setattr(math, name, compute)
 
 
-def expressions(declared: Declared, first: int, graph: Graph) -> Any:
-    """Return nested tuples of traced numbers in place of a parameter, given the row of the first number."""
-    nodes = [graph.input(PARAMETER, first + i) for i in range(len(declared.values))]
+def expressions(parameter: Declared, first: int, graph: Graph) -> Any:
+    """Return a parameter as nested tuples of traced inputs, whose rows begin at ``first``."""
+    nodes = [graph.input(PARAMETER, first + i) for i in range(len(parameter.values))]
 
     def nested(part: numpy.ndarray) -> Any:
         if part.ndim == 0:
             return Traced(part, numpy.float64)
         return tuple(nested(inner) for inner in part)
 
-    return nested(numpy.array(nodes, dtype=numpy.int64).reshape(declared.shape))
+    return nested(numpy.array(nodes, dtype=numpy.int64).reshape(parameter.shape))
 
 
 def with_parameters(parameters: Any, values: Mapping[str, Any]) -> Any:
-    """Return the parameters of a task with others, which are not checked, and without cached results of the former
-    ones.
-    """
+    """Return a copy of a task's parameters with some values replaced, without checks and cached results."""
     changed = object.__new__(type(parameters))
     for field in dataclasses.fields(parameters):
         object.__setattr__(changed, field.name, values.get(field.name, getattr(parameters, field.name)))

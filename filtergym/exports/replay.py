@@ -1,4 +1,4 @@
-"""Test vectors of an exported filter: measurements of episodes, and the estimates of the competitor itself."""
+"""Test vectors of an exported filter: measurements of episodes, and the estimates of the Python competitor."""
 
 import collections
 import copy
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class Replay(NamedTuple):
-    """E episodes of T measurements, every array of a structure row by row."""
+    """Test vectors of E episodes of T measurements, and the estimates of the Python competitor."""
 
     initial: numpy.ndarray
     """Initial estimate, ``(rows, E)``."""
@@ -57,9 +57,7 @@ class Replay(NamedTuple):
         return numpy.sqrt(numpy.maximum(variance, 0.0))
 
     def largest_difference(self, mean: numpy.ndarray) -> float:
-        """Return the largest difference of other means ``(T, C, E)`` to the competitor's, in its standard
-        deviations.
-        """
+        """Return the largest difference of means ``(T, C, E)`` to the competitor's, in its standard deviations."""
         with numpy.errstate(all="ignore"):
             difference = numpy.abs(mean - self.mean) / self.sigma
         same = (mean == self.mean) | (numpy.isnan(mean) & numpy.isnan(self.mean))
@@ -73,9 +71,7 @@ def _report(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return the input and the estimate of an estimator, and why an episode is lost: its last valid estimate is then
-    repeated.
-    """
+    """Return measurement, mean and covariance of an estimator by name, and ``lost``, above zero where it failed."""
     return {
         **_report(model, episode),
         "lost": model.filter.records(episode.filter, episode.measurement)["lost"],
@@ -83,7 +79,7 @@ def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _rows(part: Any, count: int) -> numpy.ndarray:
-    """Return the numbers of nested tuples of arrays ``(..., N)`` row by row, of the first lanes, ``(rows, count)``."""
+    """Return nested tuples of arrays ``(..., N)`` as one matrix ``(rows, count)`` of the first ``count`` lanes."""
     arrays = [numpy.asarray(array, dtype=float) for array in leaves(part)]
     return numpy.concatenate([array.reshape(-1, array.shape[-1])[:, :count] for array in arrays])
 
@@ -91,7 +87,7 @@ def _rows(part: Any, count: int) -> numpy.ndarray:
 def replay(
     request: ExportRequest, episodes: int = 8, measurements: int | None = None
 ) -> tuple[TracedFilter, Replay]:
-    """Trace a competitor, and run it over episodes as an evaluation does.
+    """Trace a competitor, and run it over episodes of the test split; return the traced filter and the test vectors.
 
     Args:
         request: competitor to trace.
@@ -123,9 +119,7 @@ def replay(
         kept["mean"].append(numpy.array(found["mean"][..., :episodes]))
         kept["covariance"].append(numpy.array(found["covariance"][..., :episodes]))
     if lost.all():
-        raise ValueError(
-            f"{name!r} lost every episode that it was to be compared on: its answers are no estimates"
-        )
+        raise ValueError(f"{name!r} lost every episode of the comparison: its estimates are not valid")
     measured, mean, covariance = (numpy.stack(values)[..., ~lost] for values in kept.values())
     components = [(component.name, component.unit) for component in plain.task.components]
     initial = _rows(started[0], episodes)[:, ~lost]
@@ -133,7 +127,7 @@ def replay(
 
 
 class _Network:
-    """The network of a filter, evaluated as in an evaluation.
+    """The network of a filter in a replay, with its memory and its last output.
 
     Args:
         network: network of the filter.
@@ -149,7 +143,7 @@ class _Network:
         self.answer: Any = None
 
     def __call__(self, shown: Any) -> None:
-        """Compute the output, if there is a decision at this measurement."""
+        """Compute and store the output, unless the first value, the flag of a decision, is zero."""
         flag, *rest = shown
         if not numpy.all(flag):
             return
@@ -161,8 +155,9 @@ class _Network:
 
 
 def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64) -> numpy.ndarray:
-    """Run the programs of a filter over episodes, step by step: in double as compiled code that calls the functions of
-    the C library, where code can be compiled, else in NumPy.
+    """Run a traced filter over replayed measurements, and return the rows of its estimate.
+
+    Compiled code runs in double where code can be compiled, with the C library's functions; NumPy otherwise.
 
     Args:
         traced: filter to run.
@@ -194,7 +189,7 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
 
 
 def _network_rows(network: _Network | None) -> Any:
-    """Return the rows of a network's output; without a decision the previous output is not read."""
+    """Return the rows of a network's last output; zeros before the first one."""
     if network is None or network.answer is None:
         return collections.defaultdict(float)
     return network.answer
@@ -211,7 +206,7 @@ def _interpret_update(
 
 
 class _CompiledUpdate:
-    """An update of E filters as compiled code.
+    """The update of E filters as compiled code; a call returns the rows of the results.
 
     Args:
         traced: the filter.
@@ -233,7 +228,7 @@ class _CompiledUpdate:
 
 
 class _Code:
-    """Compiled code of a program for E lanes, whose results are the rows of one array."""
+    """A program compiled for E lanes (parallel episodes); a call returns the rows of its results."""
 
     def __init__(self, code: StraightLineProgram, E: int) -> None:
         self.E = E

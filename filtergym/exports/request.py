@@ -29,7 +29,7 @@ class ExportRequest(NamedTuple):
 def request_export(
     problem: Problem, name: str | Path, scenario: Any = None, *, trust: bool = False, **keywords: Any
 ) -> ExportRequest:
-    """Find a competitor by its name.
+    """Return the request to export a competitor, found by its name or file.
 
     Args:
         problem: problem of the competitor.
@@ -57,7 +57,7 @@ def request_export(
 
 
 def _own_name(problem: Problem, name: str | Path) -> str:
-    """Return the name of a competitor; of a file its stem, without the name of the environment."""
+    """Return the name of an exported competitor; for a file its stem without the environment's name."""
     text = str(name)
     for ending in file_endings():
         if text.endswith(ending):

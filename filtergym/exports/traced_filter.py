@@ -44,12 +44,12 @@ if TYPE_CHECKING:
     from ..agents.learned_policy import LearnedPolicy
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
-"""Arguments of the programs, beside :data:`~.parameters.PARAMETER`."""
+"""Numbers of the arguments of the programs ``start`` and ``update``."""
 DERIVED, CONDITION = 7, 8
 LIKELIHOODS = ("log_likelihood", "nis", "nis_degrees")
-"""Likelihoods that are reported beside an estimate, if the filter has them."""
+"""Names of the likelihoods that an exported filter returns beside its estimate, where it has them."""
 FEEDBACK = "feedback"
-"""Part of an estimate that steers the world, where it does not follow from the mean."""
+"""Name of the part of an estimate that the closed loop feeds back, where it does not follow from the mean."""
 
 
 class Member(NamedTuple):
@@ -66,20 +66,20 @@ class Member(NamedTuple):
 
 
 class FreeParameters(NamedTuple):
-    """Parameters of a filter that its user sets, and the numbers that it derives of them when a track starts."""
+    """Parameters of a filter that its user sets, and the numbers that the filter derives from them at the start."""
 
     declared: Sequence[Declared] = ()
     """Arrays in the order of the rows of the argument ``PARAMETER``."""
     derive: StraightLineProgram | None = None
     """Program from the parameters to the rows of the argument ``DERIVED``; None where none is free."""
     usual: Sequence[float] = ()
-    """Values of these rows with the current parameters, as they are in the filter itself."""
+    """Values of the rows of ``DERIVED`` with the current parameters."""
     kept: int = 0
     """Number of these rows that are also the last rows of the state: ``update`` reads them and leaves them
     unchanged.
     """
     stated: range = range(0)
-    """Rows whose bits may differ from those of the filter itself in double, since a library's functions decide them."""
+    """Rows of ``DERIVED`` that may differ from the Python filter's in the last bits, since a library computes them."""
     condition: StraightLineProgram | None = None
     """Program from the parameters to one result, whether the programs hold for them; None: for any within
     the limits.
@@ -89,12 +89,12 @@ class FreeParameters(NamedTuple):
 
     @property
     def values(self) -> list[float]:
-        """Current parameters, row by row."""
+        """Current values of all parameters, row by row."""
         return [value for one in self.declared for value in one.values]
 
 
 class TracedFilter(NamedTuple):
-    """A filter as two programs."""
+    """A filter as two straight-line programs, ``start`` and ``update``."""
 
     start: StraightLineProgram
     """Program from the initial estimate and the parameters to the state."""
@@ -119,7 +119,7 @@ class TracedFilter(NamedTuple):
 
 
 class FilterSteps:
-    """A filter alone; an estimate that an evaluation would reject is returned all the same.
+    """A filter's step on traced arrays, without the checks of its estimate that an evaluation makes.
 
     Args:
         filter: on traced arrays.
@@ -143,7 +143,7 @@ class FilterSteps:
         )
 
     def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
-        """Return the state after a measurement, and the estimate."""
+        """Return the filter's state after a measurement, and by name mean, covariance and likelihoods."""
         own, received = self.filter, measurement if self.masked is None else self.masked(measurement)
         after = own.step(state, FilterInput(received))
         records = own.records(after, received)
@@ -154,7 +154,7 @@ class FilterSteps:
         return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
 
     def due_nodes(self, state: Any, graph: Graph) -> list[int]:
-        """Return the expression of whether the network is evaluated at a measurement."""
+        """Return the expression that is true where the network is evaluated at this measurement."""
         assert self.decider is not None
         if self.decider.interval == 1:
             return [graph.constant(True)]
@@ -162,7 +162,7 @@ class FilterSteps:
 
 
 def clear_missing(task: Task, measurement: Any) -> Any:
-    """Return a measurement with zero in place of missing values, whatever they contain."""
+    """Return a traced measurement with zero in place of every missing value."""
 
     def clear(own: Any, masked: Any) -> Any:
         if own is masked or (own.nodes == masked.nodes).all():
@@ -174,7 +174,7 @@ def clear_missing(task: Task, measurement: Any) -> Any:
 
 
 def action_size(network: "LearnedPolicy") -> int:
-    """Return the number of values of an action."""
+    """Return the number of values in a network's action."""
     return 1 if network.output == "argmax" else len(network.layers[-1][1])
 
 
@@ -194,7 +194,7 @@ class NetworkPlaceholder(Policy):
         self.shown: list[int] = []
 
     def act(self, observation: Any, state: Any, start: Any) -> tuple[Any, Any]:
-        """Store the input; for plain numbers return zeros, of which only the shape matters."""
+        """Store the traced input, and return new inputs of the graph as action; zeros for an untraced observation."""
         if not isinstance(observation, Traced):
             return numpy.zeros(
                 (1,) if self.network.output == "argmax" else (1, action_size(self.network))
@@ -211,15 +211,15 @@ def check_kind(name: str, maker: Any) -> None:
     kind = kind_of(maker)
     if kind not in RANKED:
         raise ValueError(
-            f"{name!r} is of kind {kind}: an estimator or a policy can be exported, which know nothing but what is "
-            "measured, when it is measured"
+            f"{name!r} is of kind {kind}: only estimators and policies can be exported, which use past and present "
+            "measurements alone"
         )
 
 
 def steps_of(
     traced: Task, control: str, maker: Any, plain: Model, graph: Graph
 ) -> tuple[FilterSteps, "NetworkPlaceholder | None"]:
-    """Return the steps of a competitor on traced arrays, and the placeholder of its network; a graph must be open.
+    """Return a competitor's step on traced arrays, and the placeholder of its network or None.
 
     Args:
         traced: task on traced arrays.
@@ -245,7 +245,7 @@ def steps_of(
     if kind_of(maker) == "estimator":
         own = as_filter(traced, make_competitor(maker, traced))
         if own.in_python:
-            raise NotTraceable("it does not say that it is traceable")
+            raise NotTraceable("its class does not set traceable = True")
         return FilterSteps(own, traced.world.mask_missing), None
     acting = plain if traced.parameters is plain.task.parameters else Model(traced, control)
     policy, network = replace_network(make_competitor(maker, acting), graph)
@@ -263,7 +263,7 @@ def steps_of(
 
 
 def replace_network(policy: Any, graph: Graph) -> tuple[Any, NetworkPlaceholder | None]:
-    """Replace the network of a policy by :class:`NetworkPlaceholder`, wherever it is inside."""
+    """Return a policy with its network replaced by a placeholder, and the placeholder; None without a network."""
     if _traced_as(policy) == "network":
         asked = NetworkPlaceholder(policy, graph)
         return asked, asked
@@ -277,9 +277,7 @@ def replace_network(policy: Any, graph: Graph) -> tuple[Any, NetworkPlaceholder 
 
 
 def _traced_as(found: Any) -> str:
-    """Return the placeholders of learned objects in an export, without importing the learning room, which may be
-    absent.
-    """
+    """Return the attribute ``traced_as``: "network", "gated", "learned estimator"; empty for other objects."""
     return getattr(found, "traced_as", "")
 
 
@@ -287,7 +285,7 @@ def _traced_as(found: Any) -> str:
 
 
 def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
-    """Return every number of nested tuples of arrays of one lane, in the order of ``leaves``."""
+    """Return a :class:`Member` for every number in nested tuples of arrays of one lane."""
     if part is None:
         return []
     if isinstance(part, dict | tuple):
@@ -309,12 +307,12 @@ def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
 
 
 def nodes_of(part: Any) -> list[int]:
-    """Return the expressions of all numbers."""
+    """Return the graph's nodes of all numbers in nested tuples of traced arrays."""
     return [node for array in leaves(part) for node in namespace.asarray(array).nodes.ravel().tolist()]
 
 
 def fill(part: Any, nodes: Sequence[int], graph: Graph) -> Any:
-    """Return nested tuples of arrays like others, made of these expressions."""
+    """Return nested tuples of traced arrays of the form of ``part``, made of the given nodes."""
     at = iter(nodes)
 
     def leaf(array: Any) -> Traced:
@@ -330,7 +328,7 @@ def fill(part: Any, nodes: Sequence[int], graph: Graph) -> Any:
 
 
 def one_lane(part: Any) -> Any:
-    """Return the nested tuples of arrays ``(..., N)`` with the first lane alone, ``(..., 1)``."""
+    """Return nested tuples of arrays ``(..., N)`` cut to the first lane, ``(..., 1)``."""
     return map_arrays(lambda array: array[..., :1], part)
 
 
@@ -338,7 +336,7 @@ def one_lane(part: Any) -> Any:
 
 
 class _Classes:
-    """Classes of equal members of a state, and of constant ones.
+    """Classes of state members that are always equal or constant, found by repeated traces of the update.
 
     Members that start equal form a class, which is constant if they start constant. Where the update makes them differ,
     the class is split, and the update is traced again. Classes that still split after some rounds, as in a window that
@@ -356,14 +354,14 @@ class _Classes:
         self.fixed = {c: value for c, value in values.items() if value is not None}
 
     def nodes(self) -> list[int]:
-        """Return the expressions of the members before an update."""
+        """Return the nodes of the state's members before an update: a constant, or one input for each class."""
         return [
             self.graph.constant(self.fixed[c]) if c in self.fixed else self.graph.input(STATE, c)
             for c in self.members
         ]
 
     def split(self, after: Sequence[int]) -> bool:
-        """Split the classes that an update makes different; return whether there were any."""
+        """Split the classes whose members differ after an update; return whether any was split."""
         pairs = list(zip(self.members, after, strict=True))
         groups: dict[tuple[int, int], int] = {}
         members = [groups.setdefault(pair, i) for i, pair in enumerate(pairs)]
@@ -396,9 +394,9 @@ def trace_filter(
     name: str,
     plain: Model,
     template: tuple[Any, Any],
-    known: Mapping[str, Tunable] = MappingProxyType({}),
+    tunables: Mapping[str, Tunable] = MappingProxyType({}),
 ) -> TracedFilter:
-    """Trace a competitor.
+    """Return a competitor as two straight-line programs, with as many free parameters as possible.
 
     Args:
         task: class of the environment.
@@ -407,13 +405,13 @@ def trace_filter(
         name: name of the competitor, in errors.
         plain: model of the control on NumPy, with the parameters of the export.
         template: initial estimate and measurement, any numbers of any width.
-        known: tunable parameters by the names of competitors; these and the task's are free.
+        tunables: tunable parameters by the names of competitors; these and the task's are free.
 
     Raises:
         ValueError: for a competitor that is neither estimator nor policy, or no straight line of arithmetic.
     """
     check_kind(name, maker)
-    found = declaration(plain.task, maker, known, name)
+    found = declaration(plain.task, maker, tunables, name)
     arguments = task, control, maker, plain, template, found
     try:
         fixed = _trace_free(*arguments, [])
@@ -529,8 +527,8 @@ def _trace(
     condition = None
     if conditions:
         whole = functools.reduce(functools.partial(graph.node, "logical_and"), conditions)
-        condition = _renumbered(program(graph, [ProgramResult(CONDITION, 0, whole)]), PARAMETER, moved)
-    derive = _renumbered(own.program(), PARAMETER, moved) if declared else None
+        condition = _renumber_rows(program(graph, [ProgramResult(CONDITION, 0, whole)]), PARAMETER, moved)
+    derive = _renumber_rows(own.program(), PARAMETER, moved) if declared else None
     own.read()
     start = program(graph, [ProgramResult(STATE, row, node) for row, node in enumerate(begun)])
     update = program(graph, written)
@@ -539,8 +537,8 @@ def _trace(
     members = [listed[member] for member in live]
     members += [Member("derived", (own.kept,), row, DERIVED_WORDS) for row in range(own.kept)]
     found = TracedFilter(
-        _renumbered(start, STATE, place),
-        _renumbered(update, STATE, place),
+        _renumber_rows(start, STATE, place),
+        _renumber_rows(update, STATE, place),
         members_of(initial),
         members_of(measurement),
         members,
@@ -553,17 +551,17 @@ def _trace(
 
 
 KEPT = 10**9
-"""First row of the parameters that the state contains, while a filter is traced."""
+"""First row in the state of numbers derived from parameters, while a filter is traced."""
 DERIVED_WORDS = "Derived from the parameters at the start, constant from then on."
 CLOSE = 1e-9
-"""Largest difference of a derived number to that of the filter itself, which computes it in another order."""
+"""Largest relative difference of a derived number to the Python filter's, which computes it in another order."""
 
 SMALL = 1e-15
-"""The same for numbers that may be zero."""
+"""Largest absolute difference of a derived number that may be zero."""
 
 
 class _Nodes(NamedTuple):
-    """Expressions of a filter."""
+    """Expressions of a filter: a graph, and the nodes of its results."""
 
     graph: ParameterGraph
     wanted: list[int]
@@ -571,7 +569,7 @@ class _Nodes(NamedTuple):
 
 
 def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
-    """Return the constants of a filter in the places of the expressions of the same filter with free parameters."""
+    """Return, by node of the filter with free parameters, the constant in its place in the filter without."""
     one, other, found = plain.graph, free.graph, dict[int, float]()
     waiting = list(zip(plain.wanted, free.wanted, strict=True))
     seen = set(waiting)
@@ -594,7 +592,7 @@ def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
 
 
 class _Derived:
-    """Largest expressions of parameters alone in a filter, in the order of the rows of ``DERIVED``.
+    """Largest expressions of a filter that depend on parameters alone, in the order of the rows of ``DERIVED``.
 
     Args:
         nodes: expressions of the filter.
@@ -647,13 +645,13 @@ class _Derived:
         return list(found | dict.fromkeys(node for node in wanted if kinds[node] == 1))
 
     def program(self) -> StraightLineProgram:
-        """Return the program from the parameters to these expressions."""
+        """Return the straight-line program from the parameters to the values of ``nodes``."""
         graph = self.graph
         numbers = [graph.node("number", node) if graph.logical[node] else node for node in self.nodes]
         return program(graph, [ProgramResult(DERIVED, row, node) for row, node in enumerate(numbers)])
 
     def read(self) -> None:
-        """Replace these expressions by inputs: of the update from the state, where it contains them."""
+        """Replace these expressions in the graph by inputs from the state or from ``DERIVED``."""
         graph = self.graph
         for row, node in enumerate(self.nodes):
             given = (STATE, KEPT + row) if row < self.kept else (DERIVED, row)
@@ -665,7 +663,7 @@ class _Derived:
 
 
 def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Declared], dict[int, int]]:
-    """Return the parameters of which a row is used, and their new rows."""
+    """Return the parameters of which a row is used, and the new number of each of their rows by the old one."""
     declared, first = list[Declared](), 0
     moved: dict[int, int] = {}
     for one in free:
@@ -693,8 +691,8 @@ def _live_members(
         live = more
 
 
-def _renumbered(code: StraightLineProgram, argument: int, place: Mapping[int, int]) -> StraightLineProgram:
-    """Return the program with other numbers of the rows of an argument."""
+def _renumber_rows(code: StraightLineProgram, argument: int, place: Mapping[int, int]) -> StraightLineProgram:
+    """Return a program with the rows of one argument renumbered by ``place``."""
     steps, arguments = code.steps, code.steps.arguments.copy()
     inputs = steps.begins[:-1][steps.which("input")]
     rows = 1 + inputs[arguments[inputs] == argument]

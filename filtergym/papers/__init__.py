@@ -1,1 +1,1 @@
-"""Reproductions of papers: one folder a paper, in a clone of the repository; the installed package lacks them."""
+"""Reproductions of papers: one folder for each paper; the installed package does not contain them."""

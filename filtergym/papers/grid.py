@@ -15,7 +15,7 @@ class Grid:
     rows: Sequence[Sequence[str]]
 
     def __rich__(self) -> Table:
-        """Return it for the terminal: numbers to the right, without the marks of Markdown."""
+        """Return the table for the terminal: numbers right-justified, without the marks of Markdown."""
         table = Table(title=_plain(self.title), title_justify="left")
         for i, name in enumerate(self.header):
             words = any(row[i].startswith("`") for row in self.rows)

@@ -19,10 +19,8 @@ def panels(rows: int, columns: int, size: tuple[float, float], **keywords: Any) 
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
 
 
-def looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return the colour and line of each name; unlike :func:`~..figures.styles` neighbours differ in their dashes
-    too.
-    """
+def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return Matplotlib's colour and dash style of each curve's name."""
     return {
         name: style | {"linestyle": LINES[i % len(LINES)]}
         for i, (name, style) in enumerate(styles(list(names)).items())
@@ -37,7 +35,7 @@ def draw(axis: Any, x: numpy.ndarray, samples: numpy.ndarray, alpha: float = 0.3
 
 
 def finish(axis: Any, x: str = "", y: str = "", title: str = "", *, legend: str = "", log: str = "") -> None:
-    """Name an axis; ``log`` names the logarithmic ones ("xy"), ``legend`` its place."""
+    """Set labels, title, legend and grid of axes; ``log`` lists the logarithmic ones ("x", "y" or "xy")."""
     for name in log:
         getattr(axis, f"set_{name}scale")("log")
         if getattr(axis, f"get_{name}lim")()[0] > 5e-4:  # smaller numbers are shorter as powers of ten

@@ -26,9 +26,9 @@ def _resampling(runs: int) -> Bootstrap:
 
 
 class Quantity(NamedTuple):
-    """A value and its uncertainty; "certainly" in a verdict means by the whole interval.
+    """A value, its 95 % interval and standard error.
 
-    As text it is ``value ± standard error``, both in the digits asked for (``f"{m:.3f}"``, ``f"{m:+.1%}"``),
+    As text it is ``value ± standard error``, both in the digits of the format (``f"{m:.3f}"``, ``f"{m:+.1%}"``),
     or in two digits of the error (``f"{m}"``); the value alone where it is exact.
     """
 
@@ -49,14 +49,12 @@ class Quantity(NamedTuple):
 
 
 def means(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the mean over the runs ``(runs, ...)``, and over every bootstrap sample of them, ``(1 + resamples,
-    ...)``.
-    """
+    """Return the mean over runs ``(runs, ...)``, then over each bootstrap sample of them, ``(1 + resamples, ...)``."""
     return _resampling(len(values)).means(values)
 
 
 def quantity(samples: numpy.ndarray) -> Quantity:
-    """Return the value and uncertainty of a quantity, ``(1 + resamples,)``."""
+    """Return the value and uncertainty of a value followed by its bootstrap samples, ``(1 + resamples,)``."""
     if len(samples) == 1:
         return Quantity(*[float(samples[0])] * 3)
     value, low, high = percentile_interval(samples).tolist()
@@ -64,7 +62,7 @@ def quantity(samples: numpy.ndarray) -> Quantity:
 
 
 def mean(values: numpy.ndarray) -> Quantity:
-    """Return the mean over the runs ``(runs,)``."""
+    """Return the mean over the runs ``(runs,)``, with its uncertainty."""
     return quantity(means(values))
 
 
@@ -77,14 +75,14 @@ def band(samples: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
 def evaluate_policy(
     environment: str, name: str, scenario: str, episodes: int, **keywords: Any
 ) -> xarray.Dataset:
-    """Evaluate a policy, reference or bound on test episodes; one unit of work.
+    """Evaluate a policy, reference or bound on test episodes; return the dataset. One unit of work.
 
     Args:
-        environment: id.
-        name: of the policy.
+        environment: Gymnasium id.
+        name: name of the policy.
         scenario: name of the scenario.
         episodes: Monte Carlo runs.
-        **keywords: of :func:`~filtergym.evaluate`; parameters of the task.
+        **keywords: keywords of :func:`~filtergym.evaluate`, and parameters of the task.
     """
     return evaluate(environment, [name], scenario, episodes, **keywords).isel(policy=0)
 
@@ -92,16 +90,16 @@ def evaluate_policy(
 def record_run(
     task: Any, actor: Any, seeds: Sequence[int], fields: Callable[[Any, Any], Mapping[str, numpy.ndarray]]
 ) -> dict[str, numpy.ndarray]:
-    """Run a policy or a reference estimator and keep what an evaluation does not record.
+    """Run a policy or a reference estimator, and return quantities that an evaluation does not record.
 
     Args:
-        task: under the actor's control.
-        actor: policy or reference.
-        seeds: one for each episode.
-        fields: of the task and its state after every measurement, values ``(..., N)`` to keep.
+        task: task with the actor's control.
+        actor: policy or reference estimator.
+        seeds: seed of each episode.
+        fields: function from the task and its state after a measurement to the values ``(..., N)`` to record.
 
     Returns:
-        The same, ``(episodes, K, ...)`` with the other axes in reversed order.
+        The recorded values, ``(episodes, K, ...)`` with the other axes in reversed order.
     """
     # Lanes beyond the seeds are padding.
     kept = [

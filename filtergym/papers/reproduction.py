@@ -24,14 +24,14 @@ from .grid import Grid, markdown_table
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]
 Progress = Callable[[int], None]
-"""Called with the units of work done."""
+"""Function that is called with the number of units of work done."""
 UNCERTAINTY = (
     '± is one standard error, by bootstrap over the runs; "certainly" means by a 95 % bootstrap interval.'
 )
 
 
 class Later(NamedTuple):
-    """A unit of work that somebody will do: a function of a module and its arguments."""
+    """A postponed unit of work: a function of a module and its arguments."""
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
@@ -39,17 +39,17 @@ class Later(NamedTuple):
 
 
 def later(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
-    """Leave a unit of work to :func:`compute_units`, which puts its result in this place."""
+    """Return a postponed call of a function, which :func:`compute_units` replaces by its result."""
     return Later(function, arguments, keywords)
 
 
 def compute_units(results: Any, progress: Progress, workers: Workers | None = None) -> Any:
-    """Do what was left for later, and return the same structure with what came out of it.
+    """Run the postponed calls inside nested containers, and return the containers with the results in their places.
 
     Args:
-        results: tuples, named ones too, lists and dictionaries, in which :func:`later` left units of work.
-        progress: called with the units done.
-        workers: who does them; default: this process, one after the other.
+        results: tuples, named ones too, lists and dictionaries that contain calls from :func:`later`.
+        progress: function that is called with the number of units done.
+        workers: processes that run them; default: this process, one after the other.
     """
     units: list[Later] = []
     _places(results, units.append)
@@ -65,7 +65,7 @@ def _unit(unit: Later, tick: Progress) -> Any:
 
 
 def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
-    """Return a structure with something else where units of work stand, in their order."""
+    """Return nested containers with ``instead(unit)`` in place of each postponed call, in their order."""
     if isinstance(part, Later):
         return instead(part)
     if isinstance(part, dict):
@@ -79,7 +79,7 @@ def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
 
 
 def verdict_if(holds: bool) -> Verdict:
-    """Return the verdict on a claim that holds or does not."""
+    """Return the verdict on a claim of one part: "reproduced" if it holds, else "not reproduced"."""
     return "reproduced" if holds else "not reproduced"
 
 
@@ -91,13 +91,13 @@ def verdict_of(holds: Iterable[bool]) -> Verdict:
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of the paper, or one thing it does not mention."""
+    """One claim of the paper, or one question that it leaves open, with verdict."""
 
     key: str
     statement: str
     """Claim of the paper, in our words; or the question, where it is silent."""
     measured: str
-    """The figures, with their uncertainty."""
+    """Measured quantities in words, with their uncertainty."""
     method: str
     """Runs, windows, statistic."""
     verdict: Verdict = "paper is silent"
@@ -112,11 +112,11 @@ class Statement(NamedTuple):
     measured: str
     method: str
     verdict: Callable[[Any], Verdict] | Verdict = "paper is silent"
-    """How the measured quantities, attributes of the argument, judge it."""
+    """Verdict, or function of the measured quantities, its argument's attributes, that returns one."""
 
 
 def judge_claims(table: Iterable[Statement], quantities: Mapping[str, Any]) -> list[Claim]:
-    """Return the claims of a table with the quantities that were measured, by their names in the table."""
+    """Return the claims of a table, with the measured quantities in their texts, and verdicts."""
     found = SimpleNamespace(**quantities)
     return [
         Claim(
@@ -140,16 +140,16 @@ class Reproduction:
     figures: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
     """File name without suffix -> Matplotlib figure and its caption, one sentence."""
     command: str = ""
-    """What made it."""
+    """Command of the reproduction."""
 
     def markdown(self, suffix: str = "png") -> str:
-        """Return the claims, tables and figures as one page, which shows files of figures that end in a suffix."""
+        """Return claims, tables and links to the figures' files as one page of Markdown."""
         lines = [f"# {self.title}", ""]
         if self.command:
             lines += [f"Made by `{self.command}`.", ""]
         lines += [UNCERTAINTY, "", "## Claims", ""]
         lines += markdown_table(
-            ("claim", "what was measured", "how", "verdict"),
+            ("claim", "measured", "method", "verdict"),
             [(f"**{c.key}.** {c.statement}", c.measured, c.method, f"**{c.verdict}**") for c in self.claims],
         )
         for table in self.tables:
@@ -159,8 +159,9 @@ class Reproduction:
         return "\n".join(lines) + "\n"
 
     def save(self, folder: Path, formats: Sequence[str] = ("png",)) -> None:
-        """Write ``report.md`` and the figures into an existing folder, all of them or none; the report shows those of
-        the first format.
+        """Write ``report.md`` and the figures into an existing folder, all of them or none.
+
+        The report shows the figures of the first format.
         """
         with whole_files(folder) as waiting:
             for name, (figure, _) in self.figures.items():
@@ -169,15 +170,15 @@ class Reproduction:
             write_text(waiting / "report.md", self.markdown(formats[0]))
 
     def __rich__(self) -> Table:
-        """Return the claims with what was measured and the verdicts, for the terminal."""
-        table = Table("claim", "what was measured", "verdict", title=self.title, show_lines=True)
+        """Return a table of claims, measured quantities and verdicts for the terminal."""
+        table = Table("claim", "measured", "verdict", title=self.title, show_lines=True)
         for claim in self.claims:
             table.add_row(f"{claim.key}. {claim.statement}", claim.measured, claim.verdict)
         return table
 
 
 def episode_count(episodes: int | None, default: int, least: int = 2) -> int:
-    """Return the number of Monte Carlo runs of a reproduction.
+    """Return the number of Monte Carlo runs of a reproduction, checked; ``default`` for None.
 
     Raises:
         ValueError: for fewer than ``least``; a single run has no interval.
@@ -188,8 +189,8 @@ def episode_count(episodes: int | None, default: int, least: int = 2) -> int:
     return count
 
 
-def its_command(module: str, episodes: int | None) -> str:
-    """Command that reproduces the paper of a module with this number of runs; None: its own."""
+def reproduction_command(module: str, episodes: int | None) -> str:
+    """Return the command that reproduces the paper of a module; with ``--episodes`` unless ``episodes`` is None."""
     paper = module.rpartition(".")[2].replace("_", "-")
     runs = "" if episodes is None else f" --episodes {episodes}"
     return f"filtergym reproduce {paper}{runs} --out DIR"

@@ -10,7 +10,7 @@ Reading: it gives no criterion for the best gains; here the RMS over the whole r
 """
 
 from ...evaluation.running.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
+from ..reproduction import Progress, Reproduction, episode_count, judge_claims, reproduction_command
 from . import claims, experiment, figures
 
 TITLE = "Tracking a manoeuvring target with an IMM algorithm over two alpha-beta filters"
@@ -20,7 +20,10 @@ STEPS = experiment.STEPS
 def reproduce(
     progress: Progress, episodes: int | None = None, workers: Workers | None = None
 ) -> Reproduction:
-    """Run the paper's experiment and judge its claims; at most ``GRID_EPISODES`` runs in a cell of the grids."""
+    """Run the paper's experiment, judge its claims, and return claims, tables and figures.
+
+    A cell of the grids has at most ``GRID_EPISODES`` runs.
+    """
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
-    return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))
+    return Reproduction(TITLE, *shown, command=reproduction_command(__name__, episodes))

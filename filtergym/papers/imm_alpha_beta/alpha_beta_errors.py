@@ -1,4 +1,4 @@
-"""Exact errors of an alpha-beta filter: settled variances, and the moments of one scan after another."""
+"""Exact errors of an alpha-beta filter: steady-state variances, and moments propagated scan by scan."""
 
 from typing import NamedTuple
 
@@ -11,12 +11,12 @@ class VarianceReduction(NamedTuple):
 
     position: Array
     velocity: Array
-    """In units of 1 / T^2."""
+    """Velocity variance, in units of 1 / T^2."""
     prediction: Array
 
 
 def variance_reduction(alpha: Array, beta: Array) -> VarianceReduction:
-    """Return the steady variance-reduction ratios of an alpha-beta filter.
+    """Return the steady-state variance-reduction ratios of an alpha-beta filter with gains alpha and beta.
 
     Textbook results (Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999), with
     ``d = alpha (4 - 2 alpha - beta)``: position ``(2 alpha^2 + 2 beta - 3 alpha beta) / d``, velocity
@@ -46,16 +46,14 @@ def propagate_error(
     beta: Array,
     T: float,
 ) -> ErrorMoments:
-    """Return the exact moments of the error over one scan, known gains, known manoeuvre of the target.
+    """Return the exact mean and covariance of an alpha-beta filter's error after one scan with known gains.
 
-    The error of the filter is linear in its initial error, the measurement noise and what the target does
-    beyond straight flight, so its mean and covariance follow without Monte Carlo:
-    ``e(k|k) = (I - K H) (F e + push) - K v``.
+    The error of the filter is linear in its initial error, the measurement noise and the manoeuvre, so its mean and
+    covariance follow without Monte Carlo: ``e(k|k) = (I - K H) (F e + push) - K v``.
 
     Args:
-        moments: of the error after the previous update.
-        push: what the manoeuvre adds to the position in this scan, m (``a T^2 / 2``), and to the velocity, m/s
-            (``a T``).
+        moments: moments of the error after the previous update.
+        push: displacement by the manoeuvre in this scan, m (``a T^2 / 2``), and change of velocity, m/s (``a T``).
         R: variance of the measurement noise, m^2.
         alpha: position gain of this scan.
         beta: velocity gain of this scan.

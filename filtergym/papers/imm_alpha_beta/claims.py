@@ -1,4 +1,4 @@
-"""The paper's claims and what it does not mention, with verdicts, and the tables of the report."""
+"""The paper's claims and open questions with verdicts, and the tables of the report."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ SPAN = f"{SECTION[0]}-{SECTION[1]}"
 
 
 def improvement_verdict(section: Sequence[Quantity], parts: Sequence[Quantity]) -> Verdict:
-    """Return the verdict on "substantially smaller error on the manoeuvre section".
+    """Return the verdict on the claim C1, "substantially smaller error on the manoeuvre section".
 
     Args:
         section: relative change over the whole section, of position and of velocity.
@@ -62,7 +62,7 @@ class Comparison(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on C1 against this comparator."""
+        """Verdict on claim C1 against this comparator."""
         return improvement_verdict(self.section, [*self.turn, *self.recovery])
 
     def __str__(self) -> str:
@@ -74,12 +74,12 @@ class Comparison(NamedTuple):
 
 
 def changes(ours: numpy.ndarray, theirs: numpy.ndarray, window: tuple[int, int] | None) -> Sequence[Quantity]:
-    """``ours / theirs - 1`` of the RMS over a window (None: the peak) of position and velocity."""
+    """Return ``ours / theirs - 1`` of the RMS over a window (None: the peak), for position and velocity."""
     return [quantity(change) for change in (rms(ours, window) / rms(theirs, window) - 1.0).T]
 
 
 def compare_sections(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0) -> Comparison:
-    """Compare the IMM with an adaptive filter on the manoeuvre section, moved by ``later`` scans."""
+    """Return the comparison of the IMM with an adaptive filter on the manoeuvre section, moved by ``later`` scans."""
     windows = (SECTION, WINDOWS["turn"], WINDOWS["recovery"])
     section, turn, recovery = (
         changes(ours, theirs, (first + later, last + later)) for first, last in windows
@@ -88,7 +88,7 @@ def compare_sections(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0)
 
 
 def comparisons(r: Results) -> dict[str, Comparison]:
-    """Every comparison of the IMM with an adaptive filter on the manoeuvre section."""
+    """Return every comparison of the IMM with an adaptive filter on the manoeuvre section, by name."""
     canonical = {name: r.main[name].squares for name in COMPARED_POLICIES}
     experiments: dict[str, Mapping[str, numpy.ndarray]] = {"canonical, 0.3 / 0.7": canonical}
     experiments |= {f"gains {a:g} / {b:g}": curves for (a, b), curves in r.boxed.items()}
@@ -102,7 +102,7 @@ def comparisons(r: Results) -> dict[str, Comparison]:
 
 
 class GridFinding(NamedTuple):
-    """Minimum of an error on the gain grid."""
+    """Minimum of an error on the gain grid, and its place relative to the recommended box."""
 
     minimum: float
     gains: tuple[float, float]
@@ -111,13 +111,13 @@ class GridFinding(NamedTuple):
     near: int
     """Cells within ``NEAR_MINIMUM`` of the smallest."""
     near_inside: int
-    """Those of them in the box."""
+    """Cells within ``NEAR_MINIMUM`` of the smallest that are in the box."""
     inside_excess: Quantity
     """Smallest error in the box over the smallest anywhere, minus one."""
 
 
-def inside_box() -> numpy.ndarray:
-    """Return the cells of the grid within the recommended gains, ``(6, 8)``."""
+def box_mask() -> numpy.ndarray:
+    """Return a boolean mask ``(6, 8)`` of the grid's cells within the recommended gains."""
     low, high = numpy.array(LOW_GAINS), numpy.array(HIGH_GAINS)
     inside_low = (low >= LOW_BOX[0] - 1e-9) & (low <= LOW_BOX[1] + 1e-9)
     inside_high = (high >= HIGH_BOX[0] - 1e-9) & (high <= HIGH_BOX[1] + 1e-9)
@@ -132,8 +132,8 @@ def grid_errors(grid: numpy.ndarray, window: tuple[int, int] | None) -> numpy.nd
 
 
 def grid_finding(errors: numpy.ndarray) -> GridFinding:
-    """Find the smallest error of a grid ``(1 + resamples, 6, 8)``."""
-    inside = inside_box()
+    """Return the minimum of a grid of errors ``(1 + resamples, 6, 8)``, and its place relative to the box."""
+    inside = box_mask()
     flat = errors.reshape(len(errors), -1)
     best = flat.argmin(axis=1)
     row, column = divmod(int(best[0]), len(HIGH_GAINS))
@@ -149,7 +149,7 @@ def grid_finding(errors: numpy.ndarray) -> GridFinding:
 
 
 def findings(r: Results, likelihood: Likelihood, window: tuple[int, int] | None) -> list[GridFinding]:
-    """Return the best gains for position and for velocity."""
+    """Return the minima on the gain grid, for position and for velocity."""
     return [grid_finding(errors) for errors in grid_errors(r.grids[likelihood], window)]
 
 
@@ -175,15 +175,15 @@ def dominance_verdict(straight: Sequence[Quantity], turn: Quantity) -> Verdict:
     return verdict_of([mean.low > 0.5 for mean in straight] + [turn.high < 0.5])
 
 
-def ramps_begun(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
-    """Return the scans at which the adaptive filter began a ramp after the first one, ``(episodes, K)`` booleans."""
+def ramp_starts(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
+    """Return a boolean mask ``(episodes, K)`` of scans at which the adaptive filter began another ramp of its gain."""
     alarms = numpy.abs(alpha - high) < 1e-9
     alarms[:, 0] = False
     return alarms
 
 
 def pair(squares: numpy.ndarray, window: tuple[int, int] | None) -> list[str]:
-    """Return the position and velocity RMS of a window, or their peaks: ``135.68 ± 0.31``, ``27.123 ± 0.021``."""
+    """Return position and velocity RMS of a window (None: peaks) as texts, such as ``135.68 ± 0.31``."""
     position, velocity = map(quantity, rms(squares, window).T)
     return [f"{position:.2f}", f"{velocity:.3f}"]
 
@@ -207,11 +207,11 @@ AGAINST = (
         for a, b in BOX_PAIRS
     ),
 )
-"""Opponents of C1: what is added to its name and to the statement, and the name of the comparison."""
+"""Comparators of claim C1: additions to its key and to its statement, and the name of the comparison."""
 
 
 def _verdict_against(i: int, quantities: Any) -> Verdict:
-    """Return the verdict on C1 against one of those opponents."""
+    """Return the verdict on claim C1 against comparator ``i`` of ``AGAINST``."""
     comparison: Comparison = quantities.against[i]
     return comparison.verdict
 
@@ -295,11 +295,11 @@ CLAIMS = (
         "the rule of C1 for every row of the table of comparisons",
     ),
 )
-"""The paper's claims, and what it does not mention."""
+"""The paper's claims, and questions that it leaves open."""
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities of the claims."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     comparison = comparisons(r)
     imm, adaptive = r.main["imm"].squares, r.main["adaptive"].squares
     best = findings(r, "gains used", WINDOWS["all"])
@@ -307,7 +307,7 @@ def quantities(r: Results) -> dict[str, Any]:
     windows = {name: slice(first - 1, last) for name, (first, last) in WINDOWS.items()}
     before, turn, after = (mean(probability[:, windows[w]].mean(axis=1)) for w in ("pre", "turn", "post"))
     begins = SECTION[0]
-    alarms = ramps_begun(r.main["adaptive"].alpha, 0.7)
+    alarms = ramp_starts(r.main["adaptive"].alpha, 0.7)
     row, column = LOW_GAINS.index(0.3), HIGH_GAINS.index(0.7)
     return {
         "r": r,
@@ -349,9 +349,7 @@ def _grid_text(found: Sequence[GridFinding]) -> str:
 
 
 def _handover(mean: numpy.ndarray) -> str:
-    """Return the scans at which the mean probability of mode 1, ``(K,)``, falls below one half in the turn, and
-    comes back.
-    """
+    """Return a clause with the scans at which the mean probability of mode 1, ``(K,)``, crosses one half."""
     first = WINDOWS["turn"][0]
     scans = numpy.arange(1, len(mean) + 1)
     below = scans[(scans >= first) & (mean < 0.5)]
@@ -367,7 +365,7 @@ def _handover(mean: numpy.ndarray) -> str:
 
 
 def _straight(imm: numpy.ndarray, adaptive: numpy.ndarray) -> str:
-    """Return the RMS on both straight legs, IMM against adaptive filter."""
+    """Return a text with the RMS on both straight legs, IMM against adaptive filter."""
     straight = []
     for window in (WINDOWS["pre"], WINDOWS["post"]):
         rows = zip(pair(imm, window), pair(adaptive, window), changes(imm, adaptive, window), strict=True)
@@ -380,14 +378,14 @@ def _straight(imm: numpy.ndarray, adaptive: numpy.ndarray) -> str:
 
 
 def _detection_shares(alarms: numpy.ndarray, begins: int) -> str:
-    """Return the share of episodes by the scan of their first alarm, of those without one before the turn begins."""
+    """Return a text with the share of episodes by the scan of detection, without those with an earlier alarm."""
     later = alarms[:, begins - 1 :][~alarms[:, : begins - 1].any(axis=1)]
     detected = numpy.where(later.any(axis=1), later.argmax(axis=1) + begins, 0)
     return ", ".join(f"{k}: {(detected == k).mean():.3f}" for k in range(begins, begins + 4))
 
 
 def _readings(r: Results) -> str:
-    """Return the verdict on C2 and the best gains under the other readings of the covariance."""
+    """Return a text with the verdict on C2 and the best gains under the other readings of the covariance."""
     return "; ".join(
         f"{LIKELIHOODS[kind]}: {box_verdict(found)} (position minimum at {found[0].gains[0]:g} / "
         f"{found[0].gains[1]:g}, box {found[0].inside_excess:+.1%} above it; velocity at {found[1].gains[0]:g} / "
@@ -398,7 +396,7 @@ def _readings(r: Results) -> str:
 
 
 def _others(comparison: Mapping[str, Comparison]) -> str:
-    """Return the experiments by their verdict on C1, against each adaptive filter."""
+    """Return a text that groups the experiments by their verdict on claim C1, for each adaptive filter."""
     others: dict[tuple[str, Verdict], list[str]] = {}
     for name, change in comparison.items():
         experiment, _, opponent = name.partition("; against ")

@@ -64,34 +64,32 @@ STEPS = (
 
 
 def mean_squares(error: numpy.ndarray) -> numpy.ndarray:
-    """Mean square along x in each scan of errors ``(episodes, K, 4)``: m^2, (m/s)^2, ``(1 + resamples, K, 2)``."""
+    """Return mean squares along x in each scan, ``(1 + resamples, K, 2)``, of errors ``(episodes, K, 4)``."""
     return means(error[:, :, ::2] ** 2)
 
 
 def rms(squares: numpy.ndarray, window: tuple[int, int] | None) -> numpy.ndarray:
-    """Return the root of the mean over a window of scans, both ends included, of squares ``(..., K, 2)``; None:
-    peak.
-    """
+    """Return the RMS over a window of scans, ends included (None: the peak), of squares ``(..., K, 2)``."""
     if window is None:
         return numpy.sqrt(squares.max(axis=-2))
     return numpy.sqrt(squares[..., window[0] - 1 : window[1], :].mean(axis=-2))
 
 
 class Run(NamedTuple):
-    """One policy, reference or bound over all episodes."""
+    """Errors of one policy, reference or bound over all episodes."""
 
     squares: numpy.ndarray
-    """``(1 + resamples, K, 2)``, or ``(1, K, 2)`` where they are exact."""
+    """Mean squares, ``(1 + resamples, K, 2)``, or ``(1, K, 2)`` where they are exact."""
     probability: numpy.ndarray
-    """Of mode 1, ``(episodes, K)``; empty without modes."""
+    """Probability of mode 1, ``(episodes, K)``; empty without modes."""
     alpha: numpy.ndarray
     """Gain used, ``(episodes, K)``; empty where there is none."""
     first: numpy.ndarray
     """Estimate minus truth in the first episode, ``(K, 4)``."""
 
 
-def flown(name: str, episodes: int, **keywords: Any) -> Run:
-    """Run a policy, reference or bound of the environment over the paper's flight; one unit of work."""
+def fly(name: str, episodes: int, **keywords: Any) -> Run:
+    """Run a policy, reference or bound over the paper's flight; return its errors. One unit of work."""
     one = evaluate_policy(ManeuveringTarget.id, name, "paper", episodes, seed=SEED, **keywords)
     nothing = numpy.empty((0, 0))
     if "mean_square" in one:
@@ -103,7 +101,7 @@ def flown(name: str, episodes: int, **keywords: Any) -> Run:
 
 
 def record_measurements(episodes: int, seed: int, scenario: str = "paper", **keywords: Any) -> Recording:
-    """Record the measurements of test episodes of ManeuveringTarget.
+    """Return measurements and truth of test episodes of ManeuveringTarget.
 
     Args:
         episodes: N; the same episodes that ``evaluate`` runs.
@@ -132,23 +130,23 @@ def record_measurements(episodes: int, seed: int, scenario: str = "paper", **key
 
 
 def variant(recording: Recording, reading: Reading) -> numpy.ndarray:
-    """Mean squares of a plain filter."""
+    """Return the mean squares of an IMM in one reading of the paper, ``(1 + resamples, K, 2)``."""
     return mean_squares(numpy.moveaxis(interacting_multiple_model(recording, reading), -1, 0))
 
 
 def grid_row(recording: Recording, likelihood: Likelihood, low: float) -> list[numpy.ndarray]:
-    """Mean squares of a lower gain with every higher one, each ``(1 + resamples, K, 2)``; a unit of work."""
+    """Return mean squares of one lower gain with every higher one, each ``(1 + resamples, K, 2)``."""
     readings = [Reading(gains=(low, high), likelihood=likelihood) for high in HIGH_GAINS]
     return [variant(recording, reading) for reading in readings]
 
 
 def squares_of(name: str, episodes: int, **keywords: Any) -> numpy.ndarray:
-    """Mean squares of a policy, ``(1 + resamples, K, 2)``; a unit of work."""
-    return flown(name, episodes, **keywords).squares
+    """Return the mean squares of a policy over the paper's flight, ``(1 + resamples, K, 2)``. One unit of work."""
+    return fly(name, episodes, **keywords).squares
 
 
 class Results(NamedTuple):
-    """Everything that claims, tables and figures are made of."""
+    """Results of all experiments, from which claims, tables and figures are made."""
 
     episodes: int
     grid_episodes: int
@@ -156,7 +154,7 @@ class Results(NamedTuple):
     exact: Mapping[str, numpy.ndarray]
     """Mean squares of one filter, ``(1, K, 2)``."""
     forced: Mapping[int, numpy.ndarray]
-    """The same of the adaptive filter with the manoeuvre detected at a given scan."""
+    """Mean squares of the adaptive filter, by the scan at which the manoeuvre is detected."""
     boxed: Mapping[tuple[float, float], Mapping[str, numpy.ndarray]]
     """Mean squares of IMM and comparators with other gains."""
     polar: Mapping[str, numpy.ndarray]
@@ -170,7 +168,7 @@ class Results(NamedTuple):
 
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
-    """Run all experiments; ``STEPS`` units of work."""
+    """Run all experiments of the paper, and return their results; ``STEPS`` units of work."""
     parameters: Any = make_task(ManeuveringTarget, "paper").parameters
     flight, scans, (low, high) = maneuver_flight(parameters), parameters.horizon, parameters.gains
 
@@ -189,7 +187,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
     results = Results(
         episodes,
         grid_episodes,
-        main={name: later(flown, name, episodes) for name in NAMES},
+        main={name: later(fly, name, episodes) for name in NAMES},
         exact=exact | {"best gain schedule, flight known": exactly(schedule)},
         forced={k: exactly(ramp_schedule(low, high, scans, k)) for k in range(first, last + 1)},
         boxed={gains: rivals(gains=gains) for gains in BOX_PAIRS},

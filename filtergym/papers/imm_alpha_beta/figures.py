@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ...evaluation.figures.looks import styles
-from ..panels import draw, finish, legend_outside, looks, panels, shade
+from ..panels import draw, finish, legend_outside, line_styles, panels, shade
 from ..quantities import means
 from .claims import HIGH_BOX, LOW_BOX, NEAR_MINIMUM, grid_errors
 from .experiment import COMPARED_POLICIES, COMPONENTS, HIGH_GAINS, LOW_GAINS, NAMES, WINDOWS, Results
@@ -14,7 +14,7 @@ from .gain_schedules import ramp_schedule
 
 
 def figures(r: Results) -> dict[str, tuple[Any, str]]:
-    """Return the figures and their captions."""
+    """Return each figure and its caption, by file name without suffix."""
     return {
         "figure_2_trajectory": (
             draw_trajectory(r), "Figure 2: the flight; one episode's measurements and estimate."
@@ -42,11 +42,11 @@ def _shade_turn(axis: Any) -> None:
 
 
 def draw_trajectory(r: Results) -> Any:
-    """Figure 2: the flight, with the measurements and the estimate of one episode."""
+    """Draw figure 2: the flight, with the measurements and the estimate of one episode."""
     figure, grid = panels(1, 2, (10.0, 4.6))
     truth, seen = r.recording.truth[:, :2, 0] / 1e3, r.recording.measurement[:, :, 0] / 1e3
     estimate = truth + r.main["imm"].first[:, :2] / 1e3
-    style = looks(["true", "estimate", "measured"])
+    style = line_styles(["true", "estimate", "measured"])
     first, last = WINDOWS["turn"]
     for axis in grid[0]:
         axis.plot(*truth.T, label="true flight", **style["true"])
@@ -64,7 +64,7 @@ def draw_trajectory(r: Results) -> Any:
 
 
 def draw_gain(r: Results) -> Any:
-    """Figure 3: gain of the adaptive filter, as the paper draws it and as its detector sets it."""
+    """Draw figure 3: gain of the adaptive filter, as the paper draws it and as its detector sets it."""
     figure, grid = panels(1, 1, (8.0, 3.8))
     axis, detection = grid[0, 0], WINDOWS["turn"][0] + 2
     scans = numpy.arange(1, len(r.schedule) + 1)
@@ -76,7 +76,7 @@ def draw_gain(r: Results) -> Any:
         "best schedule, flight known": r.schedule[None],
     }
     _shade_turn(axis)
-    for width, (name, style) in zip((2.4, 1.6, 1.6, 1.6), looks(curves).items(), strict=True):
+    for width, (name, style) in zip((2.4, 1.6, 1.6, 1.6), line_styles(curves).items(), strict=True):
         draw(axis, scans, curves[name], label=name, **(style | {"linewidth": width}))
     axis.set_ylim(0.0, 1.0)
     finish(axis, "scan k", "position gain alpha")
@@ -85,12 +85,12 @@ def draw_gain(r: Results) -> Any:
 
 
 def draw_errors(r: Results) -> Any:
-    """Figure 4: RMSE of x position and x velocity in each scan."""
+    """Draw figure 4: RMSE of x position and x velocity in each scan."""
     figure, grid = panels(2, 1, (8.0, 6.4))
     scans = numpy.arange(1, len(r.schedule) + 1)
     for c, (axis, (component, unit)) in enumerate(zip(grid[:, 0], COMPONENTS, strict=True)):
         _shade_turn(axis)
-        for name, style in looks((*COMPARED_POLICIES, "known-turn")).items():
+        for name, style in line_styles((*COMPARED_POLICIES, "known-turn")).items():
             draw(axis, scans, numpy.sqrt(r.main[name].squares[:, :, c]), label=NAMES[name], **style)
         axis.set_ylim(bottom=0.0)
         finish(
@@ -100,7 +100,7 @@ def draw_errors(r: Results) -> Any:
 
 
 def draw_probabilities(r: Results) -> Any:
-    """Figure 5: mode probabilities of the IMM."""
+    """Draw figure 5: mode probabilities of the IMM."""
     figure, grid = panels(2, 1, (8.0, 5.2))
     probability = r.main["imm"].probability
     scans = numpy.arange(1, probability.shape[1] + 1)
@@ -118,7 +118,7 @@ def draw_probabilities(r: Results) -> Any:
 
 
 def draw_gain_grid(r: Results) -> Any:
-    """Return the whole-run RMS of every pair of gains, with the recommended box and the cells close to the minimum."""
+    """Draw the whole-run RMS of every pair of gains, with the recommended box and the cells close to the minimum."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Rectangle
 

@@ -1,4 +1,4 @@
-"""Exact errors of one alpha-beta filter whose gains follow a schedule fixed beforehand.
+"""Exact errors of an alpha-beta filter whose gains follow a fixed schedule.
 
 With gains that do not depend on the data the error is linear in the noise, so its mean square follows
 without Monte Carlo from :func:`.alpha_beta_errors.propagate_error`: for constant gains, for the
@@ -16,20 +16,20 @@ from .alpha_beta_errors import ErrorMoments, propagate_error
 
 
 class Flight(NamedTuple):
-    """The x coordinate of one flight: what the filter must follow, and through which noise."""
+    """The x coordinate of one flight: its manoeuvre, and the variance of its measurements."""
 
     displacement: numpy.ndarray
-    """What the manoeuvre adds to the position in each scan, m, ``(K,)``."""
+    """Displacement by the manoeuvre in each scan, m, ``(K,)``."""
     increment: numpy.ndarray
-    """What it adds to the velocity, m/s, ``(K,)``."""
+    """Change of velocity in each scan, m/s, ``(K,)``."""
     variance: numpy.ndarray
     """Variance of the measurement at the true position, from the start on, m^2, ``(K + 1,)``."""
     interval: float
-    """T, s."""
+    """Sampling interval T, s."""
 
 
 def maneuver_flight(parameters: ManeuveringTargetParameters) -> Flight:
-    """Return the X coordinate of a flight with one manoeuvre at stated scans (the paper's), K scans long."""
+    """Return the x coordinate of the paper's flight: K scans with one manoeuvre at fixed scans."""
     p, T = parameters, parameters.sampling_interval
     first, last = p.maneuver_steps
     scans = numpy.arange(1, p.horizon + 1)
@@ -49,16 +49,16 @@ class MeanSquares(NamedTuple):
     """Mean square of the error in each scan."""
 
     position: numpy.ndarray
-    """m^2, ``(K, ...)``."""
+    """Mean square of the position error, m^2, ``(K, ...)``."""
     velocity: numpy.ndarray
-    """(m/s)^2, ``(K, ...)``."""
+    """Mean square of the velocity error, (m/s)^2, ``(K, ...)``."""
 
 
 def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:
-    """Return the exact mean square of the error under a schedule of gains, beta by equation (21).
+    """Return the exact mean square error of an alpha-beta filter under a schedule of gains; beta by (21).
 
     Args:
-        flight: what is followed; the track starts with the errors of (24).
+        flight: flight to track; the track starts with the errors of (24).
         alpha: position gain of each scan, ``(K, ...)``; trailing axes are schedules side by side.
     """
     T, nothing = flight.interval, 0.0 * alpha[0]
@@ -87,7 +87,7 @@ def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:
 def ramp_schedule(
     low: float, high: float, horizon: int, detection: int | None = None, ramp_scans: int = 7
 ) -> numpy.ndarray:
-    """Return the position gains of the paper's adaptive filter when a manoeuvre is detected at a given scan, ``(K,)``.
+    """Return the position gains ``(K,)`` of the paper's adaptive filter that detects a manoeuvre at ``detection``.
 
     The gain falls linearly from ``high`` at scan 1 to ``low`` at scan 1 + ``ramp_scans``; at the detection it
     jumps to ``high`` and falls again.
@@ -100,10 +100,9 @@ def ramp_schedule(
 
 
 def best_schedule(flight: Flight) -> numpy.ndarray:
-    """Return the position gains of least summed mean-square position error: a floor for schedules, ``(K,)``.
+    """Return the position gains ``(K,)`` with the smallest sum of mean-square position errors over a flight.
 
-    It is given the whole flight, so no causal policy should be expected to reach it; one that reacts to the
-    data may do better all the same.
+    The optimisation uses the whole flight, which no causal policy knows; a policy that reacts to data may be better.
     """
     from scipy.optimize import minimize
 

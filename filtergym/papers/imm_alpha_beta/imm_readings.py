@@ -1,4 +1,4 @@
-"""The IMM over alpha-beta filters as a plain filter, in every reading of the paper that is worth comparing.
+"""The IMM over alpha-beta filters without the environment, in several readings of the paper.
 
 The paper leaves open which covariance stands in the likelihood (11) of filters with fixed gains, and whether
 one mode variable serves both axes. The environment has the canonical reading only (the covariance that
@@ -17,20 +17,20 @@ from .alpha_beta_errors import variance_reduction
 
 
 class Recording(NamedTuple):
-    """Measurements of a radar and truth of N episodes of K scans."""
+    """Radar measurements and truth of N episodes of K scans."""
 
     start: numpy.ndarray
     """Estimate at scan 0: x, y (m), vx, vy (m/s), ``(4, N)``."""
     start_variance: numpy.ndarray
     """Variance of its position, m^2, ``(2, N)``; that of the velocity is 2 / T^2 times this."""
     measurement: numpy.ndarray
-    """m, ``(K, 2, N)``."""
+    """Measured position, m, ``(K, 2, N)``."""
     variance: numpy.ndarray
     """Variance evaluated at the measured position, m^2, ``(K, 2, N)``."""
     truth: numpy.ndarray
     """x, y, vx, vy, ``(K, 4, N)``."""
     interval: float
-    """T, s."""
+    """Sampling interval T, s."""
 
 
 Likelihood = Literal["gains used", "no spread", "Kalman", "R/(1-alpha)", "steady"]
@@ -59,7 +59,7 @@ def _diagonal(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def _kalman_covariance(P: numpy.ndarray, R: numpy.ndarray) -> numpy.ndarray:
-    """Return the covariance ``(2 d, 2 d, M, N)`` after an update with the optimal gain; R is ``(d, N)``."""
+    """Return the covariance ``(2 d, 2 d, M, N)`` after a Kalman update of a position with variances R ``(d, N)``."""
     n, modes, lanes = len(P), P.shape[2], P.shape[3]
     repeated = _diagonal(numpy.tile(R, (1, modes)))
     nothing = numpy.zeros((n, modes * lanes))
@@ -69,7 +69,7 @@ def _kalman_covariance(P: numpy.ndarray, R: numpy.ndarray) -> numpy.ndarray:
 
 
 def interacting_multiple_model(recording: Recording, reading: Reading) -> numpy.ndarray:
-    """Run a reading over recorded measurements.
+    """Run the IMM in one reading of the paper over recorded measurements, and return its errors.
 
     Returns:
         Estimate minus truth: x, y (m), vx, vy (m/s), ``(K, 4, N)``.

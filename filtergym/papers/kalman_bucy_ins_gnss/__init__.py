@@ -9,7 +9,7 @@ as removal (no mean error left).
 """
 
 from ...evaluation.running.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
+from ..reproduction import Progress, Reproduction, episode_count, judge_claims, reproduction_command
 from . import claims, experiment, figures
 
 TITLE = "Kalman-Bucy filters in orientation and navigation complexes: what they follow, and INS/GNSS fusion"
@@ -19,7 +19,7 @@ STEPS = experiment.STEPS
 def reproduce(
     progress: Progress, episodes: int | None = None, workers: Workers | None = None
 ) -> Reproduction:
-    """Run the examples and judge the claims."""
+    """Run the paper's examples, judge its claims, and return claims, tables and figures."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
-    return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))
+    return Reproduction(TITLE, *shown, command=reproduction_command(__name__, episodes))

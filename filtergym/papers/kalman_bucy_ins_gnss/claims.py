@@ -1,4 +1,4 @@
-"""The paper's claims and what it does not mention, with verdicts, and the tables of the report."""
+"""The paper's claims and open questions with verdicts, and the tables of the report."""
 
 import math
 from typing import Any
@@ -26,7 +26,7 @@ DIFFERENCES = {
 
 
 def roots(r: Results) -> tuple[dict[str, Quantity], dict[str, Quantity]]:
-    """Root mean squares of examples (a) and (b)."""
+    """Return the root mean square errors of examples (a) and (b), by name."""
     a = {name: quantity(numpy.sqrt(means(r.example.squares[name]))) for name in DIFFERENCES}
     return a, {name: quantity(numpy.sqrt(squares)) for name, squares in r.squares.items()}
 
@@ -82,7 +82,7 @@ CLAIMS = (
         "Which gain? The paper gives (4), (5) and no numbers.",
         "white part only, K = {gains[white]:.2f} 1/s: {b[plain-white]:.4f} m; coloured part reduced to white, K = "
         "{gains[reduced]:.2f}: {b[plain-reduced]:.4f} m; best constant, K = {gains[best]:.2f}: "
-        "{b[best-constant]:.4f} m. The plain scheme's own covariance knows of no drift",
+        "{b[best-constant]:.4f} m. The plain scheme's own covariance does not contain the drift",
         METHOD,
     ),
     Statement(
@@ -107,16 +107,16 @@ CLAIMS = (
         "condition on the algebraic Riccati equation",
     ),
 )
-"""The paper's claims, and what it does not mention."""
+"""The paper's claims, and questions that it leaves open."""
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities of the claims."""
+    """Return the measured quantities in the texts and verdicts of the claims, by name."""
     a, b = roots(r)
     p, gains = PARAMETERS, dict(zip(("white", "reduced", "best"), GAINS.values(), strict=True))
 
     def change(name: str, other: str) -> Quantity:
-        """Return the relative change of the root mean square error, paired."""
+        """Return the relative change of a root mean square error to another's, paired."""
         return quantity(numpy.sqrt(r.squares[name] / r.squares[other]) - 1.0)
 
     return {
@@ -141,7 +141,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     a, b = roots(r)
     theory, exact, agreement = r.example.theory, exact_root_mean_squares(), riccati_agreement()
     return [

@@ -25,7 +25,7 @@ LATE = slice(249, 500)
 
 # Example (a); all ours.
 A, U, INTENSITY, RECEIVER = -0.5, 1.0, 1.0, 0.01
-"""1/s, unit/s, unit^2/s, unit^2 s."""
+"""Constants of example (a): A, 1/s; U, unit/s; intensities of process, unit^2/s, and measurement, unit^2 s."""
 STEP, STEPS_A = 0.005, 1000
 
 NAMES = {
@@ -63,7 +63,7 @@ GAINS = {
 
 
 class FirstOrder(NamedTuple):
-    """Runs of example (a)."""
+    """Results of the runs of example (a)."""
 
     time: numpy.ndarray
     path: Mapping[str, numpy.ndarray]
@@ -75,7 +75,7 @@ class FirstOrder(NamedTuple):
 
 
 def first_order(runs: int) -> FirstOrder:
-    """Simulate process, measurement and filter of example (a)."""
+    """Simulate process, measurement and filter of example (a), and return paths and late mean squares."""
     rng = numpy.random.default_rng(SEED)
     phi, qd = (float(x[0, 0]) for x in van_loan(A, INTENSITY, STEP))
     push = U * (phi - 1.0) / A
@@ -112,7 +112,7 @@ def first_order(runs: int) -> FirstOrder:
 
 
 def example_run(name: str) -> dict[str, numpy.ndarray]:
-    """Fly one episode with the drift ``DRIFT``: reference, INS, measurement and estimate, m, ``(500,)``."""
+    """Run a policy over one episode with the drift ``DRIFT``; return its curves, m, ``(500,)``, by name."""
     maker = problem_of(LooselyCoupledNavigation.id).competitor(name)
     model = make_model(LooselyCoupledNavigation, maker.control, "paper", fixed_drift=DRIFT)
 
@@ -126,13 +126,13 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
 
 
 def _model() -> tuple[Any, Any, Any, Any, Any]:
-    """Return A, Q, C, R and the covariance at the start of the augmented model."""
+    """Return A, Q, C, R and the initial covariance of the augmented model."""
     dynamics, growth, start = ins_gnss.error_model(*LEVELS)
     return dynamics, growth, [[1.0, 0.0, 0.0]], [[PARAMETERS.receiver_intensity]], start
 
 
 def exact_plain(intensity: float, riccati: bool) -> float:
-    """Return the exact root mean square error from 2.5 to 5 s of the plain scheme, m."""
+    """Return the exact root mean square error of the plain scheme from 2.5 to 5 s, m."""
     p = PARAMETERS
     dynamics, growth, _, _, P = _model()
     Phi, Qd = van_loan(dynamics, growth, p.sampling_interval)
@@ -190,16 +190,16 @@ class Agreement(NamedTuple):
     order: float
     """Order at which the sampled filter approaches (5), from halving the step."""
     refusal: str
-    """What asking for the steady augmented filter answers."""
+    """Error message for the steady augmented filter, which does not exist."""
 
 
 def closed_form(times: Any) -> numpy.ndarray:
-    """Return the covariance (5) of example (a)."""
+    """Return the Riccati covariance (5) of example (a) at given times, in closed form."""
     return kalman_bucy.riccati_scalar(A, INTENSITY, 1.0 / RECEIVER, 0.0, times)
 
 
 def riccati_agreement() -> Agreement:
-    """Solve (5) three ways."""
+    """Solve the Riccati equation (5) in three ways, and return the largest differences between the solutions."""
     times = numpy.linspace(0.01, 5.0, 50)
     solvers = (kalman_bucy.riccati_hamiltonian, kalman_bucy.riccati_ode)
     scalar = [solve(A, INTENSITY, 1.0, RECEIVER, 0.0, times)[:, 0, 0] for solve in solvers]
@@ -223,7 +223,7 @@ def riccati_agreement() -> Agreement:
 
 
 class Results(NamedTuple):
-    """Everything that claims, tables and figures are made of."""
+    """Results of all experiments, from which claims, tables and figures are made."""
 
     episodes: int
     drifting_episodes: int
@@ -237,7 +237,7 @@ class Results(NamedTuple):
 
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
-    """Run all experiments; ``STEPS`` units of work."""
+    """Run all experiments of the paper, and return their results; ``STEPS`` units of work."""
     drifting = max(8, episodes // 4)
     results = Results(
         episodes,

@@ -15,11 +15,11 @@ Reading: (3) is printed without U, which would bias the estimate by ``-U / (K - 
 Reading: (4) is damaged; ``Q^-1`` is the only exponent that makes (5) the Riccati equation.
 Reading: the paper refers to an equation (7) that does not exist; (6) is meant.
 
-Where (5) settles is computed by :func:`~filtergym.filters.linear_systems.steady_kalman_bucy`. A random
+:func:`~filtergym.filters.linear_systems.steady_kalman_bucy` computes the steady state of (5). A random
 constant has no steady filter: its variance falls for ever, like 1/t, and its gain goes to zero; use the
 time-varying (5).
 
-Everything here is design, computed once for one model: plain NumPy and SciPy, no batch axis.
+These functions use NumPy and SciPy for one model, without a batch axis.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ from ...filters.linear_systems import Matrix, intensity_matrix, square_matrix, v
 
 
 def _times(times: ArrayLike) -> Matrix:
-    """Check instants: none before zero, in ascending order."""
+    """Return times as an array; raise ValueError unless they ascend from zero or later."""
     array = numpy.atleast_1d(numpy.asarray(times, float))
     if (
         array.ndim != 1
@@ -165,9 +165,9 @@ class Moments(NamedTuple):
     """Mean and covariance of the random process at given instants."""
 
     mean: Matrix
-    """``(k, n)``."""
+    """Mean at each instant, ``(k, n)``."""
     covariance: Matrix
-    """``(k, n, n)``."""
+    """Covariance at each instant, ``(k, n, n)``."""
 
 
 def moments(
@@ -209,11 +209,11 @@ class SampledCovariance(NamedTuple):
     """Error covariances of a sampled filter, measurement by measurement."""
 
     predicted: Matrix
-    """Before each measurement, ``(steps, n, n)``."""
+    """Covariance before each measurement, ``(steps, n, n)``."""
     updated: Matrix
-    """After each measurement, ``(steps, n, n)``."""
+    """Covariance after each measurement, ``(steps, n, n)``."""
     gain: Matrix
-    """Of each measurement, ``(steps, n, m)``; the counterpart of ``K step``."""
+    """Gain of each measurement, ``(steps, n, m)``; the counterpart of ``K step``."""
 
 
 def sampled_covariance(
@@ -226,7 +226,7 @@ def sampled_covariance(
     duration: float,
     gain: ArrayLike | None = None,
 ) -> SampledCovariance:
-    """Return the error covariance of the filter that samples every ``step`` seconds, exact.
+    """Return the exact error covariances of the filter that samples every ``step`` seconds.
 
     The measurement of one step has the variance ``Q / step``. The optimal sampled filter agrees with (5) at
     first order only, ``updated = R (1 - K step / 2)`` and ``predicted = R (1 + K step / 2)`` (scalar C = 1);

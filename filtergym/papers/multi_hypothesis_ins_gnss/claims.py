@@ -1,4 +1,4 @@
-"""The paper's claims and what it does not mention, with verdicts, and the tables of the report."""
+"""The paper's claims and open questions with verdicts, and the tables of the report."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -71,7 +71,7 @@ def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verd
 
 
 def in_band(found: Loss) -> bool:
-    """Return whether the tracks are lost in the paper's time."""
+    """Return whether the median loss time is within the paper's."""
     return found.rate > 0.95 and BAND[0] <= found.median <= BAND[1]
 
 
@@ -169,11 +169,11 @@ CLAIMS = (
         "increment, {runs} and {few} runs",
     ),
 )
-"""The paper's claims, and what it is silent about."""
+"""The paper's claims, and questions that it leaves open."""
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities of the claims."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     increment, kinematic = r.courses.values()
     adaptive, free, best = (increment[name] for name in (ADAPTIVE, "Singer, no aperture", "known mode"))
     few = len(free.nis)
@@ -232,7 +232,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     header = [
         "filter",
         "leg",

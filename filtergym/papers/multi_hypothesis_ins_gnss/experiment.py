@@ -84,24 +84,25 @@ PARTS = (
 
 
 class Run(NamedTuple):
-    """One filter over E runs of K steps."""
+    """Results of one filter over E runs of K steps."""
 
     squares: numpy.ndarray
     """Squared spherical errors of position, velocity, acceleration, attitude, and squared errors of clock
-    bias and drift, ``(E, K, 6)``."""
+    bias and drift, ``(E, K, 6)``.
+    """
     variance: numpy.ndarray
-    """Of the position, as reported, ``(E, K)``, m^2."""
+    """Reported variance of the position, ``(E, K)``, m^2."""
     probability: numpy.ndarray
-    """``(E, K, 3)``."""
+    """Probability of each hypothesis, ``(E, K, 3)``."""
     true_mode: numpy.ndarray
-    """``(E, K)``."""
+    """Index of the true hypothesis, ``(E, K)``."""
     outside: numpy.ndarray
     """Whether a rate is outside its aperture, ``(E, K)``."""
     nis: numpy.ndarray
-    """Over its degrees of freedom, ``(E, K)``."""
+    """Normalised innovation squared over its degrees of freedom, ``(E, K)``."""
 
     def some(self, first: int, end: int) -> "Run":
-        """Return some of the runs."""
+        """Return the results of the runs ``first`` to ``end``."""
         return Run(*(series[first:end] for series in self))
 
     def rms(self, component: int, window: tuple[int, int]) -> numpy.ndarray:
@@ -115,7 +116,7 @@ class Run(NamedTuple):
 
 
 def ratio(ours: Run, theirs: Run, component: int, window: tuple[int, int]) -> Quantity:
-    """Return the ratio of RMS errors, paired."""
+    """Return the ratio of RMS errors of two filters, paired over the runs."""
     return quantity(ours.rms(component, window) / theirs.rms(component, window))
 
 
@@ -134,7 +135,7 @@ class _SideBySide(Policy):
         self.weights = numpy.array([numpy.eye(len(HYPOTHESES))[lane or 0] for lane in lanes])
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """State posterior probabilities, or certainty."""
+        """Return posterior probabilities in adaptive lanes, and probability one in lanes of a single hypothesis."""
         posterior = imm.mode_posterior(
             self.log_predicted(observation).T, self.log_likelihood(observation).T
         ).T
@@ -143,10 +144,10 @@ class _SideBySide(Policy):
 
 
 def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict[str, Run]:
-    """Run several filters side by side on the same noise.
+    """Run several filters over the same noise, and return their results by name.
 
     Args:
-        scenario: of the environment.
+        scenario: scenario of the environment.
         filters: names of ``FILTERS``, or "known mode", which runs alone, and how many runs each has.
         **keywords: parameters of the task.
     """
@@ -157,7 +158,7 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
     def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
         squares, records, P = model.error(episode) ** 2, model.records(episode), model.covariance(episode)
         if model.filter.knows:
-            # The reference believes the truth; nothing but apertures takes a rate away here.
+            # The reference uses the true hypothesis; nothing but apertures takes a rate away here.
             available = episode.measurement.available
             records["mode_probability"] = numpy.eye(len(HYPOTHESES))[records["true_mode"]].T
             records["rate_outside_aperture"] = 1.0 - available[task.sensors[1].readings].min(axis=0)
@@ -180,19 +181,19 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
 
 
 class Results(NamedTuple):
-    """Everything that claims, tables and figures are made of."""
+    """Results of all experiments, from which claims, tables and figures are made."""
 
     courses: dict[str, dict[str, Run]]
     """Adaptive and Singer's filter on both courses; on ``increment`` "Singer, no aperture" and "known mode" too."""
     matched: dict[str, dict[str, Run]]
     waits: dict[str, Run]
     short: dict[str, dict[str, Run]]
-    """By filter and course; leg 1 is short."""
+    """Runs with a short leg 1, by filter and course."""
     settings: dict[str, Run]
 
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
-    """Run all experiments; ``STEPS`` units of work."""
+    """Run all experiments of the paper, and return their results; ``STEPS`` units of work."""
     share = min(1.0, episodes / EPISODES)
     few, scatter = (max(2, math.ceil(share * count)) for count in (FEW, SCATTER))
 
@@ -252,11 +253,11 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
 
 
 class Loss(NamedTuple):
-    """Lost tracks: their number, and times."""
+    """Lost tracks: their share, and times from the manoeuvre to the loss."""
 
     rate: float
     median: float
-    """Seconds from the first step of the motion, of the tracks lost; NaN where none is."""
+    """Seconds from the first step of the motion, of the lost tracks; NaN without one."""
     first: float
     last: float
 
@@ -269,7 +270,7 @@ class Loss(NamedTuple):
 
 
 def loss(run: Run, motion: int) -> Loss:
-    """Return the loss of track after the motion that begins on a step."""
+    """Return share and times of lost tracks after the motion that begins on step ``motion``."""
     outside = find_lasting(run.outside[:, motion - 1 :])
     lost = outside.any(axis=1)
     if not lost.any():
@@ -279,13 +280,13 @@ def loss(run: Run, motion: int) -> Loss:
 
 
 class Wait(NamedTuple):
-    """Seconds until a change of motion is believed; NaN where it never is."""
+    """Seconds until the filter has adapted to a change of motion; NaN where it never adapts."""
 
     mean: float
     first: float
     last: float
     never: int
-    """Runs in which it is not."""
+    """Number of runs in which the filter never adapts."""
 
     def __str__(self) -> str:
         if numpy.isnan(self.mean):
@@ -295,7 +296,7 @@ class Wait(NamedTuple):
 
 
 def waits_of(run: Run, before: int, after: int) -> Wait:
-    """Return the adaptation times of one kind of switch."""
+    """Return the adaptation times after switches from hypothesis ``before`` to ``after``."""
     found = switches(run.true_mode, run.probability)
     waits = numpy.array([s.wait * T for s in found if (s.before, s.after) == (before, after)])
     finite = waits[numpy.isfinite(waits)]

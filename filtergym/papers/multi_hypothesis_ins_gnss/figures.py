@@ -6,7 +6,7 @@ import numpy
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.figures.looks import styles
-from ..panels import draw, finish, legend_outside, looks, panels, shade
+from ..panels import draw, finish, legend_outside, line_styles, panels, shade
 from ..quantities import means
 from .claims import BAND, COORDINATE_LOSS, matched_ratios
 from .experiment import ADAPTIVE, COMPONENTS, JUMP, MOTION, SHORTEST_LEG, Results, loss
@@ -16,7 +16,7 @@ LEAST = 0.01
 
 
 def figures(r: Results) -> dict[str, tuple[Any, str]]:
-    """Return the figures and their captions."""
+    """Return each figure and its caption, by file name without suffix."""
     runs, few = (len(r.courses["increment"][name].nis) for name in (ADAPTIVE, "Singer"))
     return {
         "figure_1_errors": (
@@ -42,7 +42,7 @@ def figures(r: Results) -> dict[str, tuple[Any, str]]:
 
 
 def draw_errors(r: Results) -> Any:
-    """Figure 1: spherical errors of coordinates and of velocity against the step."""
+    """Draw figure 1: spherical errors of coordinates and of velocity against the step."""
     figure, grid = panels(2, 2, (11.0, 6.4), sharex=True, sharey="row")
     names = {
         ADAPTIVE: "adaptive",
@@ -68,7 +68,7 @@ def draw_errors(r: Results) -> Any:
 
 
 def draw_probabilities(r: Results) -> Any:
-    """Figure 2: probabilities of the hypotheses against the step, with close-ups of both changes."""
+    """Draw figure 2: probabilities of the hypotheses against the step, with close-ups of both changes."""
     figure, grid = panels(2, 3, (11.0, 5.4), sharey=True, width_ratios=(2.0, 1.0, 1.0))
     spans = {
         "whole run": (1, 3000),
@@ -80,7 +80,7 @@ def draw_probabilities(r: Results) -> Any:
         for column, (axis, (what, (first, last))) in enumerate(zip(grid[row], spans.items(), strict=True)):
             shown = probability[:, first - 1 : last]
             steps = numpy.arange(first, first + shown.shape[1])
-            for i, (name, style) in enumerate(looks(HYPOTHESES).items()):
+            for i, (name, style) in enumerate(line_styles(HYPOTHESES).items()):
                 points = {"marker": "o", "markersize": 3.0} if column else {}
                 label = name.replace("-", " ").replace("singer", "Singer")
                 draw(axis, steps, shown[:, :, i], 0.25, label=label, **style, **points)
@@ -92,7 +92,7 @@ def draw_probabilities(r: Results) -> Any:
 
 
 def draw_loss_times(r: Results) -> Any:
-    """Return the loss time of Singer's filter at every setting, with the band of the paper."""
+    """Draw the loss time of Singer's filter at every setting, with the band of the paper."""
     figure, grid = panels(1, 1, (8.0, 4.6))
     axis = grid[0, 0]
     lost, kept = (style["color"] for style in styles(["lost", "kept"]).values())
@@ -115,7 +115,7 @@ def draw_loss_times(r: Results) -> Any:
 
 
 def draw_matched(r: Results) -> Any:
-    """Return the loss against the matched filter over the mean weight of the other channels."""
+    """Draw the loss against the matched filter over the mean weight of the other channels."""
     figure, grid = panels(1, 1, (8.0, 4.4))
     axis = grid[0, 0]
     names = [name for name, _ in COMPONENTS[:3]]

@@ -12,7 +12,7 @@ are most likely the filters' own; both those and the actual errors are drawn, ea
 """
 
 from ...evaluation.running.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
+from ..reproduction import Progress, Reproduction, episode_count, judge_claims, reproduction_command
 from . import claims, experiment, figures
 
 TITLE = "Adaptive radar and ESM tracking filter with recognition of the target's class"
@@ -22,7 +22,10 @@ STEPS = experiment.STEPS
 def reproduce(
     progress: Progress, episodes: int | None = None, workers: Workers | None = None
 ) -> Reproduction:
-    """Run the paper's experiment and judge its claims; 100 episodes at least, so that every class has some."""
+    """Run the paper's experiment, judge its claims, and return claims, tables and figures.
+
+    There are at least 100 episodes, so that every class has some.
+    """
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES, least=100), workers)
     shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
-    return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))
+    return Reproduction(TITLE, *shown, command=reproduction_command(__name__, episodes))

@@ -1,4 +1,4 @@
-"""The paper's claims and what it does not mention, with verdicts, and the tables of the report."""
+"""The paper's claims and open questions with verdicts, and the tables of the report."""
 
 import math
 from collections.abc import Sequence
@@ -25,25 +25,22 @@ from .experiment import (
 )
 
 CLOSE = 0.01
-"""Within 1 % of the ideal filter counts as having reached it (ours)."""
+"""Relative excess over the ideal filter's error that counts as equal (our choice)."""
 RECOGNITION_PROBABILITY = 0.99
-"""Mean P(true class) after 30 s that counts as recognition within a limited time (ours)."""
+"""Mean P(true class) after 30 s that counts as recognition within a limited time (our choice)."""
 RARE = 0.05
-"""Share of runs that may be sure of a wrong class (ours)."""
+"""Largest share of runs that end with a wrong class (our choice)."""
 TYPES = ("advanced fighter", "fighter", "early warning", "missile")
 SECONDS = (2, 5, 10, 20, 30, 60)
 
 
 def recognition_verdict(at_30: Sequence[Quantity]) -> Verdict:
-    """Return the verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNITION_PROBABILITY`` in all
-    classes, in some, or in none.
-    """
+    """Return the verdict on D1: mean P(true class) at 30 s reaches ``RECOGNITION_PROBABILITY``."""
     return verdict_of(m.low >= RECOGNITION_PROBABILITY for m in at_30)
 
 
 def approach_verdict(excess: Sequence[Sequence[Quantity]]) -> Verdict:
-    """Return the verdict on D2: the error is within ``CLOSE`` of the ideal filter's, late in all classes, or sooner in
-    some.
+    """Return the verdict on D2: the error comes within ``CLOSE`` of the ideal filter's.
 
     Args:
         excess: relative excess of the RMSE of each class, at 10-30 s and after 30 s.
@@ -62,13 +59,13 @@ class Variant(NamedTuple):
     gain: Quantity
     """RMSE of the acceleration at 30-60 s, non-adaptive over adaptive."""
     excess: Quantity
-    """The same, adaptive over ideal, minus one."""
+    """RMSE of the acceleration at 30-60 s, adaptive over ideal, minus one."""
     radar_sure: float
     """Share of runs in which the radar alone ever reaches P >= 0.9 for the true class."""
 
 
 def variant(r: Results, name: str, s: int) -> Variant:
-    """Return the results of a variant for targets of one class."""
+    """Return recognition time and error ratios in a variant of the experiment, for targets of one class."""
     fused, radar = r.variants[name]
     of = fused.true_class == s
     if not of.any():
@@ -169,11 +166,11 @@ CLAIMS = (
         "{r.small} targets of any class for each row of the table of variants",
     ),
 )
-"""The paper's claims and what it does not mention."""
+"""The paper's claims, and questions that it leaves open."""
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities of the claims."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     early, middle, _ = WINDOWS.values()
     printed, joint = r.fixed_type["quasi-optimal"], r.fixed_type["joint-type"]
     fighter = (printed.true_class == 2) & (printed.true_type == 1)
@@ -239,7 +236,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     errors = [
         [
             f"{name} {component}, {unit}",

@@ -67,16 +67,16 @@ def channel_error_covariance(
 
 
 def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
-    """Mean log-likelihood ratio of one decision, nats, ``(M, M)``: row = true class, column = its rival.
+    """Return the mean log-likelihood ratio of one ESM decision, nats, ``(M, M)``: row = true class.
 
-    The Kullback-Leibler divergence of rows of ``decision_probabilities``, which must be positive.
+    It is the Kullback-Leibler divergence of rows of ``decision_probabilities``, which must be positive; column = rival.
     """
     logarithm = numpy.log(probabilities)
     return numpy.sum(probabilities[:, None] * (logarithm[:, None] - logarithm[None]), axis=-1)
 
 
-def leaking(probability: float) -> tuple[tuple[float, ...], ...]:
-    """Return the class transition matrix that leaves each class with a probability, equally for the others."""
+def leaky_transition(probability: float) -> tuple[tuple[float, ...], ...]:
+    """Return the class transition matrix with ``probability`` of leaving a class, equally to each other one."""
     return tuple(
         tuple(1.0 - probability if i == j else probability / 2.0 for j in range(3)) for i in range(3)
     )
@@ -92,14 +92,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "noise on the acceleration only": {"process_noise": "acceleration"},
     "sigma_D = 300 m": {"range_sigma": 300.0},
     "range without Doppler": {"range_rate_sigma": WORTHLESS_RATE},
-    "1 % class leakage, filters mixed": {"class_transition": leaking(0.01)},
-    "5 % class leakage, filters mixed": {"class_transition": leaking(0.05)},
+    "1 % class leakage, filters mixed": {"class_transition": leaky_transition(0.01)},
+    "5 % class leakage, filters mixed": {"class_transition": leaky_transition(0.05)},
 }
 STEPS = 3 * len(CLASSES) + 2 + 2 + 2 * len(VARIANTS)
 
 
 def parameters(variant: str = "as in the main experiment") -> RadarEsmTrackingParameters:
-    """Return the parameters of scenario ``paper`` in a variant."""
+    """Return the parameters of scenario ``paper`` in a variant of the experiment."""
     return make_task(RadarEsmTracking, "paper", **VARIANTS[variant]).parameters
 
 
@@ -122,48 +122,46 @@ def rms(mean_square: numpy.ndarray, window: tuple[int, int]) -> float:
 
 
 class Run(NamedTuple):
-    """Records of a policy over some episodes; ``of`` chooses some of them."""
+    """Records of a policy over some episodes; the argument ``of`` of its methods selects episodes."""
 
     error: numpy.ndarray
     """Estimate minus truth, ``(episodes, K, 3)``."""
     variance: numpy.ndarray
-    """Reported, mean over episodes, ``(K, 3)``."""
+    """Reported variance, mean over episodes, ``(K, 3)``."""
     first_variance: numpy.ndarray
-    """Reported in the first episode, ``(K, 3)``."""
+    """Reported variance in the first episode, ``(K, 3)``."""
     probability: numpy.ndarray
-    """Of the classes, ``(episodes, K, 3)``."""
+    """Probability of each class, ``(episodes, K, 3)``."""
     true_probability: numpy.ndarray
-    """``(episodes, K)``."""
+    """Probability of the true class, ``(episodes, K)``."""
     true_class: numpy.ndarray
-    """``(episodes,)``."""
+    """Index of the true class, ``(episodes,)``."""
     true_type: numpy.ndarray
-    """``(episodes,)``."""
+    """Index of the true type, ``(episodes,)``."""
     cost: numpy.ndarray
-    """Mean over the scans, ``(episodes,)``."""
+    """Mean cost over the scans, ``(episodes,)``."""
 
     def mean_square(self, component: int, window: tuple[int, int], of: Any = ...) -> numpy.ndarray:
-        """Mean square error over a window, ``(1 + resamples,)``."""
+        """Return the mean square error of a component over a window of scans, ``(1 + resamples,)``."""
         return means((self.error[of][:, window[0] - 1 : window[1], component] ** 2).mean(axis=1))
 
     def true_at(self, second: float, of: Any = ...) -> Quantity:
-        """Mean probability of the true class at a time."""
+        """Return the mean probability of the true class at a time, s."""
         return mean(self.true_probability[of][:, round(second / INTERVAL) - 1])
 
     def recognition(self, share: float, of: Any = ...) -> float:
-        """Return the time by which a share of the runs has had P(true class) >= 0.9 once, s; infinite if fewer
-        have.
-        """
+        """Return the time, s, by which P(true class) has reached 0.9 in a share of the runs; else infinity."""
         sure = self.true_probability[of] >= SURE
         return _quantile(numpy.where(sure.any(axis=1), sure.argmax(axis=1), math.inf), share)
 
     def settling(self, share: float) -> float:
-        """Return the time after which a share of the runs keeps P(true class) >= 0.9 to the end, s."""
+        """Return the time, s, after which P(true class) stays at 0.9 or above in a share of the runs."""
         unsure = self.true_probability < SURE
         last = numpy.where(unsure.any(axis=1), unsure.shape[1] - unsure[:, ::-1].argmax(axis=1), 0)
         return _quantile(numpy.where(last < unsure.shape[1], last, math.inf), share)
 
     def wrong(self) -> numpy.ndarray:
-        """Return whether a wrong class has P >= 0.9, ``(episodes, K)``."""
+        """Return a boolean mask ``(episodes, K)`` of the scans at which a wrong class has P >= 0.9."""
         other = numpy.arange(len(CLASSES)) != self.true_class[:, None, None]
         return ((self.probability >= SURE) & other).any(axis=2)
 
@@ -172,7 +170,7 @@ class Run(NamedTuple):
         return mean(self.wrong()[of][:, -1].astype(float))
 
     def calibration(self, window: tuple[int, int]) -> list[Quantity]:
-        """Mean square error over mean reported variance of each component."""
+        """Return mean square error over mean reported variance of each component in a window."""
         reported = self.variance[window[0] - 1 : window[1]].mean(axis=0)
         return [quantity(self.mean_square(c, window) / reported[c]) for c in range(len(COMPONENTS))]
 
@@ -182,7 +180,7 @@ def _quantile(scan: numpy.ndarray, share: float) -> float:
 
 
 def run_policy(name: str, scenario: str, episodes: int, **keywords: Any) -> Run:
-    """Run a policy; one unit of work."""
+    """Run a policy over test episodes of a scenario, and return its records. One unit of work."""
     one = evaluate_policy(RadarEsmTracking.id, name, scenario, episodes, seed=SEED, **keywords)
     variance = [one[f"variance_{c.name}"].values for c in RadarEsmTracking.components]
     return Run(
@@ -198,7 +196,7 @@ def run_policy(name: str, scenario: str, episodes: int, **keywords: Any) -> Run:
 
 
 class Results(NamedTuple):
-    """Everything that claims, tables and figures are made of."""
+    """Results of all experiments, from which claims, tables and figures are made."""
 
     episodes: int
     small: int
@@ -212,25 +210,28 @@ class Results(NamedTuple):
     radar: list[Run]
     esm: list[Run]
     every_decision: list[Run]
-    """The paper's algorithm, and with refused decisions too, on the same episodes."""
+    """The paper's algorithm without and with reports of rejected decisions, on the same episodes."""
     fixed_type: dict[str, Run]
     """The printed rule and the joint posterior on targets of one type."""
     variants: dict[str, list[Run]]
     """Adaptive filter and radar alone, by name of the variant."""
 
     def excess(self, s: int, component: int, window: tuple[int, int]) -> Quantity:
-        """Return the RMSE of the adaptive filter over the ideal one's on targets of class s, minus one."""
+        """Return the RMSE of the adaptive filter over the ideal filter's on targets of class s, minus one."""
         ideal = rms(self.exact[s, s][component], window)
         return quantity(numpy.sqrt(self.fused[s].mean_square(component, window)) / ideal - 1.0)
 
     def gain(self, s: int, component: int, window: tuple[int, int]) -> Quantity:
-        """Return the RMSE of the non-adaptive filter over the adaptive one's."""
+        """Return the RMSE of the non-adaptive filter over the adaptive filter's on targets of class s."""
         fixed = rms(self.exact[s, 2][component], window)
         return quantity(fixed / numpy.sqrt(self.fused[s].mean_square(component, window)))
 
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
-    """Run all experiments; ``STEPS`` units of work. Side experiments have a quarter of the episodes."""
+    """Run all experiments of the paper, and return their results; ``STEPS`` units of work.
+
+    Side experiments have a quarter of the episodes.
+    """
     small = max(episodes // 4, 2)
     p = parameters()
     models, start = RadarEsmTracking.design_models(p)

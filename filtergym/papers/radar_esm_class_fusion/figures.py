@@ -6,16 +6,16 @@ import numpy
 
 from ...baselines.radar_esm_tracking.metrics import SURE
 from ...evaluation.figures.looks import styles
-from ..panels import draw, finish, legend_outside, looks, panels
+from ..panels import draw, finish, legend_outside, line_styles, panels
 from ..quantities import means
 from .experiment import CLASSES, COMPONENTS, INTERVAL, Results
 
 FILTERS = {"non-adaptive": 1.8, "ideal": 3.2, "synthesised": 1.4}
-"""Width of their lines."""
+"""Line width of each drawn filter."""
 
 
 def figures(r: Results) -> dict[str, tuple[Any, str]]:
-    """Return the figures and their captions."""
+    """Return each figure and its caption, by file name without suffix."""
     found = {
         "figure_1_probabilities": (draw_probabilities(r), "Figure 1: class probabilities, true class S0.")
     }
@@ -42,11 +42,11 @@ def _times(count: int) -> numpy.ndarray:
 
 
 def draw_probabilities(r: Results) -> Any:
-    """Figure 1: class probabilities of one run on S0, and their mean over runs."""
+    """Draw figure 1: class probabilities of one run on S0, and their mean over runs."""
     figure, grid = panels(2, 1, (8.0, 5.6), sharex=True)
     probability = r.fused[0].probability
     t = _times(probability.shape[1])
-    for s, (name, style) in enumerate(looks(CLASSES).items()):
+    for s, (name, style) in enumerate(line_styles(CLASSES).items()):
         values = probability[:, :, s]
         grid[0, 0].plot(t, values[0], label=f"P({name})", drawstyle="steps-post", **style)
         grid[1, 0].fill_between(
@@ -61,7 +61,7 @@ def draw_probabilities(r: Results) -> Any:
 
 
 def draw_deviation(r: Results, component: int) -> Any:
-    """Return the figures 2 to 4: deviation of a component on S0, as the filters report it and as it is."""
+    """Draw one of figures 2 to 4: reported and actual deviation of a component on S0."""
     from matplotlib.lines import Line2D
 
     figure, grid = panels(1, 1, (8.0, 4.2))
@@ -94,7 +94,7 @@ def draw_deviation(r: Results, component: int) -> Any:
 
 
 def draw_classes(r: Results) -> Any:
-    """Return the errors really made in the acceleration, all three classes."""
+    """Draw the actual errors of the acceleration for all three classes."""
     figure, grid = panels(1, 3, (11.0, 3.8))
     for s, axis in enumerate(grid[0]):
         squares = (r.exact[s, 2][2], r.exact[s, s][2], (r.fused[s].error[:, :, 2] ** 2).mean(axis=0))
@@ -115,10 +115,10 @@ def draw_classes(r: Results) -> Any:
 
 
 def draw_fixed_type(r: Results) -> Any:
-    """Return the share of runs that are sure of a wrong class over time, for targets of one type each."""
+    """Draw the share of runs in which a wrong class has P >= 0.9 over time, for targets of one type each."""
     figure, grid = panels(1, 2, (10.0, 3.9))
     names = {"quasi-optimal": "printed rule (8)", "joint-type": "joint posterior of type and class"}
-    for name, style in looks(names).items():
+    for name, style in line_styles(names).items():
         run = r.fixed_type[name]
         wrong = 100.0 * run.wrong()
         fighter = (run.true_class == 2) & (run.true_type == 1)

@@ -9,7 +9,7 @@ innovation; all of the output coordinate. Energy spectrum: ``|DFT|^2 T / n`` ave
 """
 
 from ...evaluation.running.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
+from ..reproduction import Progress, Reproduction, episode_count, judge_claims, reproduction_command
 from . import claims, experiment, figures
 
 TITLE = "Stochastic simulation of a UAV autopilot with the optimal Kalman filter (Gridnev, Rusetski, Rak)"
@@ -19,7 +19,7 @@ STEPS = experiment.STEPS
 def reproduce(
     progress: Progress, episodes: int | None = None, workers: Workers | None = None
 ) -> Reproduction:
-    """Run the experiments and judge the claims."""
+    """Run the paper's experiments, judge its claims, and return claims, tables and figures."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
-    return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))
+    return Reproduction(TITLE, *shown, command=reproduction_command(__name__, episodes))

@@ -1,4 +1,4 @@
-"""The paper's claims and what it does not mention, with verdicts, and the tables of the report."""
+"""The paper's claims and open questions with verdicts, and the tables of the report."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ SCALES = (0.01, 1.0, 100.0)
 
 
 def _excess(datasets: dict[str, Any]) -> str:
-    """Return the cost of the paper's filter above that of the filter given the noise, and its consistency."""
+    """Return a text with the paper's filter's cost over that of the filter with known noise, and its ANEES."""
     ours, best = (datasets[name]["cost"].values.mean(axis=1) for name in ("kalman", "matched"))
     nees = datasets["kalman"]["nees"].values.mean() / datasets["kalman"].sizes["component"]
     return f"{quantity(means(ours) / means(best) - 1.0):.0%}, NEES {nees:.1f} per coordinate"
@@ -126,7 +126,7 @@ CLAIMS = (
         "scenario random, {r.episodes} episodes, same noise; a consistent filter has NEES 1 per coordinate",
     ),
 )
-"""The paper's claims, and what it does not mention; of pairs the first is of plant P."""
+"""The paper's claims, and questions that it leaves open; of pairs of numbers the first is of plant P."""
 
 
 def structure(tasks: Sequence[UavAutopilot]) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def structure(tasks: Sequence[UavAutopilot]) -> dict[str, Any]:
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities of the claims."""
+    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
     plants = ("P, H = I", "U")
     ours = P, U = [r.noise[plant]["kalman"] for plant in plants]
     raw = [r.noise[plant]["raw-sensors"] for plant in plants]
@@ -173,7 +173,7 @@ def quantities(r: Results) -> dict[str, Any]:
     tasks = [r.noise[case]["kalman"].task for case in (*plants, "P, H = [1 0]")]
 
     def mean_ratio(values: Callable[[Any], numpy.ndarray]) -> list[float]:
-        """Mean without the filter over that with it, of both plants."""
+        """Return the mean without the filter over the mean with it, for both plants."""
         return [float(values(a).mean() / values(b).mean()) for a, b in zip(raw, ours, strict=True)]
 
     return {
@@ -205,7 +205,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report."""
+    """Return the tables of the report on the paper."""
     rows = []
     for case, loops in r.noise.items():
         for name, s in loops.items():

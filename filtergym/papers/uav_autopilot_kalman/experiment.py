@@ -39,39 +39,39 @@ STEPS = (len(LOOPS) + 1) * len(CASES) - 1 + 2 * len(RANDOM)
 
 @dataclass
 class Signals:
-    """One loop over all runs, ``(runs, time)`` each."""
+    """Signals of one control loop over all runs, ``(runs, time)`` each."""
 
     task: UavAutopilot
     output: numpy.ndarray
     control: numpy.ndarray
     cost: numpy.ndarray
-    """In the units of the weights."""
+    """Cost, in the units of the weights."""
     observation: numpy.ndarray
     estimate: numpy.ndarray
     innovation: numpy.ndarray
-    """In units of the output; exact once the filter's covariance has settled."""
+    """Innovation of the output, in its units; exact once the filter's covariance has settled."""
     nees: numpy.ndarray
     """Normalised estimation error squared per coordinate."""
     nis: numpy.ndarray
     plant_input: numpy.ndarray
-    """Control plus white noise, plant P; control, plant U."""
+    """Input of the plant: control plus white noise (plant P), or control (plant U)."""
 
     def text(self, name: str, digits: int = 4, times: slice = STEADY_WINDOW) -> str:
-        """Return the mean of a signal over runs and time."""
+        """Return the mean of a signal over runs and time as text, with its standard error."""
         return f"{mean(getattr(self, name)[:, times].mean(axis=1)):.{digits}f}"
 
     def variance(self, name: str) -> float:
-        """Mean square of a node about the output, settled."""
+        """Return the mean square of a node's difference to the output, after the burn-in."""
         return float(numpy.mean((getattr(self, name) - self.output)[:, STEADY_WINDOW] ** 2))
 
     @property
     def decibel(self) -> float:
-        """Noise of node 2 over noise of node 3."""
+        """Noise power of the observation over that of the estimate, dB."""
         return 10.0 * math.log10(self.variance("observation") / self.variance("estimate"))
 
 
 def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) -> Signals:
-    """Run one loop of ``LOOPS`` on test episodes."""
+    """Run one control loop of ``LOOPS`` on test episodes, and return its signals."""
     control = "mode" if loop == "raw-sensors" else "gain"
     model = make_model(UavAutopilot, control, scenario, horizon=HORIZON, **keywords)
     task: Any = model.task
@@ -108,18 +108,18 @@ def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) 
 
 
 class Results(NamedTuple):
-    """Everything that claims, tables and figures are made of."""
+    """Results of all experiments, from which claims, tables and figures are made."""
 
     episodes: int
     noise: dict[str, dict[str, Signals]]
     """White-noise input, by case and loop."""
     step: dict[str, Signals]
-    """Unit step and the same noise, the loop with the filter."""
+    """Unit step and the same noise, the loop with the filter, by case."""
     random: dict[str, dict[str, Any]]
     """Datasets of the policies of ``RANDOM`` on scenario ``random``, by plant."""
 
     def response(self, case: str) -> numpy.ndarray:
-        """Return the output after a unit step, ``(K - STEP_TIME + 1,)``."""
+        """Return the mean output after a unit step, ``(K - STEP_TIME + 1,)``."""
         # Linear loop, same noise: the difference of the runs is the response without noise, exactly.
         return (self.step[case].output - self.noise[case]["kalman"].output).mean(axis=0)[STEP_TIME - 1 :]
 
@@ -131,7 +131,7 @@ class Results(NamedTuple):
 
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
-    """Run all experiments; ``STEPS`` units of work."""
+    """Run all experiments of the paper, and return their results; ``STEPS`` units of work."""
 
     def signals(keywords: dict[str, Any], scenario: str, loop: str) -> Any:
         return later(simulate, keywords, scenario, loop, episodes)
@@ -167,7 +167,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
 
 
 class Loop(NamedTuple):
-    """Matrices of the loop: plant, sensors, feedback, settled filter gain, covariances of the noise."""
+    """Matrices of the control loop: plant, sensors, feedback, steady-state filter gain, noise covariances."""
 
     F: numpy.ndarray
     B: numpy.ndarray
@@ -179,38 +179,38 @@ class Loop(NamedTuple):
 
 
 def matrices(task: UavAutopilot) -> Loop:
-    """Return the matrices of a task's loop."""
+    """Return the matrices of a task's control loop."""
     d = task.design
     Q = d.model.scaled_noise + d.model.other_noise
     return Loop(d.model.F, d.model.B, d.H, d.feedback, d.steady.gain, Q, d.R)
 
 
 def interval(task: UavAutopilot) -> float:
-    """Return the T, s."""
+    """Return the sampling interval T of a task, s."""
     return float(task.parameters.value("sampling_interval"))
 
 
 def innovation_variance(task: UavAutopilot) -> float:
-    """Return the settled variance of the output's innovation."""
+    """Return the steady-state variance of the output's innovation."""
     d, shown = task.design, task.measured.index(task.output)
     return float((d.H @ d.steady.predicted @ d.H.T + d.R)[shown, shown])
 
 
 def spectrum(values: numpy.ndarray, T: float) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return the frequencies, Hz, and averaged periodogram, unit squared per Hz."""
+    """Return frequencies, Hz, and the periodogram averaged over runs, unit squared per Hz."""
     n = values.shape[1]
     power = (numpy.abs(numpy.fft.rfft(values, axis=1)) ** 2).mean(axis=0) * T / n
     return numpy.fft.rfftfreq(n, T), power
 
 
 def flatness(values: numpy.ndarray) -> float:
-    """Return the geometric over arithmetic mean of the averaged periodogram: one for white noise."""
+    """Return the spectral flatness: geometric over arithmetic mean of the averaged periodogram, 1 for white noise."""
     power = spectrum(values, 1.0)[1]
     return float(numpy.exp(numpy.log(power).mean()) / power.mean())
 
 
 def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the spectra of output and nodes of the settled loop, white-noise input, from its transfer functions."""
+    """Return the theoretical power spectrum of output and nodes of the control loop under white noise, by name."""
     (F, B, H, L, K, Q, R), T = matrices(task), interval(task)
     n, m = len(F), len(R)
     loop = linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)
@@ -246,10 +246,10 @@ def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, nu
 
 
 def settled_output(task: UavAutopilot, predicts_command: bool) -> float:
-    """Return the output at which a unit command settles.
+    """Return the steady-state output after a unit command.
 
     Args:
-        task: whose loop it is.
+        task: task with the control loop.
         predicts_command: whether the filter predicts with the control in force, command included, as (10) is printed;
             otherwise with the feedback alone, as (6) is.
     """
@@ -263,7 +263,7 @@ def settled_output(task: UavAutopilot, predicts_command: bool) -> float:
 
 
 def loop_theory(task: UavAutopilot, scale: float) -> tuple[float, float, float]:
-    """Cost (in the units of the weights), output and control variance with process noise times ``scale``."""
+    """Return the loop's exact cost, and variances of output and control, with the filter's process noise scaled."""
     F, B, H, L, _, Q, R = matrices(task)
     n, d = len(F), task.design
     K = linear_systems.steady_kalman(F, H, scale * Q, R).gain
@@ -275,7 +275,7 @@ def loop_theory(task: UavAutopilot, scale: float) -> tuple[float, float, float]:
 
 
 def covariances(task: UavAutopilot, **changes: Any) -> numpy.ndarray:
-    """Return the recursion (12): sigma of the output's estimate, gain on the integrating mode, ``(2, TWO_MINUTES)``.
+    """Return sigma of the output's estimate and gain on the integrating mode by (12), ``(2, TWO_MINUTES)``.
 
     The mode's coordinate is ``w^T x`` with ``w^T F = w^T``, scaled to contain the output once.
     """
@@ -297,7 +297,7 @@ def covariances(task: UavAutopilot, **changes: Any) -> numpy.ndarray:
 
 
 def covariance_curves(task: UavAutopilot) -> dict[str, numpy.ndarray]:
-    """Return the recursion (12) of plant U where its correcting term bounds the covariance and where it does not."""
+    """Return :func:`covariances` of plant U with and without the correcting term of (12), by name of the case."""
     names = [c.name for c in task.components]
     H = numpy.eye(len(names))
     rate, elevator = names.index("rate"), names.index("elevator")

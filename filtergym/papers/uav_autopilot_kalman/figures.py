@@ -7,7 +7,7 @@ import numpy
 from ...baselines.uav_autopilot.theory import stationary
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.figures.looks import COLOURS
-from ..panels import finish, legend_outside, looks, panels
+from ..panels import finish, legend_outside, line_styles, panels
 from .experiment import (
     HORIZON,
     STEADY_WINDOW,
@@ -27,7 +27,7 @@ PLOT_WINDOW = slice(160, 320)
 
 
 def figures(r: Results) -> dict[str, tuple[Any, str]]:
-    """Return the figures and their captions."""
+    """Return each figure and its caption, by file name without suffix."""
     P, step, U = r.noise["P, H = I"]["kalman"], r.step["P, H = I"], r.noise["U"]["kalman"]
     found = {
         "figure_3_filter": (
@@ -69,7 +69,7 @@ def _times(signals: Signals) -> numpy.ndarray:
 
 
 def draw_filter(noise: Signals, step: Signals) -> Any:
-    """Figure 3: input and output of the filter in one run, without and with a step of the command."""
+    """Draw figure 3: input and output of the filter in one run, without and with a step of the command."""
     figure, axes = panels(2, 1, (8.0, 6.0))
     for axis, signals, title in zip(
         axes[:, 0], (noise, step), ("input: white noise", "input: unit step and white noise"), strict=True
@@ -87,7 +87,7 @@ def draw_filter(noise: Signals, step: Signals) -> Any:
 
 
 def draw_node(name: str, unit: str, title: str, noise: Signals, step: Signals) -> Any:
-    """Return the figures 4 to 6: one run of a node, and its spectrum with theory."""
+    """Draw one of figures 4 to 6: one run of a node, and its spectrum with theory."""
     figure, axes = panels(2, 2, (9.0, 5.6), sharey="row")
     for (above, below), signals, label in zip(
         axes.T, (noise, step), ("white noise", "unit step and white noise"), strict=True
@@ -113,7 +113,7 @@ def draw_node(name: str, unit: str, title: str, noise: Signals, step: Signals) -
 
 
 def draw_pitch_spectra(signals: Signals) -> Any:
-    """Return the spectra of plant U."""
+    """Draw the power spectra of the signals in the loop of plant U."""
     figure, axes = panels(1, 1, (8.0, 3.8))
     axis, T = axes[0, 0], interval(signals.task)
     nodes = (("observation", "node 2", 5), ("estimate", "node 3", 0), ("innovation", "node 4", 2))
@@ -128,7 +128,7 @@ def draw_pitch_spectra(signals: Signals) -> Any:
 
 
 def draw_mistuning(tasks: dict[str, UavAutopilot]) -> Any:
-    """Return the cost and variances of the loop over the process noise that its filter believes."""
+    """Draw cost and variances of the loop over the process noise that its filter assumes."""
     figure, axes = panels(1, len(tasks), (9.0, 3.8))
     scales = numpy.geomspace(1e-3, 1e3, 61)
     for axis, (title, task) in zip(axes[0], tasks.items(), strict=True):
@@ -147,7 +147,7 @@ def draw_mistuning(tasks: dict[str, UavAutopilot]) -> Any:
         axis.axvline(1.0, color="0.7", lw=0.8)
         finish(
             axis,
-            "factor on the process noise that the filter believes",
+            "factor on the process noise that the filter assumes",
             title=title,
             log="xy",
             legend="upper center",
@@ -158,11 +158,11 @@ def draw_mistuning(tasks: dict[str, UavAutopilot]) -> Any:
 
 
 def draw_covariance(task: UavAutopilot) -> Any:
-    """Return the recursion (12) over two minutes."""
+    """Draw the covariance recursion (12) of plant U over two minutes."""
     figure, axes = panels(1, 2, (9.0, 3.8))
     curves = covariance_curves(task)
     t = numpy.arange(1, TWO_MINUTES + 1) * interval(task)
-    for (label, values), style in zip(curves.items(), looks(curves).values(), strict=True):
+    for (label, values), style in zip(curves.items(), line_styles(curves).values(), strict=True):
         axes[0, 0].plot(t, values[0], label=label, **style)
         if values[1].any():
             axes[0, 1].plot(t, values[1], label=label, **style)

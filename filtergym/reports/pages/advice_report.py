@@ -1,4 +1,4 @@
-"""An advice as one self-contained page: sentences, tables, the checks of the log, and pictures of the results.
+"""The report on a recommended filter as one self-contained page: sentences, tables, checks of the log, pictures.
 
 Time in pictures is in seconds since the first row of the log.
 """
@@ -17,7 +17,7 @@ from ...envs.contract.log_format import LogFormat
 from ...envs.contract.task import Task
 from ...evaluation.competitors.likelihood import Span
 from ...evaluation.running.metrics import chi_square_band
-from ...evaluation.statistics.innovations import received
+from ...evaluation.statistics.innovations import measured_quantities
 from ..tables.advice import (
     PRICES,
     ParameterText,
@@ -47,12 +47,12 @@ ROLES = {"fitted": "fitted to", "chosen": "chosen by", "judged": "judged by"}
 def advice_html(
     advice: Advice, task: Task, sentences: Sequence[str], learned: Sequence[str], settings: Settings
 ) -> str:
-    """Return the page.
+    """Return the HTML report on the filter that is recommended for a recording.
 
     Args:
         advice: advice from :func:`~..baselines.advice.advise`.
         task: task of the recording, with its parameters.
-        sentences: sentences after the first one.
+        sentences: sentences that follow the first one, the verdict.
         learned: names of shipped agents.
         settings: command and versions.
     """
@@ -81,26 +81,26 @@ def advice_html(
         settings=settings,
         figures=pack(
             {
-                "names": _shown(advice),
+                "names": _drawn_names(advice),
                 "episodes": list(_episodes(advice, replay, task)),
                 "profiles": list(_profiles(advice)),
                 "drop": DROP,
             }
         ),
-        has_track=received(replay.isel(policy=0), task) is not None,
+        has_track=measured_quantities(replay.isel(policy=0), task) is not None,
         has_innovations="prediction_error" in replay,
         has_nis="nis" in replay,
         has_onboard=advice.onboard is not None,
     )
 
 
-def _shown(advice: Advice) -> list[str]:
-    """Return the names of the drawn filters, the advised one first."""
+def _drawn_names(advice: Advice) -> list[str]:
+    """Return the names of the filters that the pictures show, the advised one first."""
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
 
 
 def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]]:
-    """Return the parameters of a fitted filter in words; intervals where they were computed."""
+    """Yield name and text of each parameter of a fitted filter, with its interval where it was computed."""
     tunable, found, profiles = advice.tunables[name], advice.fits[name], advice.profiles.get(name, {})
     for key, value in found.values.items():
         interval = profiles[key].interval if key in profiles else None
@@ -114,9 +114,9 @@ def _log_lines(advice: Advice) -> Iterator[str]:
         sum(span.last - span.first for span in spans) for spans in (share.fitted, share.chosen, share.judged)
     ]
     yield (
-        "Measurements that are fitted, that choose, that judge: {:,} / {:,} / {:,}.".format(*counts)
+        "Measurements for fit, choice and judgement: {:,} / {:,} / {:,}.".format(*counts)
         if share.apart
-        else "Too few measurements to be shared out: all are fitted, choose and judge."
+        else "Too few measurements to divide: all serve fit, choice and judgement."
     )
 
 
@@ -124,7 +124,7 @@ def _log_lines(advice: Advice) -> Iterator[str]:
 
 
 def _episodes(advice: Advice, replay: xarray.Dataset, task: Task) -> Iterator[dict[str, Any]]:
-    """Return the drawn data of each track of the recording."""
+    """Yield the data that the page draws of each track of the recording, by name."""
     recording = advice.recording
     for episode in range(min(replay.sizes["episode"], MOST_EPISODES)):
         rows = min(int(recording.rows[episode]), replay.sizes["time"])
@@ -136,22 +136,22 @@ def _episodes(advice: Advice, replay: xarray.Dataset, task: Task) -> Iterator[di
             "seconds": _numbers(seconds[::step]),
             "outlier_seconds": _numbers(seconds[advice.outliers[episode, :rows]]),
             "spans": list(_spans(advice, episode, seconds)),
-            **_track(run, task, _shown(advice), step, advice.outliers[episode, :rows]),
+            **_track(run, task, _drawn_names(advice), step, advice.outliers[episode, :rows]),
             **_innovations(run, advice.advised.name, step),
             **_onboard(advice, episode, rows, step),
         }
         if "nis" in run:
-            found["nis"] = [_mean_nis(run, name, seconds) for name in _shown(advice)]
+            found["nis"] = [_mean_nis(run, name, seconds) for name in _drawn_names(advice)]
         yield found
 
 
 def _numbers(values: numpy.ndarray) -> list[float | None]:
-    """Return numbers in JSON's types, in few digits."""
+    """Return an array as a list of rounded floats, None for values that are not finite."""
     return [float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None for value in values]
 
 
 def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tuple[str, float, float]]:
-    """Return the use of each stretch of the track, with its first and last second."""
+    """Yield the use of each stretch of a track (fit, choice, judgement), and its first and last second."""
     share = advice.share
     if not share.apart:
         return
@@ -166,10 +166,8 @@ def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tup
 def _track(
     run: xarray.Dataset, task: Task, names: Sequence[str], step: int, is_outlier: numpy.ndarray
 ) -> dict[str, Any]:
-    """Return measurements, estimates, truth and outliers of a track: of a plane its two axes, else the main
-    component.
-    """
-    measured = received(run.isel(policy=0), task)
+    """Return measurements, estimates, truth and outliers of a track as lists: x and y, or the main component."""
+    measured = measured_quantities(run.isel(policy=0), task)
     log_format = find_companion(task, LogFormat)
     if measured is None or log_format is None:
         return {}
@@ -201,7 +199,7 @@ def _track(
 
 
 def _onboard(advice: Advice, episode: int, rows: int, step: int) -> dict[str, Any]:
-    """Return the positions of the vehicle's own filter at the fixes."""
+    """Return the positions from the vehicle's own filter at every ``step``-th fix; empty without one."""
     if advice.onboard is None:
         return {}
     places = advice.onboard.positions[episode, :rows:step]
@@ -209,7 +207,7 @@ def _onboard(advice: Advice, episode: int, rows: int, step: int) -> dict[str, An
 
 
 def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
-    """Return the innovations of a competitor, scaled so that their squares sum to the NIS: of deviation one each."""
+    """Return the normalised innovations of a competitor, whose squares sum to the NIS."""
     if "prediction_error" not in run or "nis" not in run:
         return {}
     groups = run["measured_group"].values
@@ -225,9 +223,7 @@ def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
 
 
 def _mean_nis(run: xarray.Dataset, name: str, seconds: numpy.ndarray) -> dict[str, Any]:
-    """Return the mean NIS over its dimension in windows of the recording, and the chi-square band of each, over
-    seconds.
-    """
+    """Return the mean NIS over its dimension in windows of a recording, with time, s, and chi-square band."""
     nis, degrees = (run[key].sel(policy=name).values[0] for key in ("nis", "nis_degrees"))
     there = numpy.flatnonzero(numpy.isfinite(nis) & (degrees > 0.0))
     size = max(SHORTEST_WINDOW, -(-len(there) // WINDOWS_OF_NIS))
@@ -244,7 +240,7 @@ def _mean_nis(run: xarray.Dataset, name: str, seconds: numpy.ndarray) -> dict[st
 
 
 def _profiles(advice: Advice) -> Iterator[dict[str, Any]]:
-    """Return the likelihood of every parameter of the fitted filter, the others adapted."""
+    """Yield the profile likelihood of every parameter of the fitted filter, for the page's figures."""
     name = advice.fitted.name
     for key, profile in advice.profiles[name].items():
         plain = key.removeprefix("log10_")

@@ -20,7 +20,7 @@ from ...evaluation.stress.crash_test import (
 
 STYLES = {PASSED: "green", DEGRADED: "yellow", FAILED: "red", NOTHING: "dim"}
 PAGE_WIDTH = 150
-"""Columns of a page."""
+"""Width of the tables on a page, characters."""
 
 
 def count_verdicts(findings: Sequence[Finding]) -> str:
@@ -30,7 +30,7 @@ def count_verdicts(findings: Sequence[Finding]) -> str:
 
 
 def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
-    """Return the table of one competitor, a line for each alteration that applies.
+    """Return the crash test's table of one competitor, a line for each alteration of the measurements.
 
     Args:
         findings: findings of the competitor, in the order of the catalogue.
@@ -55,7 +55,7 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
 
 
 def crash_page(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
-    """Return a self-contained page of HTML.
+    """Return the tables of a crash test as a self-contained HTML page.
 
     Args:
         title: title above the tables.

@@ -24,7 +24,7 @@ class FrontImage(NamedTuple):
 
 
 def front_images(results: Sequence[Result]) -> list[FrontImage]:
-    """Draw each environment of the table of the best whose competitors were timed.
+    """Return an image of cost against time for each environment whose competitors were timed.
 
     Args:
         results: results as in :func:`.headline.headline`.
@@ -59,7 +59,7 @@ def _place(point: Point) -> str:
 
 @in_print
 def _draw(panel: FrontPanel, *, columns: int) -> bytes:
-    """Return the panel as SVG with letters as lines, the same bytes every time."""
+    """Return a panel drawn as SVG, the same bytes every time, with text as paths."""
     from matplotlib import rc_context
 
     # Names are of anybody: between two dollars they are no formulas.

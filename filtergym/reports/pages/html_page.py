@@ -20,7 +20,7 @@ HTML = Path(__file__).parent / "html"
 
 
 def render_page(template: str, script: str, **values: Any) -> str:
-    """Return a page of a template.
+    """Return an HTML page from a template, with its scripts and Plotly inside.
 
     Args:
         template: file name of the template.
@@ -47,17 +47,17 @@ def _hash(script: str) -> str:
 
 
 def pack(values: Any) -> str:
-    """Return JSON, compressed, in characters without meaning in HTML; the same bytes every time."""
+    """Return values as JSON, compressed and in base64, for a page's script."""
     return pack_text(json.dumps(values, allow_nan=False, separators=(",", ":")))
 
 
 def pack_text(text: str) -> str:
-    """Return text, compressed, in characters without meaning in HTML."""
+    """Return text, compressed and in base64, for a page's script."""
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
 def mark_code(text: str) -> markupsafe.Markup:
-    """Return text with the words between backticks as code, everything escaped."""
+    """Return text escaped for HTML, with the words between backticks as ``<code>``."""
     parts = re.split(r"`([^`]*)`", text)
     pieces = [
         markupsafe.Markup("<code>{}</code>").format(part) if i % 2 else markupsafe.escape(part)

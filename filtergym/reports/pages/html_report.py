@@ -1,4 +1,4 @@
-"""One self-contained page from a file of results: it opens offline, and executes nothing of the file."""
+"""The report: one self-contained HTML page of results, which opens offline and executes nothing of the file."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -17,9 +17,9 @@ from ..tables.ranking import origin, ranking_sentence, remarks
 from ..tables.results import Result, Settings, serialise_datasets
 from ..tables.terminal_tables import (
     HEADLINE,
-    against_paper,
     consistency_word,
     main_components,
+    paper_cells,
     rank_competitors,
     score_text,
     with_interval,
@@ -42,7 +42,7 @@ class Entry(NamedTuple):
 
 
 def report_html(results: Sequence[Result], settings: Settings) -> str:
-    """Return the page.
+    """Return the HTML page of a report.
 
     Args:
         results: results of any environments and scenarios.
@@ -113,7 +113,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
 
 
 def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
-    """Return the header and rows of every competitor, lowest cost first; smoothers, references and bounds last."""
+    """Return header and rows of a scenario's table of competitors, lowest cost first, unranked ones last."""
     records = result.records
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     shown = main_components(records)
@@ -137,7 +137,7 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
     header += ["origin", "control"]
     rows = []
     for name, kind, control in rank_competitors(records):
-        lost, means = against_paper(found, name)
+        lost, means = paper_cells(found, name)
         nees = found.get((name, "anees", "state", "all"))
         value = None if nees is None else nees.value
         score = found.get((name, "score", "", "all"))
@@ -186,9 +186,7 @@ def _number(text: str) -> float | None:
 
 
 def _differences(result: Result) -> list[list[Any]]:
-    """Return name, and cost against the paper's algorithm with its interval in percent, of the ranked competitors and
-    the reference.
-    """
+    """Return rows of name, origin, and cost against the paper's algorithm with its interval, %."""
     found: dict[str, Record] = {
         r.policy: r for r in result.records if (r.metric, r.window) == (HEADLINE, "all")
     }
@@ -203,8 +201,10 @@ def _differences(result: Result) -> list[list[Any]]:
 
 
 def _front(result: Result) -> list[list[Any]]:
-    """Return name, origin, nanoseconds, cost against the paper's algorithm in percent, whether compiled, and whether on
-    the front, of the ranked competitors and the reference.
+    """Return rows for the picture of cost against time.
+
+    A row contains name, origin, nanoseconds, cost against the paper's algorithm in percent, whether the competitor is
+    compiled, and whether it is on the front.
     """
     points = points_of_records(result.records)
     on_front = front(points)
@@ -223,9 +223,7 @@ def _front(result: Result) -> list[list[Any]]:
 
 
 def _dots(group: Sequence[Result]) -> dict[str, Any]:
-    """Return the content of the picture over all scenarios of an environment: the competitors of the curves of the
-    training distribution, to which the verdict refers; where it was not run, of the first scenario.
-    """
+    """Return the data of the picture of cost in all scenarios of an environment."""
     shown = next((result for result in group if result.default), group[0])
     return {
         "paper": group[0].paper,
@@ -238,9 +236,7 @@ def _dots(group: Sequence[Result]) -> dict[str, Any]:
 
 
 def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return name, origin and colour of the drawn competitors; a name has the same colour in all scenarios of its
-    environment.
-    """
+    """Return name, origin and colour number of each drawn competitor, equal in all scenarios of ``group``."""
     names: dict[str, str] = {}
     for one in [*(other for other in group if other.default), *group]:
         kinds = {record.policy: record.kind for record in one.records}
@@ -268,19 +264,19 @@ def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
 
 
 class Figure(NamedTuple):
-    """A figure of a scenario."""
+    """Title and texts of a figure of a scenario; the page's script draws it."""
 
     kind: str
     """Kind, by which the page's script draws it."""
     title: str
     text: str
-    """Description."""
+    """Description below the figure."""
     alternative: str
-    """Alternative for readers who do not see it."""
+    """Text for readers who do not see the figure."""
 
 
 def _figures(result: Result) -> Iterator[Figure]:
-    """Yield the figures of a scenario for which there are data."""
+    """Yield title and text of each figure of a scenario for which the results contain data."""
     found = {(r.policy, r.metric, r.component): r for r in result.records if r.window == "all"}
     order = [name for name, kind, _ in rank_competitors(result.records) if kind in RANKED]
 
@@ -304,8 +300,8 @@ def _figures(result: Result) -> Iterator[Figure]:
         yield Figure(
             "front",
             "Cost and time",
-            "Cost against the processor time of a measurement, of simulated world and competitor together. No other "
-            "competitor has a lower error cost in as much time as those on the front, the line; open: asked in Python.",
+            "Cost against the competitor's processor time of a measurement. No other competitor has a lower error cost "
+            "in as much time as those on the front, the line; open: in Python, not compiled.",
             f"On the front, the quickest first: {', '.join(front(points))}.",
         )
     curves = set() if result.curves is None else {str(name) for name in result.curves}
@@ -351,8 +347,8 @@ def _figures(result: Result) -> Iterator[Figure]:
         yield Figure(
             "track",
             "A track to look at",
-            f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, what was "
-            "measured, estimates, and their covariances at two standard deviations. Move the slider.",
+            f"The first episode (seed {result.track.attrs.get('seed', '?')}), not selected: truth, "
+            "measurements, estimates, and their covariances at two standard deviations. Move the slider.",
             "An animation of one episode; its numbers are in the table above, over all episodes.",
         )
     if any(one.track is not None for one in result.worst):

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import Record
-from ...evaluation.running.times import EQUAL_TIMES, times_of_records
+from ...evaluation.running.times import longest_equal, times_of_records
 from ..tables.ranking import find_record, ranking, rival_of
 from ..tables.results import Result
 from ..tables.terminal_tables import HEADLINE, consistency_word
 
 HALF = (0.45, 0.55)
-"""Range of the cost ratio that is called half."""
+"""Range of the cost ratio that sentences call "half"."""
 
 
 def outcome_sentences(results: Sequence[Result]) -> list[str]:
@@ -29,17 +29,18 @@ def outcome_sentences(results: Sequence[Result]) -> list[str]:
     return [sentence_of(result) for result in usual if ranking(result.records)]
 
 
-def own_sentences(records: Sequence[Record], own: Sequence[str], paper: str) -> list[str]:
-    """Return a sentence for each of the user's competitors on its cost against the paper's algorithm and the best of
-    the others, and on its consistency.
+def own_sentences(records: Sequence[Record], user_names: Sequence[str], paper: str) -> list[str]:
+    """Return a sentence for each of the user's competitors: cost against the paper's algorithm and the best, ANEES.
 
     Args:
         records: records of one environment and scenario with a truth.
-        own: names of the user's competitors.
+        user_names: names of the user's competitors.
         paper: name of the paper's algorithm; it may be missing in the records.
     """
     return [
-        _own_sentence(records, name, paper) for name in own if find_record(records, name, "geometric_cost")
+        _own_sentence(records, name, paper)
+        for name in user_names
+        if find_record(records, name, "geometric_cost")
     ]
 
 
@@ -65,9 +66,7 @@ def _own_sentence(records: Sequence[Record], name: str, paper: str) -> str:
 
 
 def _comparison(difference: Record, other: str, first: bool) -> str:
-    """Return how far a cost is above or below another's, where the interval of their paired ratio excludes one; the
-    first comparison of a sentence names the quantity.
-    """
+    """Return a clause on a paired cost difference: ``level with NAME``, or ``3.1 % less than NAME``."""
     value = difference.value or 0.0
     if _low(difference) <= 0.0 <= _high(difference):
         return f"level with {other}"
@@ -78,7 +77,7 @@ def _comparison(difference: Record, other: str, first: bool) -> str:
 
 
 def protocol_sentences(results: Sequence[Result]) -> list[str]:
-    """Return sentences on the basis of the outcome sentences and of the table below them.
+    """Return sentences on episodes, split, seed and statistics of the comparison; empty without records.
 
     Args:
         results: results as in :func:`outcome_sentences`.
@@ -102,7 +101,7 @@ def _any_default(results: Sequence[Result]) -> bool:
 
 
 def sentence_of(result: Result) -> str:
-    """Return the sentence on one environment and scenario with at least one ranked competitor."""
+    """Return the outcome sentence on one environment and scenario with at least one ranked competitor."""
     places = ranking(result.records)
     first = _best_clause(result, places[0])
     rival = rival_of(places, result.learned)
@@ -160,9 +159,9 @@ class Lead(NamedTuple):
     name: str
     """Name of the leader where the most time is allowed."""
     first: float
-    """Lower end, ns."""
+    """Shortest of these times, ns."""
     last: float
-    """Upper end, ns: the time of the competitor that ends the lead."""
+    """Longest of these times, ns: that of the competitor that ends the lead."""
 
 
 def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) -> Lead | None:
@@ -197,7 +196,7 @@ def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) ->
                     name
                     for name in known
                     if ((name in learned) == (origin == "learned")) is own
-                    and times[name] <= first * (1.0 if own else EQUAL_TIMES)
+                    and times[name] <= (first if own else longest_equal(first))
                 ),
                 None,
             )
@@ -219,7 +218,7 @@ def _high(record: Record) -> float:
 
 
 def _percent(share: float) -> str:
-    """Return the percentage in two digits, or in three near 100."""
+    """Return a share as a percentage in two digits, or in three near 100."""
     percent = 100.0 * share
     digits = 1 if abs(percent) < 9.95 or 99.0 <= percent < 100.0 else 0
     return f"{percent:,.{digits}f}"

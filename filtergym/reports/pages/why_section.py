@@ -10,7 +10,7 @@ from ..tables.terminal_tables import with_interval
 
 
 def why_section(result: Result) -> list[dict[str, Any]]:
-    """Return the template's values of every competitor whose cost is split: explained ones first, and open.
+    """Return the template's values of every competitor whose cost is split by cause, explained ones first.
 
     Args:
         result: result of one environment and scenario.
@@ -67,13 +67,13 @@ def main_causes_in_words(one: WorstTrack, phrases: Mapping[str, str]) -> str:
 
     Args:
         one: the episode.
-        phrases: when each cause holds, by name.
+        phrases: condition of each cause in words, by its name.
     """
     return ", ".join(phrases.get(cause, cause) for cause in one.causes) or "under no cause in particular"
 
 
 def worst_data(result: Result) -> list[dict[str, Any]]:
-    """Return the worst episodes in the form of the page's figure."""
+    """Return the worst episodes that have a track, as values for the page's figure."""
     return [
         {
             "policy": one.policy,

@@ -1,4 +1,4 @@
-"""An advice in words and as a table: the filter, its parameters, and the reasons."""
+"""Tables and sentences on a recommended filter, its parameters, and the reasons."""
 
 import math
 import textwrap
@@ -21,7 +21,7 @@ MOST_OUTLIERS = 12
 """Largest number of outliers in a sentence."""
 MOST_ROWS = 12
 LEAST_CORRELATION = 0.1
-"""Correlation of successive prediction errors from which the advice mentions it."""
+"""Correlation of successive prediction errors from which a sentence mentions it."""
 SMALL_SCALE = 0.3
 """Scale of the noise below which most of the error lasts longer than a measurement, or the stated
 deviations are wrong.
@@ -44,13 +44,13 @@ PRICES = {
 NEGLIGIBLE = 5e-4
 """Difference of errors that is zero in the digits of a sentence."""
 FEW = 80
-"""Number of measurements below which an advice warns."""
+"""Number of measurements below which a sentence warns."""
 FEWEST_MEASUREMENTS = 30
 """Least number of measurements of an informative log; a choice: six for each of some five parameters."""
 
 
 def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
-    """Compare the advised filter with the other fitted ones, its rival, the best in hindsight and the next ones.
+    """Return a table of the advised filter, the other fitted ones, its rival and the next best filters.
 
     Args:
         advice: advice from :func:`~..baselines.advice.advise`.
@@ -60,7 +60,7 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
     has_truth = recording.truth is not None
     judged = sum(span.last - span.first for span in advice.share.judged)
     table = Table(
-        title=f"{recording.name}: {judged:,} measurements that judge (95 % intervals)", title_justify="left"
+        title=f"{recording.name}: {judged:,} test measurements (95 % intervals)", title_justify="left"
     )
     table.add_column("filter", no_wrap=True)
     for title, width in advice_columns(advice).items():
@@ -70,9 +70,9 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
     what = "estimates" if has_truth else "predictions"
     table.caption = (
         "nats: log-likelihood per measurement where filters were chosen, less one nat in all for each fitted parameter."
-        f"\nless, against: paired with {advice.rival}, the rival: what one would take of the shipped ones by the "
-        f"measurements that chose, on those that judge; RMSE: of {what}.\nNIS: mean, 1 where innovations are as large "
-        "as predicted; correlation: of successive prediction errors, 0 where they are white."
+        f"\nless, against: paired with {advice.rival}, the rival (the shipped filter chosen on the same measurements), "
+        f"on the test measurements; RMSE: of {what}.\nNIS: mean, 1 where innovations are as large as predicted; "
+        "correlation: of successive prediction errors, 0 where they are white."
     )
     if advice.onboard is not None:
         table.caption += f"\nwithheld: RMSE at {advice.onboard.fixes:,} withheld fixes, m."
@@ -81,7 +81,7 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
 
 
 class Row(NamedTuple):
-    """A row of the table of an advice."""
+    """A row of the table that compares the recommended filter with others."""
 
     name: str
     label: str
@@ -90,21 +90,19 @@ class Row(NamedTuple):
 
 
 def advice_columns(advice: Advice) -> dict[str, int]:
-    """Return the columns of the table of an advice, and their least widths."""
+    """Return the least width of each column of the table of compared filters, by its title."""
     return {**COLUMNS, **({} if advice.onboard is None else WITHHELD)}
 
 
 def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
-    """Return the rows of the table: the advised filter first, the vehicle's own last; arguments as of
-    :func:`advice_table`.
-    """
+    """Yield the rows of :func:`advice_table`: the advised filter first, the vehicle's own filter last."""
     errors = None if advice.onboard is None else advice.onboard.errors
     has_truth = advice.recording.truth is not None
     known = advice.rival, advice.best_shipped
     keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
     room = MOST_ROWS - len(keep)
     rest: list[JudgedFilter] = []
-    for each in advice.competitors:  # a filter that answers as another does in this log needs no row
+    for each in advice.competitors:  # a filter whose results on this log equal another's needs no row
         if each not in keep and not any(_has_same_results(each, other) for other in [*keep, *rest]):
             rest.append(each)
     agents = [c for c in rest if c.name in learned]
@@ -125,9 +123,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
 
 
 def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the cost of an update of each filter of :func:`advice_table`, in the order of ``PRICES``; empty where none
-    is known.
-    """
+    """Return name and cost of an update of each filter of :func:`advice_table`; empty if none is known."""
     names = [row.name for row in advice_rows(advice, learned) if row.name != ONBOARD]
     prices = {name: advice.prices[name] for name in names}
     cells = {
@@ -138,7 +134,7 @@ def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[
 
 
 def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
-    """Return a table of :func:`price_rows`; None where there are none."""
+    """Return a table of the cost of an update of each compared filter; None if none is known."""
     rows = price_rows(advice, learned)
     if not rows:
         return None
@@ -158,7 +154,7 @@ def _has_same_results(one: JudgedFilter, other: JudgedFilter) -> bool:
 
 
 def reading_lines(recording: Recording) -> Iterator[str]:
-    """Return sentences on the log before a fit: its size, the errors of its measurements, and notes."""
+    """Yield sentences on a log as it was read: size, deviations of its measurements, and notes."""
     seconds = recording.seconds
     steps = numpy.diff(seconds, axis=1)
     missed = ""
@@ -187,7 +183,7 @@ def reading_lines(recording: Recording) -> Iterator[str]:
 
 
 def _extent(recording: Recording) -> Iterator[str]:
-    """Return the span and the speed of the positions, which show a wrong unit to a reader who knows the target."""
+    """Yield a sentence on the span and speeds of a log's positions, by which a user finds a wrong unit."""
     position = recording.measurements.get("position")
     if position is None:
         return
@@ -206,7 +202,7 @@ def _extent(recording: Recording) -> Iterator[str]:
 
 
 def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
-    """Return the results of the advised filter on the judged measurements; None where unknown."""
+    """Return the advised filter's results on the measurements withheld for judgement, by name; None: unknown."""
     one = advice.advised
     numbers = {
         "measurements": float(sum(span.last - span.first for span in advice.share.judged)),
@@ -244,7 +240,7 @@ def _interval(estimate: IntervalEstimate, form: str) -> str:
 
 
 def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Return lines on the advised filter, its parameters, their certainty, and unknown quantities.
+    """Yield lines on the advised filter, its parameters, their certainty, and unknown quantities.
 
     Args:
         advice: advice from :func:`~..baselines.advice.advise`.
@@ -260,13 +256,11 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
 
 
 def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Return sentences on the certainty of the advice and on unknown quantities; arguments as of
-    :func:`advice_lines`.
-    """
+    """Yield the sentences of :func:`advice_lines` after the parameters: certainty, and unknown quantities."""
     yield from _onboard(advice)
     yield from _hindsight(advice)
     yield from _fits(advice)
-    yield from _dearer(advice)
+    yield from _likeliest(advice)
     yield from _outliers(advice)
     if not advice.tunables[advice.fitted.name].anchored:
         yield from _noise(advice)
@@ -275,28 +269,28 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     yield from _agents(advice, learned)
 
 
-def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
-    """Return the fitted parameters in lines, with units and intervals.
+def parameter_lines(tunable: Tunable, fit: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
+    """Yield a line for each fitted parameter, with unit and interval.
 
     Args:
         tunable: the fitted filter.
-        found: its fit.
+        fit: its fit.
         intervals: intervals of the parameters.
     """
-    for name, value in found.values.items():
-        text = parameter_text(name, value, intervals.get(name), tunable, name in found.at_limit)
+    for name, value in fit.values.items():
+        text = parameter_text(name, value, intervals.get(name), tunable, name in fit.at_limit)
         line = " ".join(part for part in (parameter_name(name), *text[:3]) if part)
         yield line + (f": {text.remark}" if text.remark else "")
 
 
 def verdict(advice: Advice) -> str:
-    """Return the first sentence."""
+    """Return the first sentence of a recommendation: the filter, and its error against its rival's."""
     one, rival = advice.fitted, advice.rival
     judged = sum(span.last - span.first for span in advice.share.judged)
     where = (
-        f"on {judged:,} measurements that neither was chosen by"
+        f"on {judged:,} measurements on which neither was chosen"
         if advice.share.apart
-        else f"on the same {judged:,} measurements that it was fitted to, which flatters it"
+        else f"on the same {judged:,} measurements to which it was fitted, where its error is underestimated"
     )
     if one is not advice.advised and one.relative_error.low > 0.0 and one.gain.value > 0.0:
         return (
@@ -322,8 +316,8 @@ def verdict(advice: Advice) -> str:
     if math.isnan(one.relative_error.value):
         return f"{name}: {one.difference.value:+.3f} nats per measurement against {rival}, {where}."
     text = (
-        f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter that one would take by the "
-        f"same measurements, {where}."
+        f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter chosen on the same "
+        f"measurements, {where}."
     )
     if one.relative_error.low <= 0.0 <= one.relative_error.high:
         costs = _operations(advice, rival, one.name)
@@ -334,13 +328,13 @@ def verdict(advice: Advice) -> str:
 
 
 def _operations(advice: Advice, name: str, other: str) -> str:
-    """Return the operations of an update of a filter beside another's; empty where one of them is unknown."""
+    """Return a clause that compares the operations of an update of two filters; empty if one is unknown."""
     one, two = (advice.prices.operations(each) for each in (name, other))
     return f"takes {one:,.0f} operations an update for {two:,.0f}" if max(one, two) < math.inf else ""
 
 
 def _amount(advice: Advice, relative: IntervalEstimate) -> str:
-    """Return how much less or more error, with its interval."""
+    """Return a relative error as text: ``3.1 % less error [1.0, 5.2]``."""
     value, low, high = _percent(relative)
     kind = "error" if advice.recording.truth is not None else "error of prediction"
     less = value <= 0.0
@@ -352,9 +346,7 @@ def _amount(advice: Advice, relative: IntervalEstimate) -> str:
 
 
 def _hindsight(advice: Advice) -> Iterator[str]:
-    """Return a sentence on the shipped filter that was best on the judged measurements, which is known in hindsight
-    only.
-    """
+    """Yield a sentence on the shipped filter with the smallest error on the measurements withheld for judgement."""
     best, relative = advice.best_shipped, advice.hindsight
     if best in (advice.advised.name, advice.rival) or not abs(relative.value) >= NEGLIGIBLE:
         return
@@ -366,27 +358,28 @@ def _hindsight(advice: Advice) -> Iterator[str]:
 
 
 def _onboard(advice: Advice) -> Iterator[str]:
-    """Return sentences on the vehicle's own filter, and on the bias in its favour."""
+    """Yield a sentence on the errors of the vehicle's own filter, and on the bias in its favour."""
     found = advice.onboard
     if found is None:
         return
     name, relative = advice.advised.name, _interval(_percent(found.relative), "+.1f")
     yield (
-        f"One in {ONE_IN} of the fixes was withheld. On {found.fixes:,} that judge, the estimates of {name} lie "
-        f"{found.errors[name]:.3g} m from them, and those of the vehicle's own filter ({found.source}), "
-        f"{found.delay:.2f} s before, {found.errors[ONBOARD]:.3g} m: {relative} %. That filter has seen the earlier "
-        "withheld fixes, which the others have not, and an inertial sensor: its row is an optimistic bound. Where "
-        "errors of fixes last, filters that follow them come closer to the fixes, and no closer to the truth."
+        f"One in {ONE_IN} of the fixes was withheld. At {found.fixes:,} of these, among the test measurements, the "
+        f"estimates of {name} are off by {found.errors[name]:.3g} m, and those of the vehicle's own filter "
+        f"({found.source}), {found.delay:.2f} s before, by {found.errors[ONBOARD]:.3g} m: {relative} %. That filter "
+        "has used the earlier withheld fixes, which the others have not, and an inertial sensor: its row is an "
+        "optimistic bound. Where errors of fixes last, filters that follow them come closer to the fixes, and no "
+        "closer to the truth."
     )
 
 
 def parameter_name(key: str) -> str:
-    """Return a parameter's name in words, from its name in the search."""
+    """Return a parameter's name in words, from its name in the search, such as ``log10_process_noise``."""
     return key.removeprefix("log10_").replace("_", " ")
 
 
 def parameter_size(key: str, value: float) -> float:
-    """Return a parameter's value, from its value in the search."""
+    """Return a parameter's value, from its value in the search, which may be a decimal logarithm."""
     return float(10.0**value) if key.startswith("log10_") else float(value)
 
 
@@ -403,7 +396,7 @@ class ParameterText(NamedTuple):
 def parameter_text(
     key: str, value: float, interval: Interval | None, tunable: Tunable, is_at_limit: bool
 ) -> ParameterText:
-    """Return a fitted parameter in words with its interval, and whether it is identifiable.
+    """Return a fitted parameter as texts: value, interval, unit, and a remark if it is not identifiable.
 
     Args:
         key: name in the search.
@@ -453,8 +446,8 @@ def _fits(advice: Advice) -> Iterator[str]:
         )
 
 
-def _dearer(advice: Advice) -> Iterator[str]:
-    """Return the gain of the likeliest filter, where a cheaper one is as good."""
+def _likeliest(advice: Advice) -> Iterator[str]:
+    """Yield a sentence on the filter of the highest likelihood, where a cheaper one is advised."""
     if advice.likeliest is None or math.isnan(advice.likeliest[1].value):
         return
     name, gain = advice.likeliest
@@ -466,7 +459,7 @@ def _dearer(advice: Advice) -> Iterator[str]:
 
 
 def _outliers(advice: Advice) -> Iterator[str]:
-    """Return a sentence on the measurements classified as outliers, by row and time."""
+    """Yield a sentence on the measurements classified as outliers, by row and time."""
     found, recording = advice.outliers, advice.recording
     count = int(found.sum())
     if OUTLIER_SHARE not in advice.fits[advice.fitted.name].values:
@@ -490,7 +483,7 @@ def _outliers(advice: Advice) -> Iterator[str]:
 
 
 def _noise(advice: Advice) -> Iterator[str]:
-    """Return the meaning of the fitted scale of the noise, and its limits."""
+    """Yield sentences on the meaning of the fitted scale of the measurement noise."""
     one = advice.fitted
     if NOISE_SCALE in advice.fits[one.name].values:
         scale = 10.0 ** advice.fits[one.name].values[NOISE_SCALE]
@@ -516,7 +509,7 @@ def _noise(advice: Advice) -> Iterator[str]:
 
 
 def _anchor(advice: Advice) -> Iterator[str]:
-    """Return the reason for or against a filter with a second sensor, and the meaning of its likelihood."""
+    """Yield a sentence on the reason for or against a filter that uses a second sensor."""
     anchor = advice.anchor
     if anchor is None:
         return
@@ -562,7 +555,7 @@ def _warnings(advice: Advice) -> Iterator[str]:
 
 
 def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
-    """Return a sentence on the learned agents, which were trained on other data."""
+    """Yield a sentence on the learned agents, which were trained on other data."""
     found: list[JudgedFilter] = [
         c for c in advice.competitors if c.name in learned and not math.isnan(c.relative_error.value)
     ]

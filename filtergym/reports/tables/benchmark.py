@@ -53,7 +53,7 @@ cost as much as many.
 
 
 class Cell(NamedTuple):
-    """One environment in one scenario."""
+    """A cell of a benchmark: one environment in one scenario, with its competitors and episodes."""
 
     problem: Problem
     scenario: str
@@ -67,12 +67,12 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Beginning of the names of the cell's files."""
+        """Beginning of the cell's file names."""
         return f"{self.problem.short_name}.{self.scenario}"
 
     @property
     def measurements(self) -> int:
-        """Measurements of all policies together."""
+        """Number of measurements that all competitors of the cell process together."""
         return self.episodes * _horizon(self.problem.task, self.scenario) * len(self.policies)
 
 
@@ -81,10 +81,10 @@ def _horizon(cls: Any, scenario: str) -> int:
 
 
 def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[str, ...]:
-    """Return the names of a cell's competitors, the paper's algorithm first.
+    """Return the names of the competitors of a benchmark in one environment, the paper's algorithm first.
 
-    Quick: the most informative ones, tuned where that has won and episodes are not long; other tuned ones; shipped
-    agents. Full: every policy and estimator as it is, tuned ones, shipped agents, smoothers, references, bounds.
+    Quick: the most informative ones, tuned where tuning lowers the cost and episodes are not long, and shipped agents.
+    Full: every policy and estimator, untuned and tuned, shipped agents, smoothers, references, bounds.
 
     Args:
         problem: problem of the competitors.
@@ -104,8 +104,7 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
 
 
 def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
-    """Return the number of episodes that a competitor runs in some seconds: 2000, or 400 where a measurement takes
-    long.
+    """Return the number of episodes, at most ``most``, that a competitor runs in some ten seconds.
 
     Args:
         problem: problem of the competitor.
@@ -116,10 +115,8 @@ def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
     return min(most, max(FEWEST_EPISODES_FULL, int(2.0 * FULL_SECONDS / seconds)))
 
 
-def without_smoothers_of_closed_loops(
-    problem: Problem, names: Sequence[str], scenario: Any
-) -> tuple[str, ...]:
-    """Return the names of competitors that can run in a scenario: in a closed loop there is no smoothing."""
+def drop_smoothers_of_closed_loops(problem: Problem, names: Sequence[str], scenario: Any) -> tuple[str, ...]:
+    """Return the names of competitors without the smoothers, if the scenario is a closed loop."""
     smoothers = {*names} & {*problem.baselines.smoothers}
     if not smoothers or not make_task(problem.task, scenario).closes_loop:
         return tuple(names)
@@ -127,9 +124,9 @@ def without_smoothers_of_closed_loops(
 
 
 def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> list[Cell]:
-    """Return the cells: quick, the default scenario, on which the verdict rests; full, all of them and more episodes.
+    """Return the cells (environment and scenario) of a benchmark: quick, the default scenario; full, all of them.
 
-    Held-out scenarios are for final tables: on another split than "test" only training scenarios run.
+    On another split than "test" only training scenarios run.
     """
     wanted = []
     for id in environments or catalogue():
@@ -146,9 +143,7 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
                 affordable = int(FULL_SECONDS / problem.baselines.measurement_seconds)
                 measurements, fewest = min(10 * MEASUREMENTS, affordable), FEWEST_EPISODES_FULL
             episodes = max(fewest, min(5000 if full else 500, measurements // horizon))
-            names = without_smoothers_of_closed_loops(
-                problem, benchmark_policies(problem, full, horizon), name
-            )
+            names = drop_smoothers_of_closed_loops(problem, benchmark_policies(problem, full, horizon), name)
             wanted.append(Cell(problem, name, episodes, names))
     return wanted
 
@@ -158,9 +153,9 @@ def result_of(
     evaluation: Evaluation,
     learned: Sequence[str],
     worst: Mapping[str, Sequence[WorstTrack]] | None = None,
-    own: Sequence[str] = (),
+    user_names: Sequence[str] = (),
 ) -> Result:
-    """Convert an evaluation into the content of a file of results.
+    """Return an evaluation as a :class:`Result`, the content of a file of results.
 
     Args:
         problem: the evaluated problem.
@@ -169,7 +164,7 @@ def result_of(
         learned: names of learned competitors.
         worst: worst episodes of the competitors whose cost is explained, by name; default: the paper's algorithm,
             without episodes.
-        own: names of the user's own competitors.
+        user_names: names of the user's own competitors.
     """
     dataset, records, curves = evaluation.dataset, evaluation.records, evaluation.curves
     assert curves is not None
@@ -177,7 +172,7 @@ def result_of(
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
     worst = worst or {name: [] for name in [paper] if name in names}
-    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned, own), *worst]))
+    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned, user_names), *worst]))
     components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
     named = cls.scenarios.get(scenario)
     return Result(
@@ -197,19 +192,19 @@ def result_of(
         phrases_of(dataset),
         list(worst),
         [one for episodes in worst.values() for one in episodes],
-        list(own),
+        list(user_names),
     )
 
 
 class BenchmarkOptions(NamedTuple):
-    """Content and execution of a benchmark."""
+    """Options of a benchmark: scenarios, competitors, episodes and execution."""
 
     full: bool = False
     """All scenarios and policies, and more episodes."""
     seed: int = 0
     """Number of the experiment."""
     environments: Sequence[str] = ()
-    """Ids; empty: all."""
+    """Gymnasium ids; empty: all environments."""
     split: str = "test"
     """Split of the episodes; another one than test is for development."""
     backend: str = "auto"
@@ -226,7 +221,7 @@ class BenchmarkOptions(NamedTuple):
     """Whether to measure the processor time of every competitor, which differs from run to run."""
 
     def requests(self, cell: Cell) -> list[EvaluationRequest]:
-        """Return the requests of a cell."""
+        """Return the evaluation requests of a cell, one for each competitor."""
         experiment = cell.problem.experiment(
             cell.scenario,
             cell.episodes,
@@ -266,7 +261,7 @@ class _Results:
         self._reported = 0
 
     def add(self, i: int, name: str, summary: Summary) -> None:
-        """Add the summary of a competitor of a cell, and report all results that are due."""
+        """Add the summary of a competitor to cell ``i``; pass results of complete cells to the callbacks, in order."""
         cell, found = self.wanted[i], self._summaries[i]
         found[name] = summary
         if len(found) == len(cell.policies):
@@ -278,7 +273,7 @@ class _Results:
             self._reported += 1
 
     def all(self) -> list[Result]:
-        """Return the results, in the order of the cells."""
+        """Return the results of all complete cells, in their order."""
         return [result for result in self._results if result is not None]
 
 
@@ -288,7 +283,7 @@ def run_benchmark(
     callbacks: Callbacks | None = None,
     workers: Workers | None = None,
 ) -> list[Result]:
-    """Run every cell; after an interruption continue with the missing competitors.
+    """Run a benchmark, write ``results.json``, and return the results; resume after an interruption.
 
     Args:
         folder: folder of ``results.json``; finished competitors are in ``unfinished/`` until all are done.
@@ -372,5 +367,5 @@ def headline_half_width(result: Result) -> float:
 
 
 def all_records(results: Sequence[Result]) -> list[Record]:
-    """Return the records of all results."""
+    """Return the records of all results in one list."""
     return [record for result in results for record in result.records]

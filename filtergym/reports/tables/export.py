@@ -16,7 +16,7 @@ from ...evaluation.storage.files import whole_file, write_text
 
 PREAMBLE = "% In the preamble: \\usepackage{booktabs,graphicx}"
 FITTING = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
-"""Command that shrinks a wider table to the width of the line."""
+"""LaTeX command that shrinks a wider table to the width of the line."""
 SPECIAL = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -52,13 +52,13 @@ GREEK = {
     for letter in map(chr, range(0x3B1, 0x3CA))
     if (name := unicodedata.name(letter, "")) and "FINAL" not in name
 } | {"λ": "lambda"}  # which Unicode spells otherwise
-"""Small letters; omicron has no command."""
+"""Small Greek letters with their LaTeX commands; omicron has none."""
 MINUS = re.compile(r"(?<![\w.)\]])-(?=\.?\d)")
-"""A hyphen before a number."""
+"""Pattern of a hyphen before a number."""
 
 
 LATEX_WIDTH = 160
-"""Columns of a terminal whose tables are written for LaTeX: all columns side by side, with all intervals."""
+"""Width of the terminal whose tables are written for LaTeX, characters: all columns side by side."""
 
 
 def write_records(path: Path, records: Sequence[Any]) -> None:
@@ -155,5 +155,5 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _after_break(line: str) -> str:
-    """Guard the text after a line break: LaTeX takes a bracket for a length and an asterisk for a mark."""
+    """Return a line with ``{}`` before a bracket or asterisk, which LaTeX would read as part of a line break."""
     return ("{}" if line.startswith(("[", "*")) else "") + line

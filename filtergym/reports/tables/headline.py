@@ -1,4 +1,4 @@
-"""One screen: the best of every origin in each environment, with a word on consistency."""
+"""The headline: the best competitor of every origin in each environment, with a word on consistency."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,11 @@ from .results import Result
 from .terminal_tables import HEADLINE, consistency_word, with_interval
 
 SHORT = {"slightly overconfident": "slightly over", "slightly cautious": "slightly under"}
-"""Short words on a covariance for a narrow column."""
+"""Abbreviated words on a covariance for a narrow column."""
 
 
 def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, str, str, str]]]]:
-    """Return for each environment the best of every origin, lowest cost first.
+    """Return for each environment the best competitor of every origin (paper, classical, learned ...).
 
     Args:
         results: results, of which those of training distributions are used; of an environment without one all.

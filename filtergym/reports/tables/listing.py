@@ -18,7 +18,7 @@ FEWEST_COLUMNS = 20
 
 
 def _backend(cls: type[Task]) -> str:
-    """Return the implementation of an environment's steps, and of the exponentials in compiled ones."""
+    """Return a text on how an environment's steps run: compiled or NumPy, and the library of exponentials."""
     compiled = AVAILABLE
     if cls.id in USER_TASKS:  # those of this package can all be traced
         compiled = make_model(cls, backend="auto").backend == "compiled"
@@ -26,12 +26,12 @@ def _backend(cls: type[Task]) -> str:
 
 
 def summary_of(cls: type[Task]) -> str:
-    """Return the first line of an environment's documentation."""
+    """Return the first line of the docstring of an environment's class."""
     return (cls.__doc__ or "").strip().partition("\n")[0]
 
 
 def list_lines(tasks: Mapping[str, type[Task]], width: int | None) -> Iterator[str]:
-    """Yield a line for each environment.
+    """Yield a line for each environment: its id and a summary.
 
     Args:
         tasks: tasks by id.
@@ -43,7 +43,7 @@ def list_lines(tasks: Mapping[str, type[Task]], width: int | None) -> Iterator[s
 
 
 def environment_lines(problem: Problem, width: int, everything: bool = False) -> Iterator[str]:
-    """Describe an environment in lines of at most so many columns; the first is its id.
+    """Yield the lines that describe an environment, at most ``width`` columns wide; the first is its id.
 
     Args:
         problem: the environment and its competitors.

@@ -45,7 +45,7 @@ def ranking(records: Sequence[Record]) -> list[Record]:
 
 
 def rival_of(places: Sequence[Record], learned: Sequence[str]) -> Record | None:
-    """Return the strongest competitor of another origin than the first, learned or classical; None where there is none.
+    """Return the best-placed competitor of the other origin, learned or classical, than the first; None: none.
 
     Args:
         places: ranking of at least one competitor, from :func:`ranking`.
@@ -56,7 +56,7 @@ def rival_of(places: Sequence[Record], learned: Sequence[str]) -> Record | None:
 
 
 def best_competitor(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
-    """Return the best of learned and classical competitors in a scenario, in two or three words.
+    """Return which origin is best in a scenario, with the competitor's name, in two or three words.
 
     It rests on the paired ratio between the best one and the best of the other origin: where its interval contains one,
     no competitor is called best.
@@ -80,7 +80,7 @@ def best_competitor(records: Sequence[Record], learned: Sequence[str] | None = N
 
 
 def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[str] | None = None) -> str:
-    """Return a sentence on the best competitor, by how much it leads, and on the strongest of another origin.
+    """Return a sentence on the competitor of lowest cost, its lead, and the best one of the other origin.
 
     Args:
         records: records of the scenario.
@@ -125,12 +125,12 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
 
 
 def _share(share: float) -> str:
-    """Return the percentage of the thousand resamples."""
+    """Return a share of the bootstrap resamples as a percentage."""
     return f"{100.0 * share:.1f} % of cases" if share >= 0.001 else "less than 0.1 % of cases"
 
 
 def origin(result: Result, name: str, kind: str) -> str:
-    """Return the origin of a competitor.
+    """Return the origin of a competitor: "yours", "paper", "classical", "learned" ...
 
     "yours"; "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator",
     filters of its own; "learned", policy or estimator; "smoother", which uses later measurements; "reference", which
@@ -146,7 +146,7 @@ def origin(result: Result, name: str, kind: str) -> str:
 
 
 def best_of_origins(result: Result) -> list[tuple[str, str]]:
-    """Return origin and name of the best of every origin: the ranked ones by their cost, then the reference."""
+    """Return origin and name of the best competitor of every origin, by cost, then the reference."""
     best: dict[str, str] = {}
     for place in ranking(result.records):
         best.setdefault(origin(result, place.policy, place.kind), place.policy)
@@ -195,7 +195,7 @@ def remarks(results: Sequence[Result]) -> list[str]:
 
 
 def _harms(result: Result) -> list[tuple[float, str]]:
-    """Return the learned agents that cost significantly more than the paper's algorithm: how much, and in words."""
+    """Return excess cost and text of each learned agent that costs significantly more than the paper's algorithm."""
     return [
         (r.value or 0.0, f"`{r.policy}` in {result.short} `{r.scenario}`, {with_interval(r, 100.0)} %")
         for r in result.records

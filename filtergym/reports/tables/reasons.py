@@ -37,13 +37,13 @@ class Reason(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Weight, see :func:`.evaluation.statistics.cause_split.reason_weight`."""
+        """Weight by which causes are ordered, from :func:`.evaluation.statistics.cause_split.reason_weight`."""
         shares = (numpy.array(record.value or 0.0) for record in (self.share, self.measurements))
         return float(reason_weight(*shares))
 
 
 def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
-    """Return the cost of a competitor under each cause, in the order of their declaration; first the whole.
+    """Return the cost of a competitor under each cause; the first one is the whole cost.
 
     Args:
         records: records of one environment and scenario.
@@ -109,20 +109,20 @@ def _percent(record: Record) -> str:
 
 
 def _times(record: Record) -> str:
-    """Return the multiple of the opponent's cost in words: ``2.3 times imm [1.9, 2.8]``."""
+    """Return the ratio to the opponent's cost as text: ``2.3 times imm [1.9, 2.8]``."""
     value, _, interval = with_interval(record, digits=2).partition(" ")
     return f"{value} times {record.component}" + (f" {interval}" if interval else "")
 
 
-def default_explained(records: Sequence[Record], named: Sequence[str], paper: str) -> list[str]:
-    """Return the competitor that sentences are about by default: the first of the user's, else the paper's algorithm,
-    else the cheapest.
+def default_explained(records: Sequence[Record], names: Sequence[str], paper: str) -> list[str]:
+    """Return the name of the competitor whose cost is explained by default, in a list of at most one.
 
     Args:
         records: records of one environment and scenario.
-        named: names that the user gives.
+        names: names from the command line; the first ranked one is taken, else the paper's algorithm, else the
+            cheapest.
         paper: name of the paper's algorithm.
     """
     ranked = [name for name, kind, _ in rank_competitors(records) if kind in RANKED]
-    wanted = [name for name in [*named, paper, *ranked] if name in ranked]
+    wanted = [name for name in [*names, paper, *ranked] if name in ranked]
     return wanted[:1]

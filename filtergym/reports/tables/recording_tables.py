@@ -10,13 +10,13 @@ from rich.table import Table
 from .terminal_tables import competitors_table, first_fitting, with_interval
 
 LIKELIHOOD = (
-    "log-likelihood: of what was measured, as it was predicted, nats a measurement; the higher the better, if errors "
-    "are white; less: than the best's, paired. Mean NIS: normalised innovation squared over its dimension; in the band "
-    "if innovations are as large as predicted; - : it reports none."
+    "log-likelihood: of a measurement under its prediction, mean, nats; the higher the better, if errors are white; "
+    "less: paired difference from the best. Mean NIS: normalised innovation squared over its dimension; in the band if "
+    "innovations are as large as predicted; - : not reported."
 )
 PREDICTIONS = (
-    "Error of prediction: of the measurement by the estimate before it, RMSE. Correlation: of successive innovations, "
-    "0 where they are white."
+    "Error of prediction: RMSE of a measurement's prediction from the estimate before it. Correlation: of successive "
+    "innovations, 0 where they are white."
 )
 
 
@@ -25,9 +25,9 @@ def recording_tables(
     differences: Mapping[str, Any],
     has_truth: bool,
     width: int,
-    own: Collection[str] = (),
+    user_names: Collection[str] = (),
 ) -> list[Table]:
-    """Compare competitors by their predictions of each measurement.
+    """Return tables that compare competitors by their predictions of a recording's measurements.
 
     Args:
         records: tidy records of one recording.
@@ -35,7 +35,7 @@ def recording_tables(
             stretches of measurements.
         has_truth: whether other tables contain errors and costs.
         width: columns of the terminal; columns that do not fit stand below.
-        own: names of the user's own competitors, whose rows are marked.
+        user_names: names of the user's own competitors, whose rows are marked.
     """
     found = {(r.policy, r.metric, r.component): r for r in records if r.window == "all"}
 
@@ -52,7 +52,7 @@ def recording_tables(
         _prediction_columns(records, found),
     ]
     parts = [part for part in parts if part]
-    tables = _beside(functools.partial(competitors_table, names, own=own), parts, width)
+    tables = _beside(functools.partial(competitors_table, names, user_names=user_names), parts, width)
     first = records[0]
     episodes = f"{first.episodes} episode{'s' if first.episodes > 1 else ''}"
     tables[0].title = f"{first.environment}, recording {first.scenario} ({episodes}; 95 % intervals)"
@@ -62,7 +62,9 @@ def recording_tables(
     notes += [f"{PREDICTIONS} Intervals are over stretches of measurements."] if len(parts) > 2 else []
     notes += [f"95 % band of the mean NIS: {bands.pop()}."] if len(bands) == 1 else []
     if any(record.kind == "smoother" for record in records) and not has_truth:
-        notes.append("A smoother predicts nothing: --estimates writes what it has found, with its deviation.")
+        notes.append(
+            "A smoother makes no predictions: --estimates writes its estimates, with their deviations."
+        )
     tables[-1].caption = "\n".join(notes)
     return tables
 
@@ -71,7 +73,7 @@ Column = Callable[[str], str]
 
 
 def _beside(draw: Callable[..., Table], parts: Sequence[Mapping[str, Column]], width: int) -> list[Table]:
-    """Return tables of groups of columns, with as many groups side by side as fit, the rest below."""
+    """Return tables of groups of columns: as many groups side by side as fit into ``width``, the rest below."""
     for count in range(len(parts), 0, -1):
         columns = {title: column for part in parts[:count] for title, column in part.items()}
         looks = [draw(columns, control) for control in (True, False)]

@@ -15,7 +15,7 @@ import xarray
 
 from ...envs.engine.catalogue import bare_name
 from ...evaluation.competitors.kinds import RANKED
-from ...evaluation.running.curves import spread
+from ...evaluation.running.curves import evenly_spaced
 from ...evaluation.running.metrics import Record
 from ...evaluation.storage.code import library_versions
 from ...evaluation.storage.files import write_text
@@ -43,7 +43,7 @@ REQUIRED_DIMENSIONS: dict[str, tuple[str, ...]] = {
 
 
 class Settings(NamedTuple):
-    """How results were made."""
+    """Command and versions with which results were made."""
 
     command: str
     """Command that makes them again."""
@@ -73,14 +73,14 @@ class WorstTrack(NamedTuple):
 
 
 class Result(NamedTuple):
-    """One environment in one scenario."""
+    """Results of one environment in one scenario: records, curves, a track, and texts."""
 
     environment: str
     scenario: str
     description: str
     """Description of the scenario."""
     default: bool
-    """Whether it is the environment's training distribution."""
+    """Whether the scenario is the environment's training distribution."""
     training: bool
     """Whether agents may be trained in it."""
     paper: str
@@ -90,7 +90,7 @@ class Result(NamedTuple):
     learned: list[str]
     """Names of the competitors that were learned."""
     knows: dict[str, str]
-    """Knowledge of references and bounds, by their names."""
+    """What each reference and bound knows of the truth, by its name."""
     notes: list[str]
     """Notes on omissions, in sentences."""
     records: list[Record]
@@ -99,7 +99,7 @@ class Result(NamedTuple):
     track: xarray.Dataset | None
     """Track of one episode, see :func:`track_of`."""
     causes: dict[str, str] = {}  # noqa: RUF012  (never written to)
-    """When each cause of the records holds, by name."""
+    """Condition of each cause in words, by its name."""
     explained: list[str] = []  # noqa: RUF012
     """Names of the competitors whose cost is explained."""
     worst: list[WorstTrack] = []  # noqa: RUF012
@@ -114,14 +114,18 @@ class Result(NamedTuple):
 
 
 def settings_of(command: str) -> Settings:
-    """Return a command with the versions of the running libraries."""
+    """Return the settings of a result: its command, and the versions of the installed libraries."""
     return Settings(command, {"Python": python_version(), **library_versions(LIBRARIES)})
 
 
 def select_competitors(
-    records: Sequence[Record], paper: str, reference: str, learned: Sequence[str], own: Sequence[str] = ()
+    records: Sequence[Record],
+    paper: str,
+    reference: str,
+    learned: Sequence[str],
+    user_names: Sequence[str] = (),
 ) -> list[str]:
-    """Return at most ``MOST_SHOWN`` names of the most informative curves.
+    """Return the names of the competitors whose curves a file of results contains, at most ``MOST_SHOWN``.
 
     The paper's algorithm, the reference, the user's own, the learned, the cheapest of each kind, a bound; then by cost.
     """
@@ -136,13 +140,21 @@ def select_competitors(
     classical = [name for name in by_cost if name not in learned and name != paper]
     first = [name for kind in RANKED for name in [n for n in classical if kinds[n] == kind][:2]]
     bounds = [name for name in kinds if kinds[name] == "bound"]
-    wanted = [paper, reference, *own, *first, *(n for n in by_cost if n in learned), *bounds[:1], *by_cost]
+    wanted = [
+        paper,
+        reference,
+        *user_names,
+        *first,
+        *(n for n in by_cost if n in learned),
+        *bounds[:1],
+        *by_cost,
+    ]
     return list(dict.fromkeys(name for name in wanted if name in kinds))[:MOST_SHOWN]
 
 
 def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
-    """Return curves at fewer times, and every other share of the errors."""
-    fewer = curves.isel(time=spread(curves.sizes["time"], MOST_TIMES))
+    """Return curves at most at ``MOST_TIMES`` times, and error distributions at every other share."""
+    fewer = curves.isel(time=evenly_spaced(curves.sizes["time"], MOST_TIMES))
     return fewer.isel(share=slice(None, None, 2)) if "share" in fewer.dims else fewer
 
 
@@ -175,7 +187,7 @@ def track_of(
     which = [dataset["component"].values.tolist().index(name) for name in components]
     episode = episode.isel(component=which, other_component=which)
     there = numpy.flatnonzero(numpy.isfinite(episode["drawn_estimate"].values).any(axis=(0, 2)))
-    episode = episode.isel(time=spread(int(there[-1]) + 1, TRACK_TIMES))
+    episode = episode.isel(time=evenly_spaced(int(there[-1]) + 1, TRACK_TIMES))
     names = {str(name): str(name).removeprefix("drawn_") for name in kept}
     found = episode.rename(names).transpose(
         "policy", "component", "other_component", "time", missing_dims="ignore"
@@ -206,7 +218,7 @@ def track_of(
 def components_to_draw(
     groups: Mapping[str, Sequence[str]], components: Sequence[str]
 ) -> tuple[list[str], bool]:
-    """Return the components of a drawn track: two of a group that has several, as a plane; else the first three."""
+    """Return the names of the components to draw of a track, and whether the first two span a plane."""
     for parts in groups.values():
         if len(parts) > 1:
             return list(parts[:2]), True
@@ -214,7 +226,7 @@ def components_to_draw(
 
 
 def write_results(path: Path, results: Iterable[Result], settings: Settings) -> None:
-    """Write results completely or not at all.
+    """Write results to a file, completely or not at all.
 
     Raises:
         ValueError: if the file cannot be written.
@@ -239,7 +251,7 @@ def serialise_track(track: xarray.Dataset | None) -> dict[str, Any] | None:
 
 
 def serialise_datasets(result: Result) -> dict[str, Any]:
-    """Return the curves and track in JSON's types."""
+    """Return a result's curves and track in JSON's types."""
     return {
         "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
         "track": serialise_track(result.track),
@@ -247,7 +259,7 @@ def serialise_datasets(result: Result) -> dict[str, Any]:
 
 
 def read_results(path: Path) -> tuple[list[Result], Settings]:
-    """Read a file of :func:`write_results`, or raise an error with the reason.
+    """Return the results in a file of :func:`write_results`, and their settings.
 
     Args:
         path: path of the file, or of the folder that contains it as ``results.json``.
@@ -269,7 +281,7 @@ def read_results(path: Path) -> tuple[list[Result], Settings]:
 
 
 def read_all_results(paths: Sequence[Path]) -> tuple[list[Result], Settings]:
-    """Read several files of results as one.
+    """Return the results of several files in one list, and their settings.
 
     Raises:
         ValueError: if one cannot be read, or they contain a scenario twice.
@@ -300,7 +312,7 @@ def _restore(fields: Any) -> Result:
     for part, found in datasets.items():
         _check_dataset(part, found)
     if result.curves is not None and "rmse" in result.curves and not result.curves.sizes.get("quantity"):
-        raise ValueError("the curves of a result hold errors of nothing")
+        raise ValueError("the curves of a result contain no errors")
     if any((r.environment, r.scenario) != (result.environment, result.scenario) for r in records):
         raise ValueError("a result holds records of another environment or scenario")
     return result

@@ -27,7 +27,7 @@ OWN_ROW = ">"
 
 
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
-    """Return the value and interval in significant digits: ``67.0 [66.6, 67.4]``.
+    """Return a record's value and interval as text in significant digits: ``67.0 [66.6, 67.4]``.
 
     Args:
         record: record with ``value``, ``low`` and ``high``; or None.
@@ -53,12 +53,10 @@ HEADLINE = "geometric_cost_difference"
 """Metric of the first column: geometric mean of the ratios of the episodes' costs to the paper's, less one."""
 
 
-def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
-    """Return the share of lost tracks with its interval, %, and the difference of the mean cost to the paper's
-    algorithm, %.
-    """
+def paper_cells(records: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
+    """Return two cells: share of lost tracks with interval, %, and difference of mean cost to the paper's, %."""
     lost, means = (
-        found.get((*scenario, name, metric, "", "all"))
+        records.get((*scenario, name, metric, "", "all"))
         for metric in ("lost_tracks", "relative_cost_difference")
     )
     shares = with_interval(lost, 100.0, digits=2, negligible=0.005)
@@ -70,13 +68,14 @@ def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
 
 
 def consistency_word(record: Any) -> str:
-    """Return the meaning of a mean NEES over its dimension: an estimator is consistent where its interval contains one.
+    """Return a word on a record of ANEES: "consistent" if its interval contains one, else "overconfident" or
+    "cautious".
 
     Args:
         record: record with ``value``, ``low`` and ``high``; or None.
 
     Returns:
-        One or two words; by less than a factor of two an inconsistent one is "slightly" overconfident or cautious.
+        One or two words; "slightly" marks an inconsistency of less than a factor of two.
     """
     if record is None or record.value is None:
         return "unknown"
@@ -89,26 +88,24 @@ def consistency_word(record: Any) -> str:
 
 
 def is_far_off(value: float) -> bool:
-    """Return whether a mean NEES over its dimension is off by more than a factor of two."""
+    """Return whether an ANEES (mean NEES over its dimension) is outside 0.5 to 2."""
     return not 0.5 <= value <= 2.0
 
 
 def consistency(record: Any) -> str:
-    """Return the mean NEES over the dimension, marked where it is off by more than a factor of two."""
+    """Return the ANEES of a record as text, marked where it is outside 0.5 to 2."""
     if record is None or record.value is None:
         return "-"
     return f"{record.value:.3g}" + (f" {INCONSISTENT}" if is_far_off(record.value) else "")
 
 
 def score_text(record: Any) -> str:
-    """Return the score with its interval; empty where the reference is not significantly better than the paper's
-    algorithm.
-    """
+    """Return a record of the score as text with its interval; "-" where it has no value."""
     return with_interval(record, negligible=1e-9)
 
 
 def main_components(records: Sequence[Any]) -> list[str]:
-    """Return the components of a table: groups such as "position" where there are any, else the first three."""
+    """Return the names of the components in a table: groups such as "position" if any, else the first three."""
     first = records[0]
     names = [
         r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
@@ -117,7 +114,7 @@ def main_components(records: Sequence[Any]) -> list[str]:
 
 
 def select_components(names: Sequence[str]) -> list[str]:
-    """Return the groups among components and groups where there are any, else the first three."""
+    """Return those names that are groups of components, such as "position"; without any, the first three names."""
     # One namesake is no group: "range" is not made of "range_rate".
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
@@ -145,22 +142,22 @@ def results_tables(
     knows: Mapping[str, str],
     width: int,
     paper: str = "",
-    own: Collection[str] = (),
+    user_names: Collection[str] = (),
 ) -> list[Table]:
-    """Compare competitors, lowest cost first: cost against the paper's algorithm, consistency, score, and errors.
+    """Return tables of all competitors, lowest cost first: cost against the paper's, consistency, score, errors.
 
     Args:
         records: tidy records of one environment and scenario.
-        knows: knowledge of references and bounds, by their names.
+        knows: what each reference and bound knows of the truth, by its name.
         width: columns of the terminal; errors that do not fit stand below in tables of their own, so that no number
             is cut.
         paper: name of the paper's algorithm, with which costs are compared.
-        own: names of the user's own competitors, whose rows are marked.
+        user_names: names of the user's own competitors, whose rows are marked.
     """
     first = records[0]
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     names = rank_competitors(records)
-    draw = functools.partial(competitors_table, names, own=own)
+    draw = functools.partial(competitors_table, names, user_names=user_names)
     costs, notes = _cost_columns(records, found, paper)
     exact, rounded = (_error_columns(records, found, intervals) for intervals in (True, False))
     fitting = [
@@ -177,7 +174,7 @@ def results_tables(
         f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)"
     )
     notes += more
-    notes += [f"{OWN_ROW} marks your own."] if any(name in own for name, *_ in names) else []
+    notes += [f"{OWN_ROW} marks your own."] if any(name in user_names for name, *_ in names) else []
     smoothers = [name for name, kind, _ in names if kind == "smoother"]
     notes += [f"{NOT_CAUSAL}: {', '.join(smoothers)}."] if smoothers else []
     notes += [f"{name} knows {knows[name]}." for name, *_ in names if name in knows]
@@ -199,14 +196,14 @@ RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
 def _cost_columns(
     records: Sequence[Any], found: Mapping[Any, Any], paper: str
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the columns on cost, consistency and time, and the sentences that explain them."""
+    """Return the columns on cost, consistency and time by title, and the notes that explain them."""
     columns: dict[str, Callable[[str], str]] = {
         cost_title(paper): lambda name: with_interval(
             found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
         ),
         "cost": lambda name: with_interval(found.get((name, "cost", "", "all"))),
-        "lost\ntracks, %": lambda name: against_paper(found, name)[0],
-        "means,\n%": lambda name: against_paper(found, name)[1],
+        "lost\ntracks, %": lambda name: paper_cells(found, name)[0],
+        "means,\n%": lambda name: paper_cells(found, name)[1],
         "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
     }
     compared = any(r.metric == HEADLINE and r.value is not None for r in records)
@@ -272,7 +269,7 @@ def _tables_below_each_other(
 
 
 def first_fitting(tables: Iterable[Table], width: int) -> Table | None:
-    """Return the first table that fits into the available columns."""
+    """Return the first of some tables that fits into ``width`` columns; None if none does."""
     return next((table for table in tables if _widest(table) <= width), None)
 
 
@@ -294,7 +291,7 @@ def competitors_table(
     columns: Columns,
     control: bool,
     compact: bool = False,
-    own: Collection[str] = (),
+    user_names: Collection[str] = (),
 ) -> Table:
     """Return a table of the competitors, with unranked ones in sections of their own, and marks on the user's rows."""
     table = plain_table()
@@ -309,12 +306,12 @@ def competitors_table(
             table.add_section()
             section = kind
         control_column = steered if kind == "policy" else f"({kind})"
-        marked = f"{OWN_ROW}\xa0{name}" if name in own else name  # no line holds the mark alone
+        marked = f"{OWN_ROW}\xa0{name}" if name in user_names else name  # no line holds the mark alone
         table.add_row(
             "\n".join(textwrap.wrap(marked, NARROW if compact else WIDE)).replace("\xa0", " "),
             *([control_column] if control else []),
             *(column(name) for column in columns.values()),
-            style="bold" if name in own else None,
+            style="bold" if name in user_names else None,
         )
     return table
 
@@ -335,7 +332,7 @@ SHOWN_OF_FLIGHTS = 8
 def flights_table(
     dataset: Any, records: Sequence[Any], over_all: Sequence[Any], width: int = 10_000
 ) -> Table:
-    """Compare competitors flight by flight: error of the paper's algorithm, and what the others cost against it.
+    """Return a table with a row for each flight: RMSE of the paper's algorithm, and others' cost against it.
 
     Args:
         dataset: dataset of an evaluation of flights.
@@ -348,7 +345,7 @@ def flights_table(
 
 
 def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int) -> Table:
-    """Return the table with a limited number of competitors beside the one of the comparison."""
+    """Return the table of flights with at most ``most`` competitors beside the paper's algorithm."""
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
     names = [name for name, kind, _ in rank_competitors(over_all) if kind in RANKED]
     shown, paper = main_components(over_all), dataset.attrs["paper"]
@@ -400,7 +397,7 @@ def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most
 
 
 def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
-    """Return the values that a search has found beside those from which it started."""
+    """Return a table of the tuned values beside the values from which the search started."""
     table = plain_table(f"{outcome.policy} on {outcome.scenario}")
     table.add_column("value")
     for title in ("untuned", "tuned"):

@@ -24,7 +24,7 @@ def find_worst(
     competitors: Sequence[Competitor],
     explained: Sequence[str],
 ) -> dict[str, list[WorstTrack]]:
-    """Run the worst episodes of some competitors once more, each beside the opponent; return their tracks by name.
+    """Run the worst episodes of some competitors again with their opponents; return the tracks by competitor.
 
     Args:
         experiment: experiment of the evaluation.
@@ -56,13 +56,13 @@ def find_worst(
 
 
 def _label(dataset: xarray.Dataset, number: int) -> str:
-    """Return the identity of an episode: its seed, or in a recording its name there."""
+    """Return the label of an episode: its seed, or its name in a recording."""
     name = "flight" if dataset.attrs["recorded"] else "episode_seed"
     return str(dataset[name].values[number])
 
 
 def find_opponent(records: Sequence[Record], name: str) -> str:
-    """Return the competitor to which the records compare a competitor's cost; empty: none."""
+    """Return the name of the opponent to whose cost a competitor's is compared; empty: none."""
     ratios = [reason.ratio.component for reason in reasons_of(records, name) if reason.ratio is not None]
     return ratios[0] if ratios else ""
 
