@@ -22,6 +22,9 @@ from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.names import shipped_names
 from filtergym.papers.grid import markdown_table
 
+EPISODES = {"UavAutopilot": 500, "LooselyCoupledNavigation": 500, "TightlyCoupledNavigation": 64}
+"""Episodes of a scenario, where they take longer; otherwise :data:`MOST_EPISODES`."""
+MOST_EPISODES = 1000
 HEADER = ("environment", "scenario", "opponent", "less the opponent, %", "runs, %", "ANEES", "time")
 
 
@@ -63,12 +66,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path, help="folders of training runs")
     parser.add_argument("--against", action="append", required=True, help="opponent; repeatable")
-    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--episodes", type=int, help="of a scenario")
     options = parser.parse_args()
     agents: dict[str, list[str]] = {}
     for folder in options.runs:
         agents.setdefault(load_run(folder).environment, []).append(str(best_agent(folder)))
-    rows = [row for id, own in agents.items() for row in rows_of(id, own, options.against, options.episodes)]
+    rows = [
+        row
+        for id, own in agents.items()
+        for row in rows_of(
+            id, own, options.against, options.episodes or EPISODES.get(bare_name(id), MOST_EPISODES)
+        )
+    ]
     print("\n".join(markdown_table(HEADER, rows)))
 
 
