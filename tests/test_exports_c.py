@@ -105,7 +105,7 @@ def test_a_state_keeps_each_number_once_and_nothing_that_is_never_read():
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("known-turn", "of kind reference: an estimator or a policy can be exported"),
+        ("known-turn", "of kind reference: only estimators and policies can be exported"),
         ("imm-smoother", "of kind smoother"),
         ("random", "no straight line of array arithmetic .its actions are drawn"),
     ],
@@ -117,7 +117,7 @@ def test_what_cannot_be_exported_is_refused_by_name(name, sentence):
 
 def test_an_estimator_in_python_is_refused(monkeypatch):
     monkeypatch.setattr(Symmetric, "traceable", False)
-    with pytest.raises(ValueError, match=r"cannot be exported.*does not say that it is traceable"):
+    with pytest.raises(ValueError, match=r"cannot be exported.*does not set traceable"):
         replayed("ManeuveringTarget", Symmetric, episodes=1, measurements=1)
 
 

@@ -15,6 +15,7 @@ from contract import assert_properties
 from made_results import results_of
 
 from filtergym.evaluation.figures.front_figure import FrontPanel
+from filtergym.evaluation.running.curves import evenly_spaced
 from filtergym.evaluation.running.times import points_of_records
 from filtergym.reports.pages.html_report import report_html
 from filtergym.reports.pages.outcome import find_lead, outcome_sentences, own_sentences
@@ -29,7 +30,6 @@ from filtergym.reports.tables.results import (
     read_results,
     select_competitors,
     settings_of,
-    spread,
     write_results,
 )
 from filtergym.reports.tables.terminal_tables import (
@@ -152,8 +152,8 @@ def test_results_are_read_as_they_were_written(result, tmp_path):
 
 def test_a_file_of_results_is_bounded(result):
     assert result.curves.sizes["time"] <= MOST_TIMES
-    assert spread(6000, 100)[[0, -1]].tolist() == [0, 5999]
-    assert spread(3, 100).tolist() == [0, 1, 2]
+    assert evenly_spaced(6000, 100)[[0, -1]].tolist() == [0, 5999]
+    assert evenly_spaced(3, 100).tolist() == [0, 1, 2]
     names = select_competitors(result.records, "imm", "known-turn", ["ppo"])
     assert names[:2] == ["imm", "known-turn"]
     assert len(names) <= MOST_SHOWN

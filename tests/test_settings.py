@@ -25,7 +25,7 @@ from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.sb3_training import training_environment
-from filtergym.agents.settings import merge_settings, parse_settings, read_config
+from filtergym.agents.settings import ESTIMATORS, RIVALS, merge_settings, parse_settings, read_config
 from filtergym.agents.training_run import RunOptions, load_run, new_run, open_run, read_hyperparameters
 from filtergym.agents.training_session import Session
 
@@ -180,8 +180,8 @@ def test_wrong_settings_are_refused(algorithm, keywords, overrides, message):
 
 def test_shipped_hyperparameters_pass_the_check_of_settings():
     for algorithm in training_run.FILES:
-        # A learned estimator steers a filter of its own, and no control.
-        control = {"dqn": "mode", "kalman-net": "kalman-net", "student": "student"}.get(algorithm, "gain")
+        # A learned estimator steers a filter of its own, and no control; a rival one control.
+        control = {"dqn": "mode", **{name: name for name in ESTIMATORS}, **RIVALS}.get(algorithm, "gain")
         new_run(problem_of(ID), RunOptions(algorithm, control, overrides={"learning_rate": 1e-4}))
 
 

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy
 
+from ...envs.contract.controls import SettingsBank
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Reader
 from ..alarm import Alarm, fault_evidence, innovation_evidence
@@ -16,8 +17,8 @@ class RadarAlarm(Alarm):
     """Alarm for a manoeuvre: faulty innovations, a better filter of higher gain, or missed and early scans.
 
     The innovations are those of the filter with the lowest gain: larger, smaller or to one side. Fixed gains do not
-    model a scan that missed the target or came early. For a learned Kalman filter, and for all hypotheses together
-    under control ``hypotheses``, only innovations count: these filters model such scans.
+    model a scan that missed the target or came early. For filters with a covariance only innovations count: they model
+    such scans.
     """
 
     window = 50
@@ -25,7 +26,8 @@ class RadarAlarm(Alarm):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.fixed_gains: bool = model.control in self.task.banks and model.control != "hypotheses"
+        bank = self.task.banks.get(model.control)
+        self.fixed_gains: bool = bank is not None and not issubclass(bank, SettingsBank)
         self.bank: bool = self.fixed_gains and model.control != "gain"
         names = ("innovation_x", "innovation_y", "log_likelihood") if self.bank else ("innovation",)
         self.read: list[Reader] = [model.reader(name) for name in names]

@@ -36,8 +36,8 @@ class Actions(NamedTuple):
     meanings: Mapping[str, str]
     """Meaning of an action in words, by the name of the control."""
     reach: Mapping[str, tuple[str, ...]] = {}
-    """Parameters that fix the range of an action, or its duration, by control or trained bank. A learned policy runs
-    with those that it was trained with: with others the same numbers would be other actions."""
+    """Parameters that fix the range of an action, by control or trained bank. A learned policy runs with those that it
+    was trained with, and with its decision interval: with others the same numbers would be other actions."""
 
 
 class TrainedBanks(NamedTuple):
@@ -104,9 +104,13 @@ def trained_banks(task: Any) -> Mapping[str, type]:
 
 
 def action_reach(task: Any, control: str) -> tuple[str, ...]:
-    """Return the names of the task parameters that set the range or duration of an action of a control."""
+    """Return the names of the task parameters that set the range or duration of an action of a control.
+
+    The duration belongs to every control; the network of a trained bank acts at each measurement.
+    """
     found = find_companion(task, Actions)
-    return () if found is None else found.reach.get(control, ())
+    reach = () if found is None else found.reach.get(control, ())
+    return reach if control in trained_banks(task) else (*reach, "decision_interval")
 
 
 def action_meanings(task: Any) -> Mapping[str, str]:

@@ -148,7 +148,6 @@ class LooselyCoupledNavigation(Task):
                     "receiver_scale",
                     "receiver_reduction",
                     "process_scale",
-                    "decision_interval",
                 ),
                 "gain": ("smallest_gain",),
                 "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),

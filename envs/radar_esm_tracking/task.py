@@ -164,7 +164,7 @@ class RadarEsmTracking(RadarEsmProblem):
                 "each class (r = 1.15), odds that the class has changed (1.3) and of a second emitter (2), process noise "
                 "(2), variance of the radar (1.35); **0 is `exact-bayes`**",
             },
-            {"evidence": ("evidence_scale", "decision_interval")},
+            {"evidence": ("evidence_scale",)},
         ),
         TrainedBanks({"kalman-net": KalmanNetBank}),
         PictureMaker(_picture),
