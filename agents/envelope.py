@@ -125,7 +125,7 @@ class NetworkWatch:
 
 
 def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
-    """Return the range of each observation field in an agent's training, from its file or new episodes.
+    """Return the range of each observation field in an agent's training, as stored, else from simulated episodes.
 
     Args:
         cls: the task.

@@ -270,7 +270,7 @@ def fit_stretches(
 
 
 def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[float]) -> Fit:
-    """Return the fit at ``best``, given the log-likelihoods ``values`` at the ends of all searches."""
+    """Return the fit to ``count`` measurements at ``best``, with maximum and spread of ``values`` of all searches."""
     low, high = numpy.array(list(tunable.limits.values())).T
     edge = 1e-3 * (high - low)
     at_limit = tuple(

@@ -43,7 +43,7 @@ class Problem:
 
     @property
     def name(self) -> str:
-        """Id by which another process imports it, see :func:`.envs.catalogue.importable_name`."""
+        """Id by which another process finds the environment: its Gymnasium id, with ``module:`` before a user's own."""
         return importable_name(self.task)
 
     @property

@@ -246,7 +246,7 @@ class Traced:
 
 
 def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None) -> Traced:
-    """Return numbers or an array as a traced array of constants; a traced array is returned unchanged."""
+    """Return values as a traced array of ``dtype``: a traced array itself, numbers and arrays as constants."""
     if isinstance(values, Traced):
         return values if dtype is None else astype(values, dtype)
     if isinstance(values, list | tuple) and builtins.any(isinstance(value, Traced) for value in values):

@@ -155,7 +155,7 @@ class Picture:
         """Create the panels that a subclass draws beside the time series; called once for a figure."""
 
     def begin(self, state: Any) -> None:
-        """Prepare for a new episode, from its state after the first measurement."""
+        """Prepare the picture for a new episode, given the state after the first measurement; by default do nothing."""
 
     def shading(self) -> Sequence[tuple[float, float]]:
         """Return intervals of measurements, first and last, that every time series shades grey."""

@@ -396,7 +396,7 @@ class Aperture(_OfSatellites):
         return zero
 
     def complete(self, state: Array, draws: Draws) -> Array:
-        """Return ones where the tracking loops of a drawn episode have an aperture, else zeros, ``(N,)``."""
+        """Return the drawn state: one in episodes whose tracking loops have an aperture, else zero, ``(N,)``."""
         return _draw_share(draws, "aperture", self.parameters, state)
 
     def change_measurement(self, state: Array, measurement: Any, step: DisturbanceInput) -> tuple[Array, Any]:

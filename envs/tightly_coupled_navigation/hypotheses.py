@@ -151,7 +151,7 @@ class FaultHypothesesBank(SettingsBank, SatelliteBank):
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return the records of the paper's bank, with the likelihood and NIS of the estimator, by name."""
+        """Return mode probabilities, log-likelihood, NIS, and whether a rate is outside its aperture, by name."""
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
         return {

@@ -52,7 +52,7 @@ Series = tuple[tuple[str, ...], numpy.ndarray]
 
 @one_thread()
 def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarray.Dataset:
-    """Return the curves of an evaluation's figures as a dataset: errors, consistency, probabilities, actions, costs.
+    """Return the data of an evaluation's figures: errors, consistency and actions over time, costs by stretch.
 
     Args:
         dataset: evaluation, in memory or read from a file; also with some of its policies only.

@@ -151,7 +151,7 @@ def _numbers(values: numpy.ndarray) -> list[float | None]:
 
 
 def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tuple[str, float, float]]:
-    """Yield the use of each stretch of a track (fit, choice, judgement), and its first and last second."""
+    """Yield label ("fitted to", "chosen by", "judged by"), first and last second of each stretch of an episode."""
     share = advice.share
     if not share.apart:
         return
