@@ -1,9 +1,8 @@
 r"""Loosely coupled INS and GNSS on one axis: INS error model, plain scheme, augmented error state.
 
-    INS      dX/dt  = dXr/dt + beta + eta + xi,     beta constant,  d eta/dt = -eta / tau + w
-    GNSS     Z      = Xr + zeta
-    plain    dXh/dt = dX/dt + K (Z - Xh),           K = sqrt(Ge / N) when settled
-    error    d delta/dt = beta + eta + xi,          delta = X - Xr,  X - Z = delta - zeta
+    INS      dX/dt  = dXr/dt + beta + eta + xi,     beta constant,  d eta/dt = -eta / tau + w GNSS     Z      = Xr +
+    zeta plain    dXh/dt = dX/dt + K (Z - Xh),           K = sqrt(Ge / N) when settled error    d delta/dt = beta + eta
+    + xi,          delta = X - Xr,  X - Z = delta - zeta
 
 ``xi`` has the intensity G, ``zeta`` N, ``eta`` the stationary variance ``sigma^2``, ``beta`` the variance
 ``sigma_b^2``. This is Fig. 3 of the paper by Benkafo and Lobaty; its (4) and (5) with A = 0 and the

@@ -56,9 +56,9 @@ class LostTracks(NamedTuple):
     cost: float | None = None
     """Mean cost of an episode beyond which its track counts as lost; None where it is not declared."""
     explain: Callable[[Any, Array, Array, Any], str] | None = None
-    """Function of the task, the last valid mean ``(C, N)``, its covariance ``(C, C, N)`` and the following measurement,
-    of N
-    lanes. It returns a sentence on why the filter lost an episode there, empty if there is no explanation."""
+    """Function of the task, the last valid mean ``(C, N)``, its covariance ``(C, C, N)`` and the following
+    measurement, of N lanes. It returns a sentence on why the filter lost an episode there, empty if there is no
+    explanation."""
 
 
 class ArrayMeanings(NamedTuple):
@@ -83,9 +83,9 @@ class FlightScenarios(NamedTuple):
     """Function that makes a scenario in which every episode flies one of a user's flights."""
 
     make: Callable[[Any, Mapping[str, Any]], Any]
-    """Function from a :class:`~.trajectory.Trajectory` or :class:`~.flights.Flights` and the keywords of ``gym.make``
-    beside
-    the scenario to a :class:`~.task.Scenario`; raises :class:`ValueError` for flights that cannot be flown."""
+    """Function from a :class:`~.trajectory.Trajectory` or :class:`~.flights.Flights` and the keywords of
+    ``gym.make`` beside the scenario to a :class:`~.task.Scenario`; raises :class:`ValueError` for flights that
+    cannot be flown."""
 
 
 class LoopRecords(NamedTuple):
@@ -93,8 +93,7 @@ class LoopRecords(NamedTuple):
 
     report: Callable[[Any, Any, dict[str, Array]], dict[str, Array]]
     """Function of the model, the episode after the action, and the records of filter and world; it returns further
-    records,
-    see :meth:`.Filter.records`."""
+    records, see :meth:`.Filter.records`."""
 
 
 def trained_banks(task: Any) -> Mapping[str, type]:

@@ -103,9 +103,8 @@ def widen_limits(limits: tuple[float, float], low: float, high: float) -> tuple[
 class Picture:
     """Picture of an episode; this base class draws any task.
 
-    A subclass declares its additions to the history (:meth:`records`) and the time series to draw (:meth:`strips`),
-    and may
-    draw further panels into the figure's left part (:meth:`open`, :meth:`begin`, :meth:`draw`).
+    A subclass declares its additions to the history (:meth:`records`) and the time series to draw (:meth:`strips`), and
+    may draw further panels into the figure's left part (:meth:`open`, :meth:`begin`, :meth:`draw`).
 
     Args:
         model: of the episodes; its states contain lane 0 of a batch that is padded to several.

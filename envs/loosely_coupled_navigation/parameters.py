@@ -31,9 +31,8 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     noise: PPO found no improvement in 200,000 decisions of one measurement. A gain that varies with every measurement
     needs 1."""
     sampling_interval: float = parameter(0.01, above=0.0, at_most=1e3)
-    """Time between measurements, s; ours: K times it stays below 0.05 for every tuning, so sampling costs little. From
-    1e5
-    on the filter of the augmented state overflows."""
+    """Time between measurements, s; ours: K times it stays below 0.05 for every tuning, so sampling costs little.
+    From 1e5 on the filter of the augmented state overflows."""
 
     reference_amplitude: float = parameter(2.0, at_least=0.0)
     """Amplitude of the reference motion without manoeuvres, a sine, m; ours, as in Figs. 4 and 5."""
@@ -132,8 +131,7 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     """Largest factor of the variance of a measurement under control ``noise``; ours: that of the jamming."""
     receiver_reduction: float = parameter(10**0.5, above=1.0, at_most=1e6)
     """Largest divisor of it; ours: the best receiver of ``random``. A measurement that is trusted far too much for a
-    moment
-    spoils the filter."""
+    moment spoils the filter."""
     process_scale: float = parameter(10.0, above=1.0, at_most=1e6)
     """Largest factor and divisor of the coloured and the white rate error's intensities under control ``noise``;
     ours."""

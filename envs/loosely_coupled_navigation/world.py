@@ -51,9 +51,8 @@ class Measurement(NamedTuple):
     """Readings of INS and receiver; A axes."""
 
     number: Array
-    """Number of the measurement, from 1 on, ``(N,)``. Measurements are ``sampling_interval`` seconds apart, the first
-    one
-    that long after the start of the track."""
+    """Number of the measurement, from 1 on, ``(N,)``. Measurements are ``sampling_interval`` seconds apart, the
+    first one that long after the start of the track."""
     ins: Array
     """Position X by the INS alone, m, ``(A, N)``; at the start of the track it is the reference."""
     increment: Array
@@ -64,8 +63,7 @@ class Measurement(NamedTuple):
     """One where the receiver has a fix, otherwise zero, ``(N,)``; the INS always has a position."""
     reported_deviation: Array
     """Standard deviation of each axis of the fix as the receiver reports it, m, ``(N,)``; it may be wrong. It is
-    reported
-    without a fix, too."""
+    reported without a fix, too."""
 
 
 class InsGnssWorld(World[Task, Truth, Measurement]):

@@ -119,8 +119,7 @@ class Maneuvers(NamedTuple):
     effect: Array
     """Effect of a manoeuvre in a scan, ``(6, manoeuvres, N)``; one array, since the truth selects from all of it. Of a
     turn by theta: the change of velocity along itself, per velocity, cos(theta) - 1, and across, sin(theta), then
-    that of
-    the position in the same form, s; of thrust: the acceleration along x and y, m/s^2."""
+    that of the position in the same form, s; of thrust: the acceleration along x and y, m/s^2."""
     turn: Array = None
     """Turn angle in a scan, rad, ``(manoeuvres, N)``; None where no scan comes early and ``effect`` suffices."""
 

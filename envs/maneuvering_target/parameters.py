@@ -43,18 +43,15 @@ class ManeuveringTargetParameters(TaskParameters):
     )
     """Mode probabilities at the start (paper)."""
     alpha_range: tuple[float, float] = parameter((0.05, 0.95), above=0.0, below=1.0, ascending=True)
-    """Position gain at action -1 and +1 of control ``gain`` (ours: stable, and wide enough for the best schedule with
-    known
-    manoeuvres, which uses 0.07 to 0.88)."""
+    """Position gain at action -1 and +1 of control ``gain`` (ours: stable, and wide enough for the best schedule
+    with known manoeuvres, which uses 0.07 to 0.88)."""
     gain_logits: float = parameter(2.0, above=0.0, at_most=10.0)
-    """Logits by which an action of one moves a filter's position gain under control ``gains`` (ours: from 0.3 to 0.05
-    or
-    0.76, from 0.7 to 0.24 or 0.95, as the best schedule with known manoeuvres uses)."""
+    """Logits by which an action of one moves a filter's position gain under control ``gains`` (ours: from 0.3 to
+    0.05 or 0.76, from 0.7 to 0.24 or 0.95, as the best schedule with known manoeuvres uses)."""
     evidence_scale: float = parameter(2.0, above=0.0)
     """Nats that an evidence of one adds to a mode's log-posterior. Ours: a new policy explores with a standard
-    deviation of
-    about one, which with 4 nats costs 45 % more than action zero, so that it learns to survive its own noise. Of 1, 2
-    and 4 a short training run gained most with 2. A policy that explores less may use more."""
+    deviation of about one, which with 4 nats costs 45 % more than action zero, so that it learns to survive its own
+    noise. Of 1, 2 and 4 a short training run gained most with 2. A policy that explores less may use more."""
     averaging_measurements: float = parameter(5.0, at_least=1.0)
     """Time constant of the exponential averages in the observation, scans (ours)."""
     detection_probability: tuple[float, float] = parameter((1.0, 1.0), above=0.0, at_most=1.0, ascending=True)
@@ -87,8 +84,8 @@ class ManeuveringTargetParameters(TaskParameters):
     (ours)."""
     gate: float = parameter(16.0, above=0.0)
     """Gate in clutter: the plot taken for the target's is the nearest to the predicted position, if its squared
-    distance,
-    normalised with the covariances of prediction and plot, is below this; otherwise the scan missed the target (ours).
+    distance, normalised with the covariances of prediction and plot, is below this; otherwise the scan missed the
+    target (ours).
     """
     gate_acceleration: float = parameter(3.0, at_least=0.0)
     """Standard deviation of an acceleration that the prediction of the gate allows for, m/s^2 (ours)."""
@@ -124,8 +121,7 @@ class ManeuveringTargetParameters(TaskParameters):
     """Rows x, y, vx, vy, each with horizon + 2 values one scan apart, of flight "track"."""
     track_scans: tuple[int, ...] = parameter((), at_least=1)
     """Scans of each of several flights, of which every episode flies one; ``track`` then contains them concatenated,
-    each
-    with two values more than scans. Empty: one flight."""
+    each with two values more than scans. Empty: one flight."""
     start_range: tuple[float, float] = parameter((5e3, 60e3), above=0.0, ascending=True)
     """Limits of the range at the start of a random flight, m (ours)."""
     speed: tuple[float, float] = parameter((60.0, 300.0), above=0.0, ascending=True)

@@ -68,8 +68,7 @@ class SemiMarkovPrior(NamedTuple):
     """Ratio of the standard deviation of an outlier's errors to the stated one."""
     straight_ages: int = 12
     """Number of scans for which straight flights after different manoeuvres remain separate hypotheses. With one, a
-    false
-    manoeuvre spoils the estimate of long straight flight in every scan."""
+    false manoeuvre spoils the estimate of long straight flight in every scan."""
 
 
 TRAINING = SemiMarkovPrior()
@@ -98,9 +97,8 @@ def training_prior(hypotheses: int) -> SemiMarkovPrior:
     """Return the prior of the training distribution for a filter of few hypotheses.
 
     Manoeuvres have one age: thrust, and from nine hypotheses on a turn to either side. All others are ages of straight
-    flight, which matter most: they keep false manoeuvres apart. Of the divisions of 3, 5, 9 and 15 that were tried
-    on the
-    validation split this costs least, or within chance of it.
+    flight, which matter most: they keep false manoeuvres apart. Of the divisions of 3, 5, 9 and 15 that were tried on
+    the validation split this costs least, or within chance of it.
 
     Args:
         hypotheses: H, at least 2.

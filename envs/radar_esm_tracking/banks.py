@@ -72,8 +72,7 @@ class Filters(NamedTuple):
     """Weights of the classes after the last action, ``(M, N)``."""
     posterior: Array
     """Probabilities of the classes before the next scan's transition, ``(M, N)``: under ``evidence`` those of Bayes'
-    rule
-    alone, otherwise the weights."""
+    rule alone, otherwise the weights."""
     expected: Array
     """Probabilities of the classes at the start of this scan, ``(M, N)``."""
 

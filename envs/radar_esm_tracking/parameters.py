@@ -26,8 +26,7 @@ class RadarEsmTrackingParameters(TaskParameters):
     """Scans with an action in one episode (ours: 60 s; the paper gives none)."""
     decision_interval: int = parameter(4, at_least=1)
     """Scans for which one action holds (ours: from one ESM decision to the next. The noise hides the effect of the
-    weights
-    of a single scan: PPO learned too little in 200,000 decisions of one scan)."""
+    weights of a single scan: PPO learned too little in 200,000 decisions of one scan)."""
     esm_period: int = parameter(4, at_least=1)
     """Scans from one ESM decision to the next, W (paper: 2 s)."""
     manoeuvrability: tuple[float, ...] = parameter((0.025, 0.033, 0.1), above=0.0)

@@ -58,9 +58,8 @@ class Prediction(NamedTuple):
 class Filters(NamedTuple):
     """State of the bank.
 
-    Covariances are packed (:mod:`~filtergym.filters.packed_covariance`), so that a compiled step computes only one
-    half of
-    them. The covariance of the combination (step 8) is computed on demand.
+    Covariances are packed (:mod:`~filtergym.filters.packed_covariance`), so that a compiled step computes only one half
+    of them. The covariance of the combination (step 8) is computed on demand.
     """
 
     means: Array
@@ -338,8 +337,7 @@ class HypothesisBank(SatelliteBank):
         """Return the values to record at a measurement, by name: probabilities, NIS, log-likelihood, aperture.
 
         They are the probabilities, the NIS of the combination with its degrees of freedom, the log-density of the
-        measurement
-        under the prediction, and whether a rate is outside its aperture.
+        measurement under the prediction, and whether a rate is outside its aperture.
         """
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
@@ -406,8 +404,7 @@ class NoiseBank(HypothesisBank):
         """Return the covariance of the combined mean, ``(17, 17, N)``; under an action inflated by the average NIS.
 
         The factor is the short average of the NIS per reading, if that is above one: only the innovations indicate
-        whether the
-        action's noise is right. With action zero it is the covariance of the paper's bank.
+        whether the action's noise is right. With action zero it is the covariance of the paper's bank.
         """
         groups = int(state.average_nis.shape[0])
         average = weighted_sum(state.probabilities, ordered_sum(state.average_nis)) / groups
@@ -418,9 +415,8 @@ class NoiseBank(HypothesisBank):
 class RobustBank(NoiseBank):
     """Bank of ``robust``: noise as under ``gain``, and the treatment of repeated readings and outliers.
 
-    Whether a reading repeats or is an outlier is known only with the measurement, between two decisions; so the
-    action sets
-    the treatment in advance.
+    Whether a reading repeats or is an outlier is known only with the measurement, between two decisions; so the action
+    sets the treatment in advance.
     """
 
     @property

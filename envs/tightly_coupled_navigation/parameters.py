@@ -222,10 +222,8 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     differences between backends."""
     noise_reach: float = parameter(0.3, above=0.0, at_most=1.0)
     """Share of the logarithms of these two factors that an action of one applies under control "robust". Ours: a new
-    policy
-    explores with a standard deviation of about one, and at the full range it learns to survive its own noise, at
-    the cost
-    of most episodes. A policy that explores less may use more."""
+    policy explores with a standard deviation of about one, and at the full range it learns to survive its own noise,
+    at the cost of most episodes. A policy that explores less may use more."""
     averaging_measurements: float = parameter(10.0, at_least=1.0)
     """Time constant n of the short averages in the observation, measurements: the newest has the weight 1/n.
     Ours."""

@@ -140,8 +140,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         """Return the drawn command signal, a step or random manoeuvres.
 
         Each period of random manoeuvres has, at a random time, a step to a new level or a doublet about the present
-        one, with
-        equal probability.
+        one, with equal probability.
         """
         xp, p = self.xp, self.parameters
         if p.step_size:
