@@ -39,6 +39,8 @@ small`` has no hypotheses, and shows the gain that its network sets.
 """
 
 EXPORTED = """\
+#include <stddef.h>
+
 #include "{stem}.h"
 
 static {stem}_state state;
