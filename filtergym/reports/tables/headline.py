@@ -55,7 +55,7 @@ def headline_table(results: Sequence[Result]) -> Table:
             table.add_row(*row, SHORT.get(word, word))
     table.caption = (
         "Learned and classical policies steer a filter of the environment. An estimator is a classical filter of its "
-        "own. The reference knows something of the truth. A covariance is consistent if it is as large as the errors, and "
-        "slightly over or under if it is overconfident or cautious by less than a factor of two."
+        "own. The reference knows something of the truth. A covariance is consistent if it is as large as the errors, "
+        "and slightly over or under if it is overconfident or cautious by less than a factor of two."
     )
     return table
