@@ -37,7 +37,6 @@ shipped_TightlyCoupledNavigation := bptt ppo bptt-small bptt-strongest
 training_TightlyCoupledNavigation := --gated
 training_TightlyCoupledNavigation-ppo := --residual-to fixed-robust-tuned
 training_TightlyCoupledNavigation-kalman-net := --control kalman-net
-training_TightlyCoupledNavigation-bptt-strongest := --control hypotheses --gated
 episodes_TightlyCoupledNavigation := 400
 crash_test_TightlyCoupledNavigation := --episodes 16 --steps 1000
 

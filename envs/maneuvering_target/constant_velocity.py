@@ -1,4 +1,4 @@
-"""The constant-velocity model of ManeuveringTarget, over the time between two scans, whatever it is."""
+"""The constant-velocity model of ManeuveringTarget over any time between two scans, and the base of its filters."""
 
 import math
 from types import ModuleType
@@ -55,9 +55,14 @@ class ConstantVelocityModel:
     def update_estimate(
         self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
     ) -> kalman.Update:
-        """Return Kalman's update of a predicted mean and covariance with the measured position, or these
-        themselves, which say nothing of how likely they are; H is that of the position unless another one is
-        given.
+        """Return Kalman's update of a predicted mean and covariance with the measured position.
+
+        Where the scan missed the target they are unchanged, with likelihood and NIS zero.
+
+        Args:
+            predicted: mean ``(n, N)`` and covariance ``(n, n, N)``.
+            measurement: the scan.
+            H: matrix ``(2, n)`` of the measured position; None: that of the model.
         """
         H = self.H if H is None else H
         result = kalman.update(*predicted, measurement.position, H, self.identity * measurement.variance)
@@ -68,21 +73,21 @@ class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
     """Base of the estimators with the constant-velocity model."""
 
     def start(self, initial: Initial) -> Any:
-        """Start from the initial estimate."""
+        """Return the filter's state at the start of a track, from the initial estimate."""
         return self.first_track(initial)
 
     def first_track(self, initial: Initial) -> EstimateState:
-        """Return the estimate before the first scan."""
+        """Return the initial estimate as the state of a single Kalman filter, with unknown likelihood."""
         return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
 
     def mean(self, state: Any) -> Array:
-        """Return the position and velocity, without further states."""
+        """Return the mean of position and velocity, ``(4, N)``, without further components of the state."""
         return state.mean[:4]
 
     def covariance(self, state: Any) -> Array:
-        """Return the covariance of position and velocity, without further states."""
+        """Return the covariance of position and velocity, ``(4, 4, N)``, without further components of the state."""
         return state.covariance[:4, :4]
 
     def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
-        """Return the state after an update."""
+        """Return the result of an update as the filter's state, with the measurement's likelihood."""
         return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))

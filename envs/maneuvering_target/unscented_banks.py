@@ -63,7 +63,7 @@ SPEED = 100.0
 
 
 class Prediction(NamedTuple):
-    """What the plain filter predicts for a measurement."""
+    """Prediction of the plain filter for a measurement."""
 
     innovation: Array
     """m, ``(2, N)``; zero where the scan missed the target."""
@@ -87,7 +87,7 @@ class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measure
         return measurement.available
 
     def examine(self, state: EstimateState, measurement: Measurement) -> Prediction:
-        """Compare the measurement with the prediction of the plain filter."""
+        """Return the prediction of the plain filter for a measurement, with the innovation and its likelihood."""
         xp = self.xp
         mean, covariance = self.predict_turn(state.mean, state.covariance, measurement.interval)
         innovation = measurement.position - mean[:2]
@@ -138,7 +138,7 @@ class TunedUnscentedTurn(SteeredUnscentedTurn):
     }
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Predict with the scaling and the noises that the action answers, and update with the measured position."""
+        """Predict with the scaling and noises multiplied by the action, and update with the measured position."""
         if inputs.action is None:
             return super().update(state, inputs)
         xp, measurement, T = self.xp, inputs.measurement, inputs.measurement.interval
@@ -214,7 +214,7 @@ class UnscentedBank(SettingsBank, RadarBank):
         )
 
     def start(self, initial: Initial) -> UnscentedState:
-        """Start where the estimator starts."""
+        """Return the bank's state at the initial estimate, with zero action."""
         own, none = self.own.start(initial), 0.0 * initial.mean[:2]
         action = self.xp.stack([none[0]] * len(self.own.settings))
         return UnscentedState(own, own.likelihood, action, none, none, own.mean, none[0], none, none[0])
@@ -222,7 +222,7 @@ class UnscentedBank(SettingsBank, RadarBank):
     def add_observed(
         self, state: UnscentedState, found: Prediction, measurement: Measurement
     ) -> UnscentedState:
-        """Show the innovation, its averages, and the prediction."""
+        """Return the state with the innovation, its averages and the prediction, which the agent observes."""
         xp = self.xp
         innovation = found.innovation / xp.sqrt(found.innovation_variance)
         squares = innovation * innovation

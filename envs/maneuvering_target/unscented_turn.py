@@ -33,7 +33,7 @@ class TurnModel(ConstantVelocityModel):
         return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, change)[1]
 
     def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-        """Apply the time update of the extended Kalman filter over intervals, s."""
+        """Return mean and covariance predicted by the extended Kalman filter of the turn over intervals, s."""
         return coordinated_turn.predict(mean, covariance, T, self.noise(T))
 
 
@@ -60,17 +60,17 @@ class UnscentedTurn(TurnModel, KalmanModel):
         self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def start(self, initial: Initial) -> EstimateState:
-        """Start from the initial estimate, with a turn rate of mean zero."""
+        """Return the state at the initial estimate, with a turn rate of mean zero."""
         return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
 
     def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
-        """Propagate the sigma points through the turn over intervals, s."""
+        """Return mean and covariance of the sigma points after the turn over intervals, s, with process noise."""
         mean, covariance = unscented.transform(
             mean, covariance, lambda points: coordinated_turn.propagate(points, T)
         )
         return mean, covariance + self.noise(T)
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Predict and update with the measured position."""
+        """Return the state predicted to a scan and updated with the measured position."""
         predicted = self.predict_turn(state.mean, state.covariance, inputs.measurement.interval)
         return self.track(inputs.measurement, self.update_estimate(predicted, inputs.measurement))
