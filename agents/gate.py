@@ -1,14 +1,14 @@
 """Gates that use an agent only while an alarm is active and the observations resemble its training.
 
-Where filters and sensors are as modelled, a classical filter is hard to beat and easy to harm. The output of a network
-far from its training data is unpredictable. So the gate trusts an agent under two conditions: an alarm
-(:mod:`..baselines.alarm`) has sounded within the last decisions, and the observations lie within the range of the
-training (:mod:`.envelope`). An agent that is not trusted still runs, so that its memory covers the whole episode.
+Where filters and sensors are as modelled, a classical filter is hard to beat and easy to harm, and the output of a
+network far from its training data is unpredictable. So an agent is trusted if an alarm (:mod:`..baselines.alarm`) has
+sounded within the last decisions, and the observations lie within the range of the training (:mod:`.envelope`). Without
+trust an agent still runs, so that its memory covers the whole episode.
 
-There are two gates. ``gated:NAME`` runs two filters side by side, the agent's and a classical one, and returns the
-estimate of the trusted one (:class:`GatedEstimator`). The fallback may be any policy or estimator, whatever the agent
-controls; in a closed loop the vehicle follows the trusted estimate. In training (``--gated``) both share one filter,
-and the gate replaces the agent's action (:class:`Gated`): the fallback is an action of the same control.
+``gated:NAME`` runs two filters side by side, the agent's and a classical one, and returns the estimate of the trusted
+one (:class:`GatedEstimator`). The fallback may be any policy or estimator; in a closed loop the vehicle follows the
+trusted estimate. In training (``--gated``) both share one filter, and the gate replaces the agent's action
+(:class:`Gated`): the fallback is an action of the same control.
 """
 
 import math
@@ -84,7 +84,7 @@ class FallbackAction(ConstantPolicy):
 
 
 class TrustMemory(NamedTuple):
-    """Memory of the alarms of N episodes."""
+    """Memory of a :class:`Trust` for N episodes: its alarms, and for how long they are active."""
 
     alarm: Any
     envelope: Any
@@ -126,15 +126,12 @@ class Trust:
     def listen(
         self, observation: numpy.ndarray, memory: TrustMemory | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, TrustMemory]:
-        """Update the alarms with an observation; return a boolean mask of the lanes in which the agent is trusted.
+        """Update the alarms with observations ``(N, fields)``; return the mask ``(N,)`` of trusted lanes, and memory.
 
         Args:
-            observation: ``(N, fields)``.
+            observation: observations of the lanes (parallel episodes).
             memory: memory returned by the last call; None at the first.
             start: true where an episode begins, ``(N,)``.
-
-        Returns:
-            Booleans ``(N,)``, and memory.
         """
         none = 0.0 * observation[:, 0]
         alarm, envelope, active, outside = (None, None, none, none) if memory is None else memory
@@ -154,14 +151,14 @@ class Trust:
 
 
 class GateMemory(NamedTuple):
-    """Memory of a gate: alarms, fallback policy."""
+    """Memory of a :class:`Gate`: that of its alarms, and that of the fallback policy."""
 
     trust: TrustMemory | None
     fallback: Any
 
 
 class Gate:
-    """Choice in training between an agent's action and a fallback's, by the agent's trust.
+    """Switch in training between the actions of an agent and of a fallback, by whether the agent is trusted.
 
     Args:
         model: the model whose observations are passed.
@@ -185,7 +182,7 @@ class Gate:
             raise ValueError(f"the fallback is made for control {own!r}, but the task has {model.control!r}")
 
     def begin(self, seeds: Sequence[int]) -> GateMemory:
-        """Return the gate's memory at the start of the episodes with these seeds."""
+        """Return the memory of a gate at the start of the episodes with these seeds."""
         return GateMemory(None, self.fallback.begin(seeds) if isinstance(self.fallback, Policy) else None)
 
     def choose(
@@ -262,7 +259,7 @@ class Gated(Policy):
 
 
 class MonitoredMemory(NamedTuple):
-    """Memory of a policy and of its alarms."""
+    """Memory of a :class:`MonitoredPolicy`: that of the policy, that of its alarms, and the mask of trust."""
 
     policy: Any
     trust: TrustMemory
@@ -296,7 +293,7 @@ class MonitoredPolicy(Policy):
 
 
 class GatedState(NamedTuple):
-    """State of a gated filter."""
+    """State of a :class:`GatedEstimator`: both filters, the mask of trust, and the evidence for each filter."""
 
     agent: Any
     """State of the agent's filter."""
@@ -382,21 +379,16 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         return self.xp.where(state.trusted, self.agent.mean(state.agent), self.fallback.mean(state.fallback))
 
     def covariance(self, state: GatedState) -> Array:
-        """Return the trusted filter's covariance in each lane, ``(C, C, N)``; the fallback's times its variance
-        factor.
-        """
+        """Return the trusted filter's covariance ``(C, C, N)``; the fallback's is scaled by its variance factor."""
         other = self._variance_factor(state.squares, state.degrees) * self.fallback.covariance(state.fallback)
         return self.xp.where(state.trusted, self.agent.covariance(state.agent), other)
 
     def records(self, state: GatedState, measurement: Any) -> dict[str, Array]:
-        """Return no records: the estimate changes between two filters."""
+        """Return no records: the estimate switches between two filters."""
         return {}
 
     def _sum_squares(self, memory: GatedState, likelihood: Likelihood) -> tuple[Array, Array]:
-        """Return the sums of the fallback's normalised innovations squared, and of their degrees of freedom.
-
-        A missing measurement, or one without these numbers, does not change them.
-        """
+        """Add a measurement's NIS and degrees of freedom to the fallback's fading sums; missing ones add nothing."""
         if self.fallback.adapts_covariance or likelihood.nis is None or likelihood.nis_degrees is None:
             return memory.squares, memory.degrees
         xp, keep = self.xp, 1.0 - 1.0 / NIS_MEMORY
@@ -417,12 +409,12 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
 
 
 def is_gateable(maker: Any) -> bool:
-    """Return whether a competitor has actions that depend on measurements, which a gate can replace."""
+    """Return whether a gate can guard a competitor: a learned estimator, or any policy but the random one."""
     return isinstance(maker, EstimatorMaker) or (kind_of(maker) == "policy" and maker is not RandomPolicy)
 
 
 class GatedMaker:
-    """Maker of an agent behind a gate, which an evaluation calls with a task.
+    """Factory of an agent behind a gate; an evaluation calls it with a task.
 
     Args:
         problem: the problem of agent and fallback.
@@ -490,12 +482,7 @@ class GatedMaker:
             )
 
     def __call__(self, task: Task, replace: Callable[[Any], Any] | None = None) -> GatedEstimator:
-        """Return the gated estimator for a task.
-
-        Args:
-            task: the task.
-            replace: function from the agent's policy to its replacement.
-        """
+        """Return the gated estimator for a task; ``replace`` maps the agent's policy to a replacement."""
         model = Model(task, self.control)
         shown = model.on_numpy()
         policy = check_competitor(self.name, make_competitor(self._policy, shown), "policy")
@@ -530,14 +517,11 @@ def _excess_cost(name: str, fallback: str) -> tuple[float, float]:
 
 
 def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
-    """Return a competitor's relative excess cost over the paper's on validation episodes, and its standard errors.
+    """Return a competitor's relative excess cost over the paper's algorithm, and that in standard errors.
 
     Args:
-        problem: the problem of both; the episodes are of its training distribution.
+        problem: the problem of both; the episodes are validation episodes of its training distribution.
         fallback: name of the competitor.
-
-    Returns:
-        Difference of the mean costs over the paper's, and the difference in standard errors over paired episodes.
     """
     if fallback == problem.paper:
         return 0.0, 0.0
@@ -545,7 +529,7 @@ def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
 
 
 class PolicyMaker:
-    """Maker of a wrapped policy, which is called with a model.
+    """Factory of a wrapped policy, which is called with a model.
 
     Args:
         maker: the policy inside, or a factory of it.
@@ -586,6 +570,6 @@ def wrap_as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool
 
 
 def find_gated(name: str, inner: str, problem: Problem, find: Callable[[str], Competitor]) -> Competitor:
-    """Return the competitor ``gated:NAME``: the agent ``inner`` beside the environment's fallback."""
+    """Return the competitor ``gated:NAME``: the agent ``inner`` behind a gate, with the environment's fallback."""
     policy = find(inner)
     return Competitor(name, GatedMaker(problem, inner, policy.maker), policy.learned)

@@ -1,7 +1,7 @@
 """A learned estimator: a filter with a network inside, as plain arrays.
 
 The filter is a bank of the environment (:class:`.TrainedBanks`), and the network is a learned policy that acts in it.
-The interface has neither observations nor actions: the input is measurements, the output mean and covariance.
+The interface has neither observations nor actions: measurements in, mean and covariance out.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from ..evaluation.competitors.steered_filter import PolicyFilterState, SteeredFi
 
 
 class LearnedEstimator(SteeredFilter):
-    """A bank with the policy that acts in it; missing values are passed as zeros.
+    """Filter made of a bank and the network that steers it; missing values of a measurement count as zeros.
 
     Args:
         model: model with the bank.
@@ -31,11 +31,11 @@ class LearnedEstimator(SteeredFilter):
         self.network = network
 
     def predict(self, state: PolicyFilterState, measurement: Any) -> PolicyFilterState:
-        """Return the bank's state predicted to a measurement, with zeros for missing values."""
+        """Return the state predicted to a measurement, with zeros for missing values."""
         return super().predict(state, fill_missing(measurement))
 
     def update(self, state: PolicyFilterState, inputs: FilterInput) -> PolicyFilterState:
-        """Run the network on the measurement, update the bank with its action, and return the state."""
+        """Run the network on a measurement, update the bank under its action, and return the state."""
         return super().update(state, FilterInput(fill_missing(inputs.measurement)))
 
 
@@ -45,7 +45,7 @@ def fill_missing(measurement: Any) -> Any:
 
 
 class EstimatorMaker:
-    """Maker of a learned estimator, which an evaluation calls with a task.
+    """Factory of a learned estimator; an evaluation calls it with a task.
 
     Args:
         bank: name of the filter among the trained banks of the task.

@@ -1,7 +1,7 @@
 """Trained models of Stable-Baselines3 and sb3-contrib as policies, with the normalisation of their training.
 
-A model that was trained under ``VecNormalize`` needs normalised observations, and its zip does not contain the
-statistics: they are in a file of their own. With raw observations such a model runs without an error, but badly.
+The zip of a model trained under ``VecNormalize`` lacks the statistics: they are in a file of their own. With raw
+observations such a model runs without an error, but badly.
 """
 
 import pickle
@@ -100,7 +100,7 @@ class Sb3Policy:
         episode_start: numpy.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[numpy.ndarray, Any]:
-        """Return actions for raw observations, with the interface of Stable-Baselines3."""
+        """Return a model's actions for raw observations, which it normalises as in training, and its memory."""
         if self.normalisation is not None:
             normalised: Any = self.normalisation.normalize_obs(observation)
             observation = normalised
@@ -108,7 +108,7 @@ class Sb3Policy:
 
 
 def _reach(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the task parameters that set the range of actions in a model's environment, if not default."""
+    """Return the task parameters that set the range of actions in a model's environment, where not default."""
     held = model.get_env()
     inner: Any = None if held is None else held.unwrapped
     env = inner.envs[0].unwrapped if isinstance(inner, DummyVecEnv) else getattr(inner, "env", None)
@@ -131,11 +131,10 @@ def _check_shape(normalisation: VecNormalize, model: BaseAlgorithm) -> None:
 def was_trained_normalised(model: BaseAlgorithm) -> bool:
     """Return whether a model was trained on normalised observations, as far as its stored observations show.
 
-    A model stores its last observation and, under ``VecNormalize``, the original of it. Algorithms with a replay buffer
-    store an earlier observation in its place without ``VecNormalize``, too. ``VecNormalize`` returns float32. So with
-    float64 observations the two types decide exactly. With float32 observations an algorithm without replay buffer is
-    detected, even if only rewards were normalised, and one with a replay buffer is not. A model without training is not
-    detected either.
+    A model stores its last observation and, under ``VecNormalize``, the original of the float32 one.
+    So with float64 observations the two types decide. With float32 an algorithm without replay buffer is
+    detected, even if only rewards were normalised; one with a replay buffer stores an earlier observation there without
+    ``VecNormalize``, too, and is not detected, nor is a model without training.
     """
     shown, original = model._last_obs, model._last_original_obs
     if not isinstance(original, numpy.ndarray):

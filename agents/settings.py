@@ -1,7 +1,7 @@
-"""A user's settings of a training run: those of the environment and of the algorithm, as options or in a file.
+"""A user's settings of a training run, as options or in a file: those of the environment and of the algorithm.
 
-Values are parsed as YAML. Later sources override earlier ones: the shipped file of hyperparameters, the user's file,
-single settings. Mappings are merged key by key.
+Values are parsed as YAML. Later sources override earlier ones, key by key: the shipped hyperparameters, the user's
+file, single settings.
 """
 
 import inspect
@@ -31,7 +31,7 @@ RUN_ARGUMENTS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", 
 
 
 def convert_numbers(value: Any) -> Any:
-    """Return a parsed YAML value with numbers in scientific notation converted."""
+    """Return a parsed YAML value in which texts such as ``1e-3`` have become numbers."""
     if isinstance(value, str) and SCIENTIFIC.fullmatch(value):
         return float(value)
     if isinstance(value, list):
@@ -53,7 +53,7 @@ def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[st
 
 
 def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parse words ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for keys inside a mapping.
+    """Parse words ``env.NAME=VALUE`` and ``algo.NAME=VALUE``; further dots are keys inside a mapping.
 
     Returns:
         Keywords of the environment, and hyperparameters.
@@ -85,7 +85,7 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
     """Return the mapping in a YAML file.
 
     Raises:
-        ValueError: if it cannot be read, or is not a mapping; ``needs`` describes the expected form.
+        ValueError: if it cannot be read, or is not a mapping, which the error describes by ``needs``.
     """
     try:
         table = convert_numbers(read_yaml(path))
@@ -98,11 +98,7 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
 
 
 def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
-    """Return the section of an environment in a table of settings, or the section ``default``.
-
-    Raises:
-        ValueError: if there is none.
-    """
+    """Return an environment's section of a table of settings, else ``default``; raise ValueError without both."""
     section = table.get(id, table.get("default"))
     if section is None:
         raise ValueError(

@@ -1,8 +1,8 @@
 """Training runs of all algorithms: their options, their record and their folder.
 
-A run's folder holds ``run.json`` (command, versions, seeds, duration, validation), ``checkpoint/`` (the last
-one, from which ``--resume`` continues, with the ``run.json`` of its time), ``best/`` (the agent with the lowest
-validation cost) and the log.
+A run's folder holds ``run.json`` (command, versions, seeds, duration, validation), ``checkpoint/`` (the last one, with
+the ``run.json`` of its time, from which ``--resume`` continues), ``best/`` (the agent with the lowest validation cost)
+and the log.
 """
 
 import functools
@@ -95,7 +95,7 @@ class FirstWin(TypedDict):
 
 @dataclass
 class TrainingRun:
-    """The record of a training run, the content of ``run.json``."""
+    """Record of a training run: its settings, versions, progress and validations; the content of ``run.json``."""
 
     environment: str
     control: str
@@ -129,12 +129,12 @@ class TrainingRun:
 
     @functools.cached_property
     def problem(self) -> Problem:
-        """Problem (task and baselines) of the environment."""
+        """Problem (task and baselines) of the run's environment."""
         return problem_of(self.environment)
 
     @property
     def task_keywords(self) -> dict[str, Any]:
-        """Parameters of the task, without keywords of the training alone, such as the reward."""
+        """Task parameters of the run, without keywords of the training alone, such as the reward."""
         known = parameter_names(self.problem.task)
         return {n: value for n, value in self.hyperparameters.get("env_kwargs", {}).items() if n in known}
 
@@ -186,7 +186,7 @@ class RunOptions:
 
 
 def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
-    """Return a new run with options and hyperparameters merged.
+    """Return the record of a new training run, from a user's options and the hyperparameters in files.
 
     Args:
         problem: the problem of the training.
@@ -237,7 +237,7 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
 
 
 def _merge_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a run's hyperparameters, and keywords of the environment from the user, merged from all sources.
+    """Return a run's hyperparameters and the user's keywords of the environment, merged from all sources.
 
     Raises:
         ValueError: for an unknown name.
@@ -300,7 +300,7 @@ def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
     """Return the names of the controls that an algorithm can train, or the bank of a learned estimator.
 
     Raises:
-        ValueError: if the environment has no such filter.
+        ValueError: if the environment has no filter for the algorithm.
     """
     if algorithm in RIVALS and RIVALS[algorithm] in cls.controls:
         return (RIVALS[algorithm],)
@@ -333,7 +333,7 @@ def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
 
 
 def scenario_text(weights: Mapping[str, float]) -> str:
-    """Return a scenario or a mixture as text, such as ``random:0.8,paper:0.2``."""
+    """Return weights of scenarios as text, such as ``random:0.8,paper:0.2``; of one scenario its name alone."""
     if len(weights) == 1:
         return next(iter(weights))
     return ",".join(f"{name}:{weight!r}" for name, weight in weights.items())
@@ -388,7 +388,7 @@ def check_trust(what: str, trust: bool) -> None:
 
 
 def save_run(run: TrainingRun, path: Path) -> None:
-    """Write a run's record to a file in one atomic step."""
+    """Write a training run's record to a file, whole or not at all."""
     write_text(path, json.dumps(asdict(run), indent=1) + "\n")
 
 
@@ -435,7 +435,7 @@ def best_agent(folder: Path) -> Path:
 
 
 def resume_run(folder: Path, requested: TrainingRun, same: bool = False) -> TrainingRun:
-    """Return the run of a folder, to continue it to the requested steps; repair folders that a crash left.
+    """Return the run of a folder, to be continued to the requested steps; repair folders that a crash left.
 
     Args:
         folder: folder of the run.

@@ -17,7 +17,7 @@ from .validation import Validation
 
 
 def _curve(entry: ValidationEntry) -> dict[str, float]:
-    """Return the numbers of a validation for the log, by name."""
+    """Return the numbers of a validation for the training log, by name."""
     curve = {"validation/cost": entry["cost"]}
     if "paper_cost" in entry and "relative_cost_difference" in entry:
         curve["validation/paper_cost"] = entry["paper_cost"]
@@ -56,7 +56,7 @@ def curve_writer(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
 
 @contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C or SIGTERM has requested a stop; the second stops at once."""
+    """Yield a function that returns whether Ctrl-C or SIGTERM came; a second signal acts at once."""
     wished = False
     if threading.current_thread() is not threading.main_thread():  # signals reach the main thread only
         yield lambda: False
@@ -121,7 +121,7 @@ class Session:
 
 
 class Trainee(NamedTuple):
-    """An agent in training: its policy, and functions that save it."""
+    """An agent in training: its policy, and functions that save a checkpoint and the agent."""
 
     policy: Any
     """Policy of the agent, for an evaluation."""
@@ -132,7 +132,7 @@ class Trainee(NamedTuple):
 
 
 class Bookkeeping:
-    """Bookkeeping of a run in training: validations, checkpoints, and the record.
+    """Validations, checkpoints and record of a run in training.
 
     Args:
         run: the record, which is updated.
@@ -167,7 +167,7 @@ class Bookkeeping:
         self.seconds_before: float = run.seconds
 
     def safe_point(self, steps_done: int, last: bool = False) -> bool:
-        """Validate and save between two updates if it is time, and return whether to stop."""
+        """Validate and write a checkpoint if it is time, between two updates; return whether to stop."""
         stopping = self.stop()
         if not (stopping or last or steps_done >= self.due):
             return False

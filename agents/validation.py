@@ -45,7 +45,7 @@ class TrainingEpisodes:
         self._models: dict[tuple[str | None, str, str], Model] = {}
 
     def _model(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Model:
-        """Return the model of a control and scenario from a cache, as compilation takes time."""
+        """Return the model of a control and scenario, cached since compilation takes time."""
         key = control, scenario, repr(keywords)
         if key not in self._models:
             cls, parameters = self.problem.task, {**keywords, **self.keywords}
@@ -105,7 +105,7 @@ class Validation:
         self.paper_cost = self._costs(problem.competitor(self.paper), None) if self.paper else None
 
     def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
-        """Return the mean cost over the episodes, then over each bootstrap resample, ``(1 + resamples,)``."""
+        """Return a policy's mean cost over all episodes, then over each bootstrap resample, ``(1 + resamples,)``."""
         return self.bootstrap.means(self.episodes.costs(policy, control))
 
     def score(self, policy: Any) -> ValidationEntry:

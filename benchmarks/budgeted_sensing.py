@@ -4,9 +4,9 @@
     python benchmarks/budgeted_sensing.py --agent runs/sensing-0 --agent runs/sensing-1
 
 Two tables in Markdown. The first is of episodes. The second excludes the semi-Markov bank: it uses covariances alone,
-of the Gauss-Markov course with the moments of the semi-Markov one, without random quantities. There no schedule costs
-less than the best evenly spaced looks at each target by itself, at rates whose sum is one look a second (P. Whittle,
-Restless bandits, J. Applied Probability 25A (1988), 287-298: the relaxed problem and its multiplier).
+of the Gauss-Markov course with the same moments, without random quantities. There no schedule costs less than the best
+evenly spaced looks at each target by itself, at rates whose sum is one look a second (P. Whittle, Restless bandits, J.
+Applied Probability 25A (1988), 287-298: the relaxed problem and its multiplier).
 """
 
 import argparse
@@ -119,7 +119,6 @@ def schedule_rows(scenario: str, count: int = 500) -> list[list[str]]:
 
 
 def main() -> None:
-    """Print the tables of episodes and of covariances."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -62,7 +62,7 @@ def seconds_of(
 
 
 def measure_single() -> Figures:
-    """Return the times of ``step`` and ``reset`` of single environments, and of Gymnasium's own."""
+    """Yield the times of ``step`` and ``reset`` of single environments, filtergym's and Gymnasium's."""
     import gymnasium
 
     import filtergym
@@ -89,7 +89,7 @@ def measure_single() -> Figures:
 
 
 def measure_vectors() -> Figures:
-    """Return the times of ``step`` of vector environments, with one thread and with two, and of a wide one."""
+    """Yield the times of ``step`` of vector environments, with one thread and with two, and with many lanes."""
     import gymnasium
 
     import filtergym
@@ -117,7 +117,7 @@ def measure_vectors() -> Figures:
 
 
 def measure_live() -> Figures:
-    """Return the times of ``update`` of running filters, and of filterpy's."""
+    """Yield the times of ``update`` of running filters, filtergym's and filterpy's."""
     import numpy
     from filterpy.kalman import IMMEstimator, KalmanFilter
 
@@ -179,7 +179,7 @@ def child_cost(code: str, folder: str) -> tuple[float, float]:
 
 
 def measure_start() -> Figures:
-    """Return the processor times of processes that make, reset and step an environment, with a full code cache."""
+    """Yield the processor times of processes that make, reset and step an environment, with a full code cache."""
     code = "import gymnasium\n{more}env = gymnasium.make({id!r}); env.reset(); env.step(env.action_space.sample())"
     ids = {"CartPole": "CartPole-v1"} | {k: f"filtergym/{v}-v0" for k, v in ENVIRONMENTS.items()}
     for letter, id in ids.items():
@@ -214,7 +214,7 @@ TRACK = "filtergym/ManeuveringTarget-v0"
 
 
 def measure_logs(rows: Sequence[int]) -> Figures:
-    """Return time and memory of ``advise`` and ``evaluate`` over logs and episodes of increasing number."""
+    """Yield time and memory of ``advise`` and ``evaluate`` over logs and episodes of the given numbers of rows."""
     policies = [word for name in COMPETITORS for word in ("--policy", name)]
     log = ["evaluate", TRACK, "--recording", "truth.csv", "--speeds", "0.0001,100000", "--policy"]
     for count in rows:
@@ -240,7 +240,7 @@ def measure_logs(rows: Sequence[int]) -> Figures:
 
 
 def measure(section: str, rows: Sequence[int]) -> Figures:
-    """Return the figures of a section, measured in this process."""
+    """Yield the figures of a section, measured in this process."""
     if section == "logs":
         return measure_logs(rows)
     return {
@@ -252,7 +252,6 @@ def measure(section: str, rows: Sequence[int]) -> Figures:
 
 
 def main() -> None:
-    """Read the command line, measure in separate processes, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -262,7 +262,6 @@ CLIENTS: dict[str, tuple[str, str, Callable[[str], Portion]]] = {
 
 
 def install(name: str) -> None:
-    """Create the virtual environment of a client and install its packages."""
     folder = ENVIRONMENTS / name
     print(f"installing {name} into {folder.relative_to(ROOT)}", flush=True)
     venv.create(folder)  # without pip: this environment's serves both
@@ -277,7 +276,6 @@ def install(name: str) -> None:
 
 
 def python_of(name: str) -> str:
-    """Return the path of the Python that runs a client: of its virtual environment, or this one."""
     own = ENVIRONMENTS / name / "bin" / "python"
     return str(own) if own.exists() else sys.executable
 
@@ -304,7 +302,6 @@ def measure(client: str, id: str) -> dict[str, Any]:
 
 
 def measure_in_client(client: str, id: str) -> dict[str, Any]:
-    """Return the result of :func:`measure`, run in the client's own Python."""
     command = [python_of(CLIENTS[client][0]), __file__, "--measure", client, "--environment", id]
     try:
         done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=LIMIT, cwd=ROOT)
@@ -340,7 +337,7 @@ def table(clients: list[str], ids: list[str]) -> None:
 
 
 def recipes() -> None:
-    """Run every recipe, and print the last line of its output and its time."""
+    """Run every recipe of the documentation; print its duration and the last line of its output."""
     print("| recipe | seconds | prints |\n|---|---|---|")
     for file in sorted(RECIPES.glob("with_*")):
         python = python_of(file.stem.removeprefix("with_"))

@@ -55,7 +55,7 @@ LIMIT_S = 1200
 
 
 class Cost(NamedTuple):
-    """Time of a process."""
+    """Processor and wall time of a process, s."""
 
     processor: float
     """Processor time, s."""
@@ -88,11 +88,7 @@ def commands(quick: bool) -> dict[str, list[str]]:
 
 
 def measure(command: Sequence[str], home: Path) -> Cost:
-    """Run a command with a folder as the user's home, and return its time.
-
-    Raises:
-        RuntimeError: if it fails.
-    """
+    """Run a command with a folder as the user's home, and return its times; a failure raises RuntimeError."""
     environment = {
         **os.environ,
         "HOME": str(home),
@@ -119,7 +115,7 @@ def row(name: str, cold: Cost, warm: Cost) -> list[str]:
 
 
 def write_record(rows: Sequence[Sequence[str]]) -> None:
-    """Write rows to the record, in the order of :func:`commands`; see ``docs/make/records.py``."""
+    """Replace rows of the record file, in the order of :func:`commands`; see ``docs/make/records.py``."""
     known = json.loads(RECORD.read_text(encoding="utf-8"))["data"]["rows"] if RECORD.exists() else []
     by_name = {each[0]: list(each) for each in [*known, *rows]}
     versions = {"Python": platform.python_version()}
@@ -135,7 +131,6 @@ def write_record(rows: Sequence[Sequence[str]]) -> None:
 
 
 def main() -> None:
-    """Measure the commands, print the table, and write the record."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -35,7 +35,7 @@ FEWER = 8
 
 
 def make_episodes(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple[Any, NetworkPolicy]:
-    """Return a function that runs an episode with a gradient step after each window, and the policy."""
+    """Return a function that simulates an episode with a gradient step after each window, and the policy."""
     truncation = run.hyperparameters["truncation"]
     env = TaskVectorEnv(
         run.environment, envs, control=run.control, backend=backend, autoreset_mode="Disabled",

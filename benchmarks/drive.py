@@ -337,7 +337,6 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
 
 
 def main() -> None:
-    """Read a checkout of the data, and write the recordings and the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

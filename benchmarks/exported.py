@@ -99,7 +99,7 @@ int main(int argc, char **argv) {{
 
 
 class Size(NamedTuple):
-    """Bytes of an exported filter."""
+    """Bytes of an exported filter: source, code, stack, and code of a cross compiler."""
 
     source: int
     code: int
@@ -174,7 +174,7 @@ def run_in_c(
 
 
 def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
-    """Return the nanoseconds of an update in LLVM's code of the same program, a lane of many."""
+    """Return the nanoseconds of an update of one lane of many, in LLVM's code of the same program."""
     program = traced.update
     # Input and output must not be the same memory: the state after an update goes elsewhere.
     after = max(STATE, MEASUREMENT, ANSWER, ESTIMATE, SHOWN, 3) + 1
@@ -228,7 +228,7 @@ def least_time(call: Any, count: int) -> float:
 def lines(
     problem: Problem, names: list[str], episodes: int, measurements: int, compilers: Compilers
 ) -> Iterator[dict[str, Any]]:
-    """Yield the figures of each competitor's export by name, or the reason why it cannot be exported."""
+    """Yield a line for each competitor: the figures of its export, or the reason why it cannot be exported."""
     for name in names:
         maker = find_competitor(problem, name).maker
         line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
@@ -275,7 +275,7 @@ COST = (
 
 
 def summary(found: list[dict[str, Any]]) -> str:
-    """Return two tables in Markdown, a row for each environment: differences; and costs, median and range."""
+    """Return two Markdown tables with a row for each environment: differences; and costs, median and range."""
     accuracy, cost = ([f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"] for names in (ACCURACY, COST))
     for environment in dict.fromkeys(line["environment"] for line in found):
         own = [line for line in found if line["environment"] == environment]

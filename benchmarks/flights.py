@@ -107,7 +107,7 @@ def sets(smoothing: float) -> dict[str, Flights]:
 
 
 def _thin_pieces(pieces: list) -> list:
-    """Return the pieces of a set, or every second, third, ... of a set that is too long for one scenario."""
+    """Return the pieces of a set of flights, or every second, third, ... if too long for one scenario."""
     scans = sum(piece.intervals(INTERVAL) for piece in pieces)
     return pieces[:: 1 + int(scans // MOST_SCANS)]
 
@@ -125,7 +125,7 @@ def _rows(own: dict, records: list) -> list[dict]:
 
 
 def print_tables(table: pandas.DataFrame) -> None:
-    """Print the cost of every competitor against the paper's: mean, interval and median, %."""
+    """Print a table for each smoothing: cost of every competitor against the paper's, interval and median, %."""
     for smoothing, part in table.groupby("smoothing", sort=False):
         print(f"\nSmoothed over {smoothing:g} s:\n" if smoothing else "\nAs recorded:\n")
         cells = zip(part.cost, part.low, part.high, part["median"], strict=True)

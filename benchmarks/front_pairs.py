@@ -51,7 +51,6 @@ CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
 
 
 def main() -> None:
-    """Evaluate, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--environment", choices=CLASSICAL, action="append", help="default: all")
     rows = []
@@ -69,7 +68,7 @@ def main() -> None:
 
 
 def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str]) -> list[list[str]]:
-    """Return the rows of an environment, the quickest competitor first."""
+    """Return the table rows of an environment's competitors, the quickest first."""
     names = [str(name) for name in results["policy"].values]
     cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in names}
     times = {name: time_of(results.sel(policy=name)) for name in names}
@@ -105,7 +104,6 @@ def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str])
 
 
 def percent(found: IntervalEstimate) -> str:
-    """Return a difference and its interval."""
     return f"{100.0 * found.value:+.1f} [{100.0 * found.low:+.1f}, {100.0 * found.high:+.1f}]"
 
 

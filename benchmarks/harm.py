@@ -31,7 +31,7 @@ CONSISTENT = (0.5, 2.0)
 
 
 class Cell(NamedTuple):
-    """Result of a competitor in a scenario or under a stress."""
+    """Result of a competitor in a scenario or under a stress: cost ratio, ANEES and lost tracks."""
 
     name: str
     """Name of the scenario or stress."""
@@ -53,7 +53,7 @@ class Cell(NamedTuple):
 
 
 def cells_of(problem: Problem) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield the name of each cell, its scenario and its keywords."""
+    """Yield name, scenario and task keywords of every scenario and stress of a problem."""
     for scenario in problem.task.scenarios:
         yield scenario, scenario, {}
     if problem.id in STRESSES:
@@ -69,7 +69,7 @@ def fly(
     split: str,
     cell: tuple[str, str, dict[str, Any]],
 ) -> dict[str, Cell]:
-    """Run competitors in a scenario or under a stress, and return each one's result by name."""
+    """Evaluate competitors in a scenario or under a stress; return the result of each by name."""
     name, scenario, keywords = cell
     run = problem.evaluate(makers, scenario, episodes, split=split, **keywords)
     paper, bootstrap = mean_cost(run, problem.baselines.compared_paper), Bootstrap(run.sizes["episode"])
@@ -85,7 +85,7 @@ def fly(
 
 
 def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
-    """Return the makers of paper's algorithm, gate's fallback, and each agent alone and gated, by name."""
+    """Return the factories of the paper's algorithm, the gate's fallback, and each agent alone and gated."""
     fallback = problem.baselines.fallback or problem.paper
     first = dict.fromkeys([problem.baselines.compared_paper, fallback])
     makers = {name: problem.competitor(name) for name in first}

@@ -37,7 +37,7 @@ STATISTICS = ("geometric mean of ratios", "lost tracks", "ratio of means")
 
 
 class Pool(NamedTuple):
-    """Population of episodes."""
+    """Population of episodes: costs of the paper's algorithm and of a competitor, and the cost of a lost track."""
 
     paper: numpy.ndarray
     """Mean cost of the paper's algorithm in every episode, ``(episodes,)``."""
@@ -82,7 +82,7 @@ def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
 
 
 def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
-    """Return, for each statistic, the share of intervals that contain the truth, as text."""
+    """Return for each statistic the share of intervals with the truth, and of misses below it, as text."""
     generator, bootstrap = numpy.random.default_rng(number), Bootstrap(number)
     true = numpy.array(truths(pool))
     below, above = numpy.zeros(len(true)), numpy.zeros(len(true))

@@ -47,12 +47,12 @@ class Nearest(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Verdict, as text, whether the reference is a limit in this scenario."""
+        """Whether the reference is a limit in this scenario, or which competitors beat it, as text."""
         return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
 
 
 def names_without_random(problem: Problem) -> list[str]:
-    """Return the names of all ranked competitors, each under its own control, without random actions."""
+    """Return the names of all ranked competitors but the one with random actions."""
     policies = problem.baselines.policies
     return [name for name in ranked_names(problem) if policies.get(name) is not RandomPolicy]
 

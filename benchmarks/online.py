@@ -35,7 +35,7 @@ T, SIGMA, MISSED, SAVED_EVERY = 4.0, 100.0, 0.1, 500
 
 
 def write_log(path: Path, tracks: int, plots: int) -> numpy.ndarray:
-    """Write a log of random-walk tracks, and return its rows: track, time, x, y."""
+    """Write a log of random-walk tracks; return its rows of track number, time, x and y."""
     rng = numpy.random.default_rng(0)
     rows = []
     for track in range(tracks):

@@ -42,7 +42,7 @@ NAME = "public_optimised"
 
 
 class Problem(NamedTuple):
-    """A problem of the comparison: model of the filters, prior, and test set."""
+    """A problem of the comparison: model of OKF's filter, prior, and whether its test set is stored."""
 
     name: str
     id: str
@@ -131,7 +131,7 @@ def estimates_of(model: okf.OKF, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def optimise(problem: Problem, seed: int) -> dict[str, Any]:
-    """Train OKF's filter, and compare it with ours; return Q, R, seconds and largest difference, by name."""
+    """Train OKF's filter, and compare it with ours; return Q, R, duration and largest difference by name."""
     torch.manual_seed(seed)
     recording = filtergym.record(problem.id, episodes=TRACKS, seed=seed, split="train", horizon=LENGTH)
     assert recording.truth is not None
@@ -151,12 +151,10 @@ def optimise(problem: Problem, seed: int) -> dict[str, Any]:
 
 
 def run_file(folder: Path, problem: Problem, seed: int) -> Path:
-    """Return the path of the file with the result of a training run."""
     return folder / f"{problem.id.replace('/', '.')}.{seed}.json"
 
 
 def main() -> None:
-    """Train all filters, evaluate them on the test episodes, and write the record."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

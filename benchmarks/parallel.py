@@ -35,7 +35,7 @@ def process_tree(root: int) -> list[int]:
 
 
 def resident_memory(processes: list[int]) -> float:
-    """Return the memory of processes together, GiB; shared memory counts once."""
+    """Return the memory of processes together, GiB, with shared memory counted once."""
     total = 0
     for process in processes:
         try:
@@ -63,7 +63,7 @@ def filtergym(*words: str) -> tuple[float, float, float]:
 
 
 def results(folder: Path) -> str:
-    """Return the text of a benchmark's results without its command, which differs between the runs."""
+    """Return the results of a benchmark as text, without its command, which differs between the runs."""
     return (folder / "results.json").read_text(encoding="utf-8").partition("\n")[2]
 
 
@@ -103,7 +103,7 @@ def command_of(process: int) -> str:
 
 
 def kill_nodes(words: list[str]) -> None:
-    """Run a command on a cluster of two nodes, and kill a worker, then a node, after some results."""
+    """Evaluate on a cluster of two nodes, and kill a worker, then a node; print whether the records are the same."""
     import ray
     from ray.cluster_utils import Cluster
 

@@ -85,7 +85,7 @@ INTERVAL = 0.02
 
 
 def taylor(x: Any, order: int) -> list[Any]:
-    """Return KalmanNet's transition: the Taylor series of ``exp(A(x) T)`` to some order, applied to the state."""
+    """Return KalmanNet's Lorenz transition: the Taylor series of ``exp(A(x) T)`` to some order, times the state."""
     answer, term = list(x), list(x)
     for j in range(1, order + 1):
         term = [entry * (INTERVAL / j) for entry in _product(x, term)]
@@ -99,7 +99,7 @@ def _product(x: Any, y: Sequence[Any]) -> list[Any]:
 
 
 def flow(x: Any, steps: int = 4) -> list[Any]:
-    """Return the Lorenz attractor's state after an interval, by the Runge-Kutta method of fourth order."""
+    """Return the Lorenz attractor's state after an interval, by fourth-order Runge-Kutta steps."""
     T, state = INTERVAL / steps, list(x)
 
     def ahead(slope: Sequence[Any], share: float) -> list[Any]:
@@ -232,7 +232,7 @@ class WithNoises(Extended):
 
 
 def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
-    """Return the maker of a Kalman filter with constant Q and R."""
+    """Return a factory of Kalman filters with constant Q and R."""
 
     def make(task: Any) -> WithNoises:
         return WithNoises(task, Q, R)
@@ -245,14 +245,13 @@ def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
 
 
 def read_tensors(file: Path) -> Any:
-    """Return the tensors of a stored data set, loaded without executing code."""
     import torch
 
     return torch.load(file, weights_only=True, map_location="cpu")
 
 
 def stored_linear(folder: Path, id: str) -> Recording:
-    """Return KalmanNet's stored test set of the linear problem, 200 tracks of 100 measurements."""
+    """Return KalmanNet's stored test set of the linear problem as a recording: 200 tracks of 100 measurements."""
     stored = read_tensors(folder / "Simulations/Linear_canonical/data/2x2_rq020_T100.pt")
     z, truth = (part.double().numpy().swapaxes(1, 2) for part in stored[4:6])
     episodes, times, _ = z.shape
@@ -339,7 +338,6 @@ class Row(NamedTuple):
 
 
 def decibels(values: Any) -> Any:
-    """Return values in decibels, ``10 log10(values)``."""
     return 10.0 * numpy.log10(values)
 
 
@@ -409,7 +407,7 @@ def judge(
 
 
 class Problem(NamedTuple):
-    """A problem of state-space models, and its test set."""
+    """A problem of a state-space model: scales of Q to try, and its stored test set, if any."""
 
     name: str
     id: str
@@ -420,7 +418,7 @@ class Problem(NamedTuple):
 
 
 def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: Path) -> dict[str, Any]:
-    """Return the makers of a problem's filters by name: the model's own, tuned and trained.
+    """Return the filters of a problem by name: the model's own, tuned and trained.
 
     Args:
         problem: problem of the filters.
@@ -552,7 +550,6 @@ def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECOR
 
 
 def main() -> None:
-    """Tune, train and evaluate all filters, and write the records."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

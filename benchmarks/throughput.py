@@ -64,7 +64,6 @@ Record = dict[str, Any]
 
 
 def processor_seconds(call: Callable[[], object]) -> float:
-    """Return the processor time of a call, s."""
     begin = time.process_time()
     call()
     return time.process_time() - begin
@@ -124,7 +123,6 @@ class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     """A single environment that resets automatically at the end of an episode."""
 
     def step(self, action: Any) -> Any:
-        """Return the result of a step, and reset the environment at the end of the episode."""
         answer = self.env.step(action)
         if answer[2] or answer[3]:
             self.env.reset()
@@ -135,7 +133,7 @@ class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def compiled_costs() -> tuple[float, float]:
-    """Return the seconds of an addition or product, and of an exponential, in compiled code."""
+    """Return the seconds of an arithmetic operation, and of an exponential, in compiled code."""
     chains, links, x = 16, 64, numpy.linspace(-1.0, 1.0, 16 * 8).reshape(16, 8)
 
     def arithmetic(x: Any) -> Any:
@@ -176,7 +174,7 @@ def floor_seconds(model: Any) -> float:
 
 
 def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Record]:
-    """Yield the measured speed of a step in compiled code, NumPy, JAX and filterpy."""
+    """Yield the measured time of a step in compiled code, NumPy, JAX and filterpy."""
     try:
         import jax  # noqa: F401
         import peer_jax
@@ -284,7 +282,6 @@ def _cell(value: Any) -> str:
 
 
 def main() -> None:
-    """Read the command line, measure its sections, and print the tables."""
     sections = ("environments", "steps", "evaluations", "scaling")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

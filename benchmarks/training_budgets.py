@@ -24,7 +24,7 @@ BUDGETS = (100_000, 1_000_000, 10_000_000)
 
 
 def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
-    """Train one run for each seed, unless it is finished, and return the runs' folders."""
+    """Train one run for each seed, and return the runs' folders; finished runs are skipped."""
     words = ["train", id, "--algo", algo, "--steps", str(steps), "--seeds", f"0-{seeds - 1}", "--no-compare"]
     command = [sys.executable, "-m", "filtergym", *words, "--out", str(run)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
@@ -32,7 +32,6 @@ def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
 
 
 def main() -> None:
-    """Train agents with each budget, evaluate them on test episodes, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=Path, default=Path("runs/budgets"), help="folder of the runs")
     parser.add_argument("--algo", default="bptt")

@@ -29,7 +29,7 @@ HEADER = ("environment", "scenario", "opponent", "less the opponent, %", "runs, 
 
 
 def rows_of(id: str, agents: list[str], opponents: list[str], episodes: int) -> Iterator[list[str]]:
-    """Yield the rows of the table of an environment.
+    """Yield the table rows of an environment: agents against opponents, in each scenario.
 
     Args:
         id: its Gymnasium id.
@@ -62,7 +62,6 @@ def rows_of(id: str, agents: list[str], opponents: list[str], episodes: int) -> 
 
 
 def main() -> None:
-    """Evaluate, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path, help="folders of training runs")
     parser.add_argument("--against", action="append", required=True, help="opponent; repeatable")

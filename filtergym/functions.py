@@ -110,7 +110,7 @@ def record(
 def requests_of(
     problem: Problem, experiment: Experiment, competitors: Sequence[Competitor], curves: bool = True
 ) -> list[EvaluationRequest]:
-    """Return the :class:`.EvaluationRequest` of each competitor in an experiment.
+    """Return the evaluation request of each competitor in an experiment, compared with the paper's algorithm.
 
     Args:
         problem: problem of the competitors.
@@ -181,7 +181,7 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
     Args:
         problem: problem of the policy.
         policy: name, path, object or class; errors as of :func:`make_policy`.
-        experiment: experiment that gives the environment its control, scenario and parameters.
+        experiment: experiment that gives control, scenario and parameters.
         trust: whether to load a model's zip, which can execute code.
     """
     name, maker = _named_policy(problem, policy, trust)
@@ -192,7 +192,7 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
 
 
 def _named_policy(problem: Problem, policy: Any, trust: bool) -> tuple[str, Any]:
-    """Return the name of a policy for error messages, and its maker.
+    """Return the name of a policy in errors, and its factory.
 
     Raises:
         ValueError: for a competitor that does not act.
@@ -219,7 +219,7 @@ def _model_of(env: Any) -> Any:
     """Return the model inside a Gymnasium environment of this package.
 
     Raises:
-        ValueError: if the environment is none of filtergym, or computes in torch.
+        ValueError: if it is none of filtergym, shows the truth, mixes scenarios, or computes in torch.
     """
     inner = env.unwrapped if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv) else env
     if not isinstance(inner, TaskEnv | TaskVectorEnv):
@@ -242,9 +242,5 @@ def _model_of(env: Any) -> Any:
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:
-    """Return a record of every metric of every policy, with its interval, the environment's metrics included.
-
-    Args:
-        dataset: from :func:`evaluate`; see :func:`.evaluation.running.metrics.tidy_records`.
-    """
+    """Return a record of every metric of every policy with its interval, from the result of :func:`evaluate`."""
     return metrics.tidy_records(dataset, problem_of(dataset.attrs["environment"]).baselines.metrics)

@@ -1,8 +1,7 @@
 """Minari data sets of episodes of policies, for offline reinforcement learning.
 
 A data set holds the episodes of one policy in one environment: observations, actions and rewards exactly as
-``gymnasium.make`` gives them, and of every episode its seed. ``minari.load_dataset`` reads it, and
-``recover_environment()`` of what it returns makes the environment again.
+``gymnasium.make`` gives them, and of every episode its seed. The environment can be made again from it.
 """
 
 import os
@@ -41,7 +40,7 @@ ENVIRONMENT_KEYWORDS = ("reward", "dtype")
 
 
 class DatasetSummary(NamedTuple):
-    """Summary of a written data set."""
+    """Summary of a written data set: name, policy, environment, size and mean return."""
 
     name: str
     """Name for ``minari.load_dataset``."""
@@ -55,7 +54,7 @@ class DatasetSummary(NamedTuple):
 
 
 def default_policies(problem: Problem, control: str | None = None) -> list[str]:
-    """Return the names of the paper's policy, of the tuned one of least cost, and of random actions.
+    """Return the names of the paper's policy, the tuned one of least cost, and random actions.
 
     Args:
         problem: problem of the policies.
@@ -119,7 +118,7 @@ def write_datasets(
 
 
 class DatasetPlan(NamedTuple):
-    """Checked plan of data sets: experiment, policies and names; writing it raises errors of the folder only."""
+    """Checked plan of data sets, whose writing raises errors of the folder only."""
 
     experiment: Experiment
     """Experiment of the episodes."""
@@ -134,14 +133,14 @@ class DatasetPlan(NamedTuple):
 
     @property
     def decisions(self) -> int:
-        """Number of decisions in all data sets."""
+        """Number of decisions (actions) in all data sets."""
         tasks = [policy.model.task for policy in self.policies]
         return len(self.seeds) * sum(task.horizon // task.decision_interval for task in tasks)
 
     def write(
         self, folder: Path | None = None, namespace: str | None = None, progress: Progress | None = None
     ) -> list[DatasetSummary]:
-        """Write the data sets; arguments, result and errors as of :func:`write_datasets`."""
+        """Write the planned data sets; arguments, result and errors as of :func:`write_datasets`."""
         from minari.storage import get_dataset_path
 
         root = Path(folder) if folder is not None else get_dataset_path()
@@ -227,7 +226,7 @@ def plan_datasets(
 
 
 def _has_any_control(maker: Any) -> bool:
-    """Return whether a policy can act in any control: it declares neither control nor action space."""
+    """Return whether a policy declares neither control nor action space, and so can act in any control."""
     return getattr(maker, "control", None) is None and getattr(maker, "action_space", None) is None
 
 
@@ -256,13 +255,12 @@ def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) 
 
 
 def _minari_name(text: str) -> str:
-    """Return a text with hyphens for all characters that Minari rejects in a name."""
     return re.sub(r"[^\w-]+", "-", text).strip("-")
 
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Set the folder of Minari's data sets, inside a ``with`` block."""
+    """Set the folder in which Minari stores data sets, inside a ``with`` block."""
     variable = "MINARI_DATASETS_PATH"
     before = os.environ.get(variable)
     os.environ[variable] = str(folder.absolute())
@@ -312,7 +310,7 @@ def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, a
 
 
 def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> None:
-    """Store the mean returns of score 0 and 1 of ``minari.get_normalized_score`` in data sets with random actions."""
+    """Store in each data set the mean returns that ``minari.get_normalized_score`` maps to 0 and 1."""
     for entry, dataset in zip(written, stored, strict=True):
         alike = [other for other in written if other.environment == entry.environment]
         low = next((other.mean_return for other in alike if other.policy == RANDOM), None)

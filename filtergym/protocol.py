@@ -40,7 +40,7 @@ MOST_BYTES = 100_000
 
 
 class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One environment of a protocol: version, paper's algorithm and scenarios."""
+    """One environment of a protocol: its id and version, paper's algorithm and scenarios."""
 
     id: str
     """Gymnasium id."""
@@ -62,7 +62,7 @@ class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
 
 class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a protocol file."""
+    """Content of a protocol file: environments, split, seed and episodes."""
 
     name: str
     year: int
@@ -86,13 +86,10 @@ def protocol_names() -> list[str]:
 
 
 def read_protocol(name: str) -> tuple[Protocol, str]:
-    """Return a protocol, read from its file and checked, and the file's digest.
+    """Return a protocol, read from its file and checked, and the SHA-256 digest of the file.
 
     Args:
         name: name of one of this package, or the path of a ``.toml``.
-
-    Returns:
-        The protocol, and the SHA-256 digest of the file.
 
     Raises:
         ValueError: for another name, a file that is no protocol, or one with another interface, bound, bootstrap or
@@ -202,7 +199,7 @@ def _find_entry(own: ProtocolEnvironment, name: str, trust: bool, rename: Any) -
 
 
 class EnvironmentResult(NamedTuple):
-    """Result of a competitor in one environment of a protocol."""
+    """Result of a competitor in one environment of a protocol: cost, lost tracks, ANEES, time."""
 
     entry: Entry
     cost: IntervalEstimate
@@ -221,14 +218,14 @@ class EnvironmentResult(NamedTuple):
 
     @property
     def logarithms(self) -> numpy.ndarray:
-        """Logarithms of the cost ratios of the episodes of the training distribution, ``(episodes,)``."""
+        """Logarithms of the cost ratios to the paper's algorithm in the training distribution, ``(episodes,)``."""
         own = self.entry.environment
         costs = self.costs[own.training]
         return numpy.log(costs[self.entry.name] / costs[own.paper])
 
 
 class ProtocolResult(NamedTuple):
-    """Results of the entries of a protocol, and its number."""
+    """Result of the competitors entered in a protocol, in each environment and as one number."""
 
     protocol: Protocol
     digest: str
@@ -308,12 +305,12 @@ def run_protocol(
 
 
 def measurements_of(protocol: Protocol, entries: Sequence[Entry]) -> int:
-    """Return the number of measurements that a run of the protocol simulates, over all competitors."""
+    """Return the number of measurements that a run of a protocol simulates, over all competitors."""
     return sum(one.measurements for e in entries for cell in _cells(protocol, e, {}) for one in cell)
 
 
 def _cells(protocol: Protocol, entry: Entry, options: Mapping[str, Any]) -> Iterator[list[EvaluationRequest]]:
-    """Yield the evaluation requests of each scenario: the paper's algorithm, references, and the competitor."""
+    """Yield the evaluation requests of each scenario of an entry: paper's algorithm, references, competitor."""
     own = entry.environment
     problem = problem_of(own.id)
     makers = {name: problem.competitor(name) for name in (own.paper, *entry.references)}
@@ -372,12 +369,7 @@ def _costs(found: Sequence[Summary]) -> Iterator[tuple[str, numpy.ndarray]]:
 
 
 def bib_entry(result: ProtocolResult, version: str) -> str:
-    """Return a BibTeX entry that cites the protocol of a result.
-
-    Args:
-        result: result to quote.
-        version: version of the package.
-    """
+    """Return a BibTeX entry that cites the protocol of a result, and the version of the package."""
     protocol = result.protocol
     ids = ", ".join(own.short for own in protocol.environments)
     fields = {

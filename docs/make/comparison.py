@@ -37,9 +37,9 @@ class Comparison(NamedTuple):
 def compared_policies(benchmark: BenchmarkRecords) -> list[str]:
     """Return the names of the competitors that the comparison page shows, in the order of its columns.
 
-    Learned agents; the cheapest of all others in the training distribution, of any control and kind; the paper's
-    algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
-    are in the records. A narrow screen shows only the first columns without scrolling.
+    Learned agents; the cheapest of all others in the training distribution; the paper's algorithm in all its readings;
+    it and the best constant action, tuned; the reference whose score is 1. A narrow screen shows only the first
+    columns.
     """
     problem, records = benchmark
     known, paper = problem.baselines, benchmark.paper
@@ -150,7 +150,7 @@ def covariances(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def compare_environment(benchmark: BenchmarkRecords, width: int = 2) -> Comparison:
-    """Return the tables of one environment: cost against the paper's algorithm, and the physical error.
+    """Return the tables and figure of one environment: cost against the paper's algorithm, and physical errors.
 
     Args:
         benchmark: the environment and its records.
@@ -182,9 +182,8 @@ def compare_environment(benchmark: BenchmarkRecords, width: int = 2) -> Comparis
     times = {s: column_of_times([record for record in records if record.scenario == s]) for s in sizes}
 
     def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
-        """Return a table with a row for each scenario and the cell ``text(scenario, name)`` for each name.
-
-        With ``judged`` the first column is the verdict.
+        """Return a table with a row for each scenario: the verdict if ``judged``, and ``text(scenario,
+        name)`` by name.
         """
         heads = [f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in names]
         return Grid(
@@ -261,7 +260,7 @@ def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
 
 
 def _two_lines(record: Record | None, scale: float) -> str:
-    """Return a record's value and interval as text of two lines, for a narrow column."""
+    """Return a record's value and interval as Markdown of two lines, for a narrow column."""
     # Percentages to a hundredth: smaller values are rounding.
     negligible = 0.005 if scale == 100.0 else 0.0
     shown = with_interval(record, scale, negligible=negligible)

@@ -53,10 +53,9 @@ def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
 
 
 def budgets_markdown(benchmarks: Sequence[BenchmarkRecords]) -> str:
-    """Return a table in Markdown: the classical and the learned competitor of lowest error cost within each time.
+    """Return a Markdown table: the classical and the learned competitor of lowest cost within each processor time.
 
-    A learned one is bold where its whole interval lies below that of the classical one, and a classical one in the
-    opposite case.
+    Of the two, the one whose whole interval lies below that of the other is bold.
     """
     rows = []
     for problem, records in benchmarks:

@@ -23,8 +23,9 @@ def draw_learning_curves(
     *,
     columns: int = 2,
 ) -> Any:
-    """Draw the cost of validations against the paper's algorithm over training: of each algorithm the median over its
-    runs, and a band from the lowest to the highest.
+    """Draw the cost of validations against the paper's algorithm over training, for each algorithm.
+
+    The line is the median over its runs, the band reaches from the lowest to the highest.
 
     Args:
         curves: algorithm -> for each of its runs the environment steps, and the relative cost differences there.
@@ -97,7 +98,7 @@ def draw_differences(
     *,
     columns: int = 2,
 ) -> Any:
-    """Draw dots with intervals: cost of policies against the paper's algorithm, scenario by scenario.
+    """Draw the cost of policies against the paper's algorithm in each scenario, as dots with intervals.
 
     Args:
         differences: scenario -> policy -> difference in percent, lower and upper end of its interval.
@@ -163,8 +164,7 @@ LEARNED = "kalman-net", "KalmanNet"
 def draw_public_problems(
     rows: Sequence[Mapping[str, Any]], drives: Mapping[str, Sequence[float]], *, columns: int = 2
 ) -> Any:
-    """Draw dots with intervals: the mean squared error of filters on KalmanNet's problems; and of each of NCLT's
-    drives.
+    """Draw the errors of filters on KalmanNet's problems, as dots with intervals, and on each of NCLT's drives.
 
     Args:
         rows: rows of the records, all with ``problem``, ``name``, ``mse_db``, ``low_db`` and ``high_db``.
@@ -202,7 +202,7 @@ def draw_public_problems(
 
 @in_print
 def draw_update_times(rows: Sequence[Sequence[str]], *, columns: int = 2) -> Any:
-    """Draw bars of the time of an update, the quickest first; those of other libraries are grey.
+    """Draw bars of the time of an update, the quickest first; other libraries are grey.
 
     Args:
         rows: rows of the record: the filter, in quotes where it is ours, and the median time in microseconds.

@@ -101,7 +101,7 @@ def compile_filter(name: str) -> bytes:
 
 
 def page_script(modules: dict[str, bytes]) -> str:
-    """Return the JavaScript text with the filters' names, weights, and WebAssembly modules in base64."""
+    """Return JavaScript text with the playground's filters: names, weights, WebAssembly modules in base64."""
     filters = {
         name: {"weights": list(FILTERS[name]), "module": base64.b64encode(module).decode("ascii")}
         for name, module in modules.items()

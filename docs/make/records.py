@@ -44,7 +44,7 @@ DIGITS = 6
 
 
 class ResultRecord(NamedTuple):
-    """Content of a record's file."""
+    """Content of a record's file: its data, and how they were made."""
 
     command: str
     """Command that makes the data again."""
@@ -64,7 +64,7 @@ class ResultRecord(NamedTuple):
 
 
 class BenchmarkRecords(NamedTuple):
-    """Results of a benchmark in one environment."""
+    """Results of a benchmark in one environment: the problem and tidy records."""
 
     problem: Problem
     records: list[Record]
@@ -127,7 +127,7 @@ def strip_folders(command: str) -> str:
 
 
 def today() -> str:
-    """Return today's date, ISO 8601."""
+    """Return today's date, UTC, as ISO 8601 text."""
     return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
 
 
@@ -190,8 +190,7 @@ def merge_competitors(
 
     Args:
         data: data of the whole benchmark.
-        added: data of the same environment with some competitors, among them the best of each scenario, since all
-            others are compared with it.
+        added: data of the same environment with some competitors, among them the best of each scenario.
         names: names of the added or replaced competitors; the others serve the comparison.
 
     Raises:
@@ -226,7 +225,7 @@ def _same_cost(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _best(scenario: Mapping[str, Any]) -> str:
-    """Return the name of the competitor with which the others are compared."""
+    """Return the name of the competitor of lowest cost, with which the others are compared."""
     [name] = {
         key.partition(" ")[2]
         for each in scenario["competitors"].values()

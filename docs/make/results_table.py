@@ -28,12 +28,12 @@ COLUMNS = ("difference", "lost", "means", "ns", "control", "cost", "rmse", "anee
 def scenario_records(
     benchmark: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
 ) -> list[Record]:
-    """Return the records of a benchmark in one scenario, without random actions.
+    """Return a benchmark's records of one scenario; of all competitors but random actions by default.
 
     Args:
         benchmark: results in an environment.
         scenario: name of the scenario; default: the training distribution.
-        policies: names of competitors. Default: all.
+        policies: names of competitors.
 
     Raises:
         ValueError: if there are no results.
@@ -57,7 +57,7 @@ def scenario_records(
 def results_grid(
     records: Sequence[Record], paper: str, columns: Sequence[str] = COLUMNS
 ) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of the table of results in one environment and scenario, lowest cost first.
+    """Return header and rows of the results in one environment and scenario, lowest cost first.
 
     Args:
         records: records of one scenario.
@@ -112,7 +112,7 @@ def chosen_markdown(
     policies: Sequence[str] = (),
     columns: Sequence[str] = (),
 ) -> str:
-    """Return one table of results in Markdown over several environments, or with some competitors or columns.
+    """Return a Markdown table of results in several environments, or of some competitors or columns.
 
     Args:
         benchmarks: records of the environments by their short names.

@@ -37,7 +37,7 @@ Scores = Mapping[str, Mapping[str, numpy.ndarray]]
 
 
 def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] = ()) -> Scores:
-    """Return the scores of all training runs, by algorithm and environment, where every algorithm has runs.
+    """Return scores of training runs by algorithm and environment, for environments in which all algorithms have runs.
 
     Agents are not distinguished by a gate or by a policy that they correct.
 
@@ -71,7 +71,7 @@ def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] =
 
 
 def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndarray:
-    """Return the weights of runs (1), then of each bootstrap resample, ``(1 + resamples, sum of counts)``.
+    """Return the weights of runs (1), then those of each bootstrap resample, ``(1 + resamples, runs)``.
 
     Args:
         counts: runs of each environment.
@@ -117,7 +117,7 @@ def interquartile_table(scores: Scores) -> str:
 
 
 def profile_figure(scores: Scores) -> Any:
-    """Return a figure with the performance profile of every algorithm."""
+    """Return a figure with each algorithm's performance profile: share of runs above each score."""
     everything = numpy.concatenate([_pooled(own) for own in scores.values()])
     limits = numpy.linspace(min(0.0, everything.min()), max(1.0, everything.max()), 401)
     profiles = {}

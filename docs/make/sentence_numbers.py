@@ -2,8 +2,8 @@
 
 ``ManeuveringTarget/random/bptt/difference`` is of a benchmark: environment, scenario, competitor, quantity.
 ``seeds/ManeuveringTarget/random/bptt/mean`` is of training seeds: the cost against the paper's algorithm of an
-algorithm ("mean", "median", "between seeds", "over episodes"), or of one run or opponent (no statistic). Every other
-path is record, row and column of a table of text, see :func:`.records.table_cell`.
+algorithm ("mean", "median", "between seeds", "over episodes"), or of one run or opponent. Every other path is record,
+row and column of a table of text, see :func:`.records.table_cell`.
 """
 
 from pathlib import Path

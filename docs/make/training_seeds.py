@@ -40,7 +40,7 @@ from filtergym.reports.tables.terminal_tables import select_components, with_int
 
 
 class Comparison(NamedTuple):
-    """One number of a run, of an algorithm's runs together, or of an opponent."""
+    """One number with interval: of a run, of an algorithm's runs together, or of an opponent."""
 
     environment: str
     scenario: str
@@ -62,7 +62,7 @@ class Comparison(NamedTuple):
 
 
 class SeedRun(NamedTuple):
-    """One training run among those of its algorithm."""
+    """One training run among those of its algorithm: record, agent and folder."""
 
     algorithm: str
     """Name of the algorithm, with the control where its runs have several."""
@@ -78,7 +78,7 @@ class SeedRun(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """Description of one training run on pages."""
+    """Description of a training run on pages: name, algorithm, seed, steps and command."""
 
     name: str
     algorithm: str
@@ -90,7 +90,7 @@ class Trained(NamedTuple):
 
 
 class EpisodeMeans(NamedTuple):
-    """All policies' mean costs and squared errors of every episode in one scenario."""
+    """Mean cost and squared errors of every episode in one scenario, of each policy by name."""
 
     cost: dict[str, numpy.ndarray]
     """Mean cost of every episode, ``(episodes,)``, by policy."""
@@ -100,7 +100,7 @@ class EpisodeMeans(NamedTuple):
 
 
 class PolicyMeans(NamedTuple):
-    """One policy's mean cost and squared errors of every episode."""
+    """Mean cost and squared errors of every episode, of one policy."""
 
     cost: numpy.ndarray
     """Mean cost of every episode, ``(episodes,)``."""
@@ -110,7 +110,7 @@ class PolicyMeans(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Mean over seeds and episodes, and its sources of variation."""
+    """Mean over seeds and episodes, and its standard deviations between seeds and over episodes."""
 
     mean: IntervalEstimate
     between_seeds: float
@@ -122,9 +122,8 @@ class Spread(NamedTuple):
 def spread(values: numpy.ndarray) -> Spread:
     """Return the mean with interval, and its variation over training seeds and over episodes (random effects).
 
-    The moment estimates are those of the analysis of variance. The interval of the mean covers new seeds
-    and new episodes: Student's t with Satterthwaite's degrees of freedom. A bootstrap over five seeds would
-    give too narrow an interval.
+    The moment estimates are those of the analysis of variance. The interval of the mean covers new seeds and new
+    episodes: Student's t with Satterthwaite's degrees of freedom; a bootstrap over five seeds would be too narrow.
 
     Args:
         values: a number for each seed and episode, ``(seeds, episodes)``.
@@ -195,7 +194,7 @@ def _algorithm(run: TrainingRun) -> str:
 
 
 def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
-    """Return environment steps and relative cost differences of a run's validations; None without any."""
+    """Return the steps and relative cost differences of a run's validations; None if any has no difference."""
     entries = run.validation
     relative = [entry.get("relative_cost_difference") for entry in entries]
     differences = [float(f"{difference[0]:.4g}") for difference in relative if difference]
@@ -225,7 +224,7 @@ def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
 
 
 def default_opponents(problem: Problem) -> list[str]:
-    """Return the names of the default opponents of runs: paper's algorithm, strong policies, reference."""
+    """Return the default opponents of runs, by name: paper's algorithm, tunable and tuned policies, references."""
     known = problem.baselines
     untuned = [name for name in known.tunable if name != known.best_constant]
     names = [problem.paper, *known.compared, *untuned, *problem.tuned_policies, *known.references]
@@ -233,7 +232,7 @@ def default_opponents(problem: Problem) -> list[str]:
 
 
 class Study(NamedTuple):
-    """A comparison of runs with opponents, over the same episodes of every scenario."""
+    """A comparison of runs with opponents, over the same episodes of each scenario."""
 
     runs: Sequence[SeedRun]
     opponents: Sequence[str]
@@ -299,7 +298,7 @@ def episode_means(
 
 
 def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationRequest, Work | None]]:
-    """Return for each run and opponent, by name, the evaluation request, and the work item of its means or None."""
+    """Return for each run and opponent, by name, the evaluation request, and the key of its stored means."""
     problem = study.problem
     entered = {m.name: find_competitor(problem, str(m.agent), study.trust) for m in study.runs}
     for name in dict.fromkeys([problem.paper, *study.opponents]):
@@ -350,8 +349,8 @@ def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
 def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison]:
     """Return every number of the tables of one scenario, with interval, from the episodes' means.
 
-    Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; only
-    the mean's interval is over training seeds as well (:func:`spread`).
+    Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; that of the mean
+    is over training seeds as well (:func:`spread`).
     """
     runs, problem = study.runs, study.problem
     paper, reference = problem.paper, problem.baselines.score_reference
@@ -372,7 +371,7 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
         values: Any,
         component: str = "",
     ) -> None:
-        """Append a comparison: an estimate, or an interval from a statistic and its bootstrap resamples."""
+        """Append a comparison whose estimate is given, or computed from a statistic and its bootstrap resamples."""
         estimate = values if isinstance(values, IntervalEstimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
         where = (problem.id, scenario, study.split, study.seed, episodes)
@@ -517,7 +516,7 @@ def compare_scenarios(
 
 
 def describe_runs(runs: Sequence[SeedRun]) -> list[Trained]:
-    """Return a description of each training run, for pages."""
+    """Return the descriptions of training runs on pages."""
     return [
         Trained(
             member.name,
@@ -601,10 +600,10 @@ def seeds_markdown(record: ResultRecord) -> str:
 
 
 def seeds_overview(records: Sequence[ResultRecord]) -> str:
-    """Return a table in Markdown: mean cost over training seeds of every algorithm in every environment.
+    """Return a Markdown table: mean cost over training seeds of every algorithm in every environment.
 
-    Beside them stands the opponent of the lowest cost that is no reference. Agents are not distinguished by a gate or
-    by a policy that they correct.
+    Beside them stands the opponent of lowest cost that is no reference. Agents are not distinguished by a gate or by a
+    policy that they correct.
     """
     means: dict[str, dict[str, str]] = {}
     for record in records:

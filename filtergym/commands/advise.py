@@ -49,7 +49,7 @@ OWN = "The class is your own: put these values into it. A file that names a modu
 
 
 def price_words(price: Mapping[str, int] | None) -> str:
-    """Return the cost of an update of a filter in C, in words; empty where it is unknown."""
+    """Return the cost of an update of a filter in C as text: operations and bytes; empty where unknown."""
     if price is None:
         return ""
     return (
@@ -59,7 +59,7 @@ def price_words(price: Mapping[str, int] | None) -> str:
 
 
 def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any], Mapping[str, int] | None]:
-    """Return a function from a competitor's name and maker to the cost of an update in C: operations and bytes."""
+    """Return a function from a competitor's name and factory to the cost of its update in C."""
     parameters = log_setup(problem, recording).parameters
 
     def price(name: str, maker: Any) -> Mapping[str, int] | None:
@@ -72,7 +72,7 @@ def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any]
 
 
 def fit_to_recording(problem: Problem, name: str, recording: Recording, folder: Path, seed: int) -> None:
-    """Fit one filter to a whole recording, print its parameters, and write them to a file.
+    """Fit one filter to a whole recording, print its parameters, and write them to a file in ``folder``.
 
     Args:
         problem: environment of the recording.

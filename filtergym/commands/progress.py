@@ -21,7 +21,7 @@ class _Bar(Progress):
 
 
 class ProgressLines:
-    """Progress as few lines of text with the remaining time, where there is no terminal; none for tasks of seconds.
+    """Progress of a task as few lines of text with the remaining time; none for tasks of seconds.
 
     Args:
         write: function that writes a line.

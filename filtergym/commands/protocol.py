@@ -59,9 +59,6 @@ def evaluate_protocol(
         trust: load models that can execute code.
         rename: function that replaces names, see :func:`..protocol.find_entries`.
         **options: further arguments of :func:`..protocol.run_protocol`.
-
-    Raises:
-        ValueError: as these functions raise it.
     """
     if json is not None:
         writable_file(json)
@@ -82,7 +79,7 @@ def evaluate_protocol(
 
 
 def quoted_row(result: ProtocolResult) -> list[str]:
-    """Return the lines of a Markdown table with one row, the result to quote; its last column is the time."""
+    """Return a Markdown table with one row, line by line: the protocol's result to quote."""
     cells = {
         result.protocol.name: result.title,
         "cost against the papers, %": _percent(result.cost),

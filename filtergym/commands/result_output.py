@@ -32,7 +32,7 @@ def print_headline(results: Sequence[Result]) -> None:
 
 
 def report_maker() -> Callable[[Sequence[Result], Settings], str]:
-    """Return :func:`.report_html`, which makes a page of results.
+    """Return the function :func:`.report_html`, which makes a page of results.
 
     Raises:
         ValueError: if the packages that it needs are not installed.

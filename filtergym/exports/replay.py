@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class Replay(NamedTuple):
-    """Test vectors of E episodes of T measurements, and the estimates of the Python competitor."""
+    """Test vectors: initial estimates and measurements of E episodes, and the competitor's estimates in Python."""
 
     initial: numpy.ndarray
     """Initial estimate, ``(rows, E)``."""
@@ -57,7 +57,7 @@ class Replay(NamedTuple):
         return numpy.sqrt(numpy.maximum(variance, 0.0))
 
     def largest_difference(self, mean: numpy.ndarray) -> float:
-        """Return the largest difference of means ``(T, C, E)`` to the competitor's, in its standard deviations."""
+        """Return the largest difference of means ``(T, C, E)`` to the competitor's, in standard deviations."""
         with numpy.errstate(all="ignore"):
             difference = numpy.abs(mean - self.mean) / self.sigma
         same = (mean == self.mean) | (numpy.isnan(mean) & numpy.isnan(self.mean))
@@ -71,7 +71,7 @@ def _report(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
-    """Return measurement, mean and covariance of an estimator by name, and ``lost``, above zero where it failed."""
+    """Return an estimator's measurement, mean and covariance by name, and ``lost``, positive where it failed."""
     return {
         **_report(model, episode),
         "lost": model.filter.records(episode.filter, episode.measurement)["lost"],
@@ -87,7 +87,7 @@ def _rows(part: Any, count: int) -> numpy.ndarray:
 def replay(
     request: ExportRequest, episodes: int = 8, measurements: int | None = None
 ) -> tuple[TracedFilter, Replay]:
-    """Trace a competitor, and run it over episodes of the test split; return the traced filter and the test vectors.
+    """Trace a competitor, and run it over episodes of the test split; return traced filter and test vectors.
 
     Args:
         request: competitor to trace.
@@ -127,12 +127,7 @@ def replay(
 
 
 class _Network:
-    """The network of a filter in a replay, with its memory and its last output.
-
-    Args:
-        network: network of the filter.
-        dtype: type in which it computes.
-    """
+    """The network of a filter in a replay, with its memory and its last output, computed in ``dtype``."""
 
     def __init__(self, network: "LearnedPolicy", dtype: Any) -> None:
         self.network = copy.copy(network)
@@ -143,7 +138,7 @@ class _Network:
         self.answer: Any = None
 
     def __call__(self, shown: Any) -> None:
-        """Compute and store the output, unless the first value, the flag of a decision, is zero."""
+        """Compute and store the network's output, unless the first value, the flag of a decision, is zero."""
         flag, *rest = shown
         if not numpy.all(flag):
             return
@@ -155,7 +150,7 @@ class _Network:
 
 
 def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64) -> numpy.ndarray:
-    """Run a traced filter over replayed measurements, and return the rows of its estimate.
+    """Run a traced filter over replayed measurements, and return the rows of its estimate, ``(T, rows, E)``.
 
     Compiled code runs in double where code can be compiled, with the C library's functions; NumPy otherwise.
 
@@ -163,9 +158,6 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
         traced: filter to run.
         replayed: its input.
         dtype: type of the computation.
-
-    Returns:
-        Rows of the estimate, ``(T, rows, E)``.
     """
     E = replayed.initial.shape[1]
     compiled = AVAILABLE and dtype is numpy.float64
@@ -206,12 +198,7 @@ def _interpret_update(
 
 
 class _CompiledUpdate:
-    """The update of E filters as compiled code; a call returns the rows of the results.
-
-    Args:
-        traced: the filter.
-        E: number of filters.
-    """
+    """The update of E traced filters as compiled code; a call returns the rows of the results."""
 
     def __init__(self, traced: TracedFilter, E: int) -> None:
         code, shown = traced.update, traced.shown

@@ -36,15 +36,14 @@ SPAN = f"{SECTION[0]}-{SECTION[1]}"
 
 
 def improvement_verdict(section: Sequence[Quantity], parts: Sequence[Quantity]) -> Verdict:
-    """Return the verdict on the claim C1, "substantially smaller error on the manoeuvre section".
+    """Return the verdict on claim C1, "substantially smaller error on the manoeuvre section".
+
+    "Reproduced" if every change over the section lies below minus ``SUBSTANTIAL`` with its interval and no part is
+    certainly worse; "not reproduced" if no change over the section is certainly below zero.
 
     Args:
         section: relative change over the whole section, of position and of velocity.
         parts: relative changes over its parts (turn, recovery).
-
-    Returns:
-        "reproduced" if every change over the section lies below minus ``SUBSTANTIAL`` with its interval and
-        no part is certainly worse; "not reproduced" if no change over the section is certainly below zero.
     """
     worse_somewhere = any(change.low > 0.0 for change in parts)
     if all(change.high < -SUBSTANTIAL for change in section) and not worse_somewhere:
@@ -74,12 +73,12 @@ class Comparison(NamedTuple):
 
 
 def changes(ours: numpy.ndarray, theirs: numpy.ndarray, window: tuple[int, int] | None) -> Sequence[Quantity]:
-    """Return ``ours / theirs - 1`` of the RMS over a window (None: the peak), for position and velocity."""
+    """Return ``ours / theirs - 1`` of the RMS over a window (None: of the peak), for position and velocity."""
     return [quantity(change) for change in (rms(ours, window) / rms(theirs, window) - 1.0).T]
 
 
 def compare_sections(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0) -> Comparison:
-    """Return the comparison of the IMM with an adaptive filter on the manoeuvre section, moved by ``later`` scans."""
+    """Return the IMM's RMS against an adaptive filter's on the manoeuvre section, moved by ``later`` scans."""
     windows = (SECTION, WINDOWS["turn"], WINDOWS["recovery"])
     section, turn, recovery = (
         changes(ours, theirs, (first + later, last + later)) for first, last in windows
@@ -88,7 +87,7 @@ def compare_sections(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0)
 
 
 def comparisons(r: Results) -> dict[str, Comparison]:
-    """Return every comparison of the IMM with an adaptive filter on the manoeuvre section, by name."""
+    """Return every comparison of the IMM with an adaptive filter, in all experiments, by name."""
     canonical = {name: r.main[name].squares for name in COMPARED_POLICIES}
     experiments: dict[str, Mapping[str, numpy.ndarray]] = {"canonical, 0.3 / 0.7": canonical}
     experiments |= {f"gains {a:g} / {b:g}": curves for (a, b), curves in r.boxed.items()}
@@ -102,7 +101,7 @@ def comparisons(r: Results) -> dict[str, Comparison]:
 
 
 class GridFinding(NamedTuple):
-    """Minimum of an error on the gain grid, and its place relative to the recommended box."""
+    """Minimum of the RMS error on the gain grid, and its place relative to the recommended box."""
 
     minimum: float
     gains: tuple[float, float]
@@ -125,14 +124,12 @@ def box_mask() -> numpy.ndarray:
 
 
 def grid_errors(grid: numpy.ndarray, window: tuple[int, int] | None) -> numpy.ndarray:
-    """Return the RMS of a window (None: the peak) in every cell, position and velocity, ``(2, 1 + resamples, 6,
-    8)``.
-    """
+    """Return the RMS over a window (None: the peak) in every cell of the gain grid, ``(2, 1 + resamples, 6, 8)``."""
     return numpy.moveaxis(rms(grid, window), (3, 2), (0, 1))
 
 
 def grid_finding(errors: numpy.ndarray) -> GridFinding:
-    """Return the minimum of a grid of errors ``(1 + resamples, 6, 8)``, and its place relative to the box."""
+    """Return the minimum of the RMS errors ``(1 + resamples, 6, 8)`` on the gain grid, and its place."""
     inside = box_mask()
     flat = errors.reshape(len(errors), -1)
     best = flat.argmin(axis=1)
@@ -149,7 +146,7 @@ def grid_finding(errors: numpy.ndarray) -> GridFinding:
 
 
 def findings(r: Results, likelihood: Likelihood, window: tuple[int, int] | None) -> list[GridFinding]:
-    """Return the minima on the gain grid, for position and for velocity."""
+    """Return the minimum on the gain grid for position, and that for velocity."""
     return [grid_finding(errors) for errors in grid_errors(r.grids[likelihood], window)]
 
 
@@ -211,7 +208,6 @@ AGAINST = (
 
 
 def _verdict_against(i: int, quantities: Any) -> Verdict:
-    """Return the verdict on claim C1 against comparator ``i`` of ``AGAINST``."""
     comparison: Comparison = quantities.against[i]
     return comparison.verdict
 
@@ -299,7 +295,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
+    """Return the quantities that the claims' texts contain, computed from the results, by name."""
     comparison = comparisons(r)
     imm, adaptive = r.main["imm"].squares, r.main["adaptive"].squares
     best = findings(r, "gains used", WINDOWS["all"])
@@ -410,7 +406,7 @@ def _others(comparison: Mapping[str, Comparison]) -> str:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report; RMS along x, position in m / velocity in m/s."""
+    """Return the report's tables, such as the RMS along x of all algorithms, in m and m/s."""
 
     def row(name: str, squares: numpy.ndarray, later: int = 0) -> list[str]:
         last = squares.shape[1]

@@ -31,7 +31,7 @@ from ...filters.linear_systems import Matrix, intensity_matrix, square_matrix, v
 
 
 def _times(times: ArrayLike) -> Matrix:
-    """Return times as an array; raise ValueError unless they ascend from zero or later."""
+    """Return times as an array; raise ValueError unless they are not negative and ascend."""
     array = numpy.atleast_1d(numpy.asarray(times, float))
     if (
         array.ndim != 1
@@ -44,7 +44,7 @@ def _times(times: ArrayLike) -> Matrix:
 
 
 def _information(C: ArrayLike, Q: ArrayLike, size: int) -> Matrix:
-    """Return ``C^T Q^-1 C``, the information that a measurement brings in one second."""
+    """Return ``C^T Q^-1 C``, the information of a measurement in one second."""
     rows = numpy.atleast_2d(numpy.asarray(C, float))
     if rows.ndim != 2 or rows.shape[1] != size:
         raise ValueError(f"C must have {size} columns, got {C!r}")
@@ -162,7 +162,7 @@ def riccati_ode(
 
 
 class Moments(NamedTuple):
-    """Mean and covariance of the random process at given instants."""
+    """Mean and covariance of a random process at given instants."""
 
     mean: Matrix
     """Mean at each instant, ``(k, n)``."""
@@ -206,7 +206,7 @@ def moments(
 
 
 class SampledCovariance(NamedTuple):
-    """Error covariances of a sampled filter, measurement by measurement."""
+    """Error covariances and gains of a sampled filter, measurement by measurement."""
 
     predicted: Matrix
     """Covariance before each measurement, ``(steps, n, n)``."""

@@ -58,8 +58,7 @@ def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verd
     """Return the verdict on "the loss comes from the weights of the other channels".
 
     Reproduced if the loss in coordinates vanishes (less than 0.1 %) where the other channels have less than a
-    thousandth of the weight, is certain where they have most, and the settings come in the same order by
-    weight and by loss.
+    thousandth of the weight, is certain where they have most, and grows with their weight from setting to setting.
     """
     ordered = [ratios[i] for i in numpy.argsort(weights)]
     quiet = [r for w, r in zip(weights, ratios, strict=True) if w < 1e-3]
@@ -71,7 +70,7 @@ def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verd
 
 
 def in_band(found: Loss) -> bool:
-    """Return whether the median loss time is within the paper's."""
+    """Return whether the median time to loss of track is within the paper's band, and most runs lose it."""
     return found.rate > 0.95 and BAND[0] <= found.median <= BAND[1]
 
 
@@ -173,7 +172,7 @@ CLAIMS = (
 
 
 def quantities(r: Results) -> dict[str, Any]:
-    """Return the quantities, computed from the results, that the claims' texts contain, by name."""
+    """Return the quantities that the claims' texts contain, computed from the results, by name."""
     increment, kinematic = r.courses.values()
     adaptive, free, best = (increment[name] for name in (ADAPTIVE, "Singer, no aperture", "known mode"))
     few = len(free.nis)
@@ -232,7 +231,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 
 def tables(r: Results) -> list[Grid]:
-    """Return the tables of the report on the paper."""
+    """Return the report's tables, such as spherical errors, mode probabilities, and times of loss."""
     header = [
         "filter",
         "leg",

@@ -55,13 +55,7 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
 
 
 def crash_page(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
-    """Return the tables of a crash test as a self-contained HTML page.
-
-    Args:
-        title: title above the tables.
-        tables: tables from :func:`crash_table`.
-        notes: sentences below them.
-    """
+    """Return the tables of a crash test, under a title and with notes, as a self-contained HTML page."""
     console = Console(width=PAGE_WIDTH, record=True, file=io.StringIO(), force_terminal=True)
     console.print(title, style="bold", markup=False, highlight=False)
     for table in tables:

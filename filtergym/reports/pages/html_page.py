@@ -20,7 +20,7 @@ HTML = Path(__file__).parent / "html"
 
 
 def render_page(template: str, script: str, **values: Any) -> str:
-    """Return an HTML page from a template, with its scripts and Plotly inside.
+    """Return an HTML page from a template and its ``values``, with its scripts and Plotly inside.
 
     Args:
         template: file name of the template.

@@ -34,7 +34,7 @@ WORDS = ("competitor", "covariance", "origin", "control")
 
 
 class Entry(NamedTuple):
-    """One cell of a table."""
+    """A cell of a table on the page: its text, and the value by which it is sorted."""
 
     text: str
     sorted_by: float | str | None = None
@@ -42,11 +42,7 @@ class Entry(NamedTuple):
 
 
 def report_html(results: Sequence[Result], settings: Settings) -> str:
-    """Return the HTML page of a report.
-
-    Args:
-        results: results of any environments and scenarios.
-        settings: command and versions.
+    """Return the HTML page of a report on results of any environments and scenarios.
 
     Raises:
         ValueError: if there are none.
@@ -113,7 +109,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
 
 
 def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
-    """Return header and rows of a scenario's table of competitors, lowest cost first, unranked ones last."""
+    """Return header and rows of a scenario's competitors, lowest cost first, unranked ones last."""
     records = result.records
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     shown = main_components(records)
@@ -186,7 +182,7 @@ def _number(text: str) -> float | None:
 
 
 def _differences(result: Result) -> list[list[Any]]:
-    """Return rows of name, origin, and cost against the paper's algorithm with its interval, %."""
+    """Return name, origin, and cost against the paper's algorithm with interval, %, of each competitor."""
     found: dict[str, Record] = {
         r.policy: r for r in result.records if (r.metric, r.window) == (HEADLINE, "all")
     }
@@ -201,11 +197,7 @@ def _differences(result: Result) -> list[list[Any]]:
 
 
 def _front(result: Result) -> list[list[Any]]:
-    """Return rows for the picture of cost against time.
-
-    A row contains name, origin, nanoseconds, cost against the paper's algorithm in percent, whether the competitor is
-    compiled, and whether it is on the front.
-    """
+    """Return the rows of the picture of cost against time: name, origin, ns, cost in %, compiled, on the front."""
     points = points_of_records(result.records)
     on_front = front(points)
     return [
@@ -236,7 +228,7 @@ def _dots(group: Sequence[Result]) -> dict[str, Any]:
 
 
 def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return name, origin and colour number of each drawn competitor, equal in all scenarios of ``group``."""
+    """Return name, origin and colour number of each drawn competitor, the same in all scenarios."""
     names: dict[str, str] = {}
     for one in [*(other for other in group if other.default), *group]:
         kinds = {record.policy: record.kind for record in one.records}

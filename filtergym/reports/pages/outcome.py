@@ -17,13 +17,10 @@ HALF = (0.45, 0.55)
 
 
 def outcome_sentences(results: Sequence[Result]) -> list[str]:
-    """Return a sentence for each environment on the best competitor against the paper's algorithm, and on learned
-    against classical ones.
+    """Return a sentence for each environment on its best competitor against the paper's algorithm.
 
-    Two competitors are called level where the interval of their paired difference contains zero.
-
-    Args:
-        results: results, of which those of training distributions are used; where there is none, all.
+    Learned and classical competitors are compared, too; two are level where the interval of their paired difference
+    contains zero. Only results of training distributions are used, if there are any.
     """
     usual = [result for result in results if result.default] or list(results)
     return [sentence_of(result) for result in usual if ranking(result.records)]
@@ -77,11 +74,7 @@ def _comparison(difference: Record, other: str, first: bool) -> str:
 
 
 def protocol_sentences(results: Sequence[Result]) -> list[str]:
-    """Return sentences on episodes, split, seed and statistics of the comparison; empty without records.
-
-    Args:
-        results: results as in :func:`outcome_sentences`.
-    """
+    """Return sentences on episodes, split, seed and statistics of the comparison; empty without records."""
     records = [result.records[0] for result in results if result.default or not _any_default(results)]
     if not records:
         return []
@@ -154,7 +147,7 @@ def _best_clause(result: Result, best: Record) -> str:
 
 
 class Lead(NamedTuple):
-    """Times of a measurement for which the cheapest of one origin costs less than the cheapest of the other."""
+    """A range of times per measurement in which the cheapest of one origin costs less than the other's."""
 
     name: str
     """Name of the leader where the most time is allowed."""
@@ -165,7 +158,7 @@ class Lead(NamedTuple):
 
 
 def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) -> Lead | None:
-    """Return the times in which competitors of an origin lead, though another one has a lower cost.
+    """Return the range of times in which an origin leads, though the other one has the lowest cost.
 
     A competitor leads where the interval of its cost against the paper's algorithm lies below that of the cheapest of
     the other origin that takes no more time: a stricter test than that of their paired difference, which records
@@ -177,7 +170,7 @@ def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) ->
         origin: "learned" or "classical", that of the best excluded.
 
     Returns:
-        The longest times for which they lead; None where they lead nowhere, or times are unknown.
+        The longest such range; None where they lead nowhere, or times are unknown.
     """
     times = {name: time.nanoseconds for name, time in times_of_records(records).items()}
     costs = {

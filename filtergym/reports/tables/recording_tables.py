@@ -73,7 +73,7 @@ Column = Callable[[str], str]
 
 
 def _beside(draw: Callable[..., Table], parts: Sequence[Mapping[str, Column]], width: int) -> list[Table]:
-    """Return tables of groups of columns: as many groups side by side as fit into ``width``, the rest below."""
+    """Return tables of groups of columns: as many groups in one as fit into ``width``, the rest below."""
     for count in range(len(parts), 0, -1):
         columns = {title: column for part in parts[:count] for title, column in part.items()}
         looks = [draw(columns, control) for control in (True, False)]

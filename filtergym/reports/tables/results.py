@@ -52,7 +52,7 @@ class Settings(NamedTuple):
 
 
 class WorstTrack(NamedTuple):
-    """An episode of high cost to a competitor, for the report."""
+    """An episode of high cost to a competitor: its opponent, seed, costs, causes and track."""
 
     policy: str
     """Name of the competitor."""
@@ -125,7 +125,7 @@ def select_competitors(
     learned: Sequence[str],
     user_names: Sequence[str] = (),
 ) -> list[str]:
-    """Return the names of the competitors whose curves a file of results contains, at most ``MOST_SHOWN``.
+    """Return the competitors whose curves a file of results contains, by name, at most ``MOST_SHOWN``.
 
     The paper's algorithm, the reference, the user's own, the learned, the cheapest of each kind, a bound; then by cost.
     """
@@ -153,7 +153,7 @@ def select_competitors(
 
 
 def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
-    """Return curves at most at ``MOST_TIMES`` times, and error distributions at every other share."""
+    """Return curves at ``MOST_TIMES`` times at most, and error distributions at every other share."""
     fewer = curves.isel(time=evenly_spaced(curves.sizes["time"], MOST_TIMES))
     return fewer.isel(share=slice(None, None, 2)) if "share" in fewer.dims else fewer
 
@@ -161,10 +161,10 @@ def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
 def track_of(
     dataset: xarray.Dataset, components: Sequence[str], plane: bool, number: int = 0
 ) -> xarray.Dataset | None:
-    """Return the truth, measurements and estimates of one episode of an evaluation.
+    """Return the truth, measurements and estimates of one episode of an evaluation; None: not stored.
 
     Args:
-        dataset: dataset of an evaluation with ``drawn_episodes``; without these there is no track.
+        dataset: dataset of an evaluation with ``drawn_episodes``.
         components: components to draw.
         plane: whether the first two of them are the axes of a plane.
         number: number of the episode.
@@ -246,12 +246,12 @@ def _as_json(result: Result) -> dict[str, Any]:
 
 
 def serialise_track(track: xarray.Dataset | None) -> dict[str, Any] | None:
-    """Return a track in JSON's types."""
+    """Return a track as a dictionary of JSON's types."""
     return None if track is None else dataset_as_json(track, TRACK_DIGITS, DIGITS)
 
 
 def serialise_datasets(result: Result) -> dict[str, Any]:
-    """Return a result's curves and track in JSON's types."""
+    """Return a result's curves and track as dictionaries of JSON's types."""
     return {
         "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
         "track": serialise_track(result.track),
@@ -259,10 +259,7 @@ def serialise_datasets(result: Result) -> dict[str, Any]:
 
 
 def read_results(path: Path) -> tuple[list[Result], Settings]:
-    """Return the results in a file of :func:`write_results`, and their settings.
-
-    Args:
-        path: path of the file, or of the folder that contains it as ``results.json``.
+    """Return the results in a file of :func:`write_results`, or in ``results.json`` of a folder; and settings.
 
     Raises:
         ValueError: if the file has other content.
@@ -338,7 +335,7 @@ def _check_dataset(part: str, found: xarray.Dataset | None) -> None:
 
 
 def check_numbers(record: Record) -> None:
-    """Raise ValueError unless value and interval of a record are finite, or None."""
+    """Raise ValueError unless the numbers of a record are finite or None, and both ends of its interval alike."""
     numbers = (record.value, record.low, record.high)
     finite = all(number is None or math.isfinite(number) for number in numbers)
     if not finite or (record.low is None) != (record.high is None):

@@ -42,8 +42,8 @@ def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool =
         trust: whether to load a model, which can execute code.
 
     Returns:
-        ``cost`` and ``anees``, normalised estimation error, of every episode, ``(policy, episode)``; ``role`` is
-        "agent", "paper", "strongest classical" or "reference".
+        ``cost`` and ``anees`` of every episode, ``(policy, episode)``; ``role`` is "agent", "paper", "strongest
+        classical" or "reference".
 
     Raises:
         ValueError: if an agent cannot be read, or needs ``trust``.
@@ -75,7 +75,7 @@ def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool =
 
 
 def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
-    """Return the name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
+    """Return the name of the shipped classical competitor of lowest cost, tuned or not; None without any."""
     problem, known = run.problem, run.problem.baselines
     makers = {
         name: problem.competitor(name)
@@ -95,7 +95,7 @@ def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
 
 
 def standing_table(standing: xarray.Dataset, passed: Mapping[str, FirstWin | None]) -> Table:
-    """Return a table of agents and their opponents: cost, its difference to the paper's algorithm, consistency.
+    """Return a table of agents and their opponents: cost, difference to the paper's algorithm, consistency.
 
     Args:
         standing: dataset from :func:`measure_standing`.

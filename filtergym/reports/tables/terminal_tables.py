@@ -54,7 +54,7 @@ HEADLINE = "geometric_cost_difference"
 
 
 def paper_cells(records: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
-    """Return two cells: share of lost tracks with interval, %, and difference of mean cost to the paper's, %."""
+    """Return two cells of a table: share of lost tracks, %, and difference of mean cost to the paper's, %."""
     lost, means = (
         records.get((*scenario, name, metric, "", "all"))
         for metric in ("lost_tracks", "relative_cost_difference")
@@ -68,14 +68,9 @@ def paper_cells(records: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
 
 
 def consistency_word(record: Any) -> str:
-    """Return a word on a record of ANEES: "consistent" if its interval contains one, else "overconfident" or
-    "cautious".
+    """Return "consistent" if the interval of an ANEES record contains one, else "overconfident" or "cautious".
 
-    Args:
-        record: record with ``value``, ``low`` and ``high``; or None.
-
-    Returns:
-        One or two words; "slightly" marks an inconsistency of less than a factor of two.
+    "Slightly" marks an inconsistency of less than a factor of two.
     """
     if record is None or record.value is None:
         return "unknown"
@@ -105,7 +100,7 @@ def score_text(record: Any) -> str:
 
 
 def main_components(records: Sequence[Any]) -> list[str]:
-    """Return the names of the components in a table: groups such as "position" if any, else the first three."""
+    """Return the names of the components that tables show: groups such as "position", else the first three."""
     first = records[0]
     names = [
         r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
@@ -114,7 +109,7 @@ def main_components(records: Sequence[Any]) -> list[str]:
 
 
 def select_components(names: Sequence[str]) -> list[str]:
-    """Return those names that are groups of components, such as "position"; without any, the first three names."""
+    """Return the names that are groups of components, such as "position"; without any, the first three."""
     # One namesake is no group: "range" is not made of "range_rate".
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
@@ -254,9 +249,7 @@ def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: 
 def _tables_below_each_other(
     draw: Callable[..., Table], costs: Columns, errors: Columns, width: int
 ) -> list[Table]:
-    """Return the costs in one table and the errors below, each in a table of its own where they do not fit side by
-    side.
-    """
+    """Return a table of costs, and below it the errors, side by side if they fit, else a table each."""
     costs, errors = dict(costs), dict(errors)
     table = first_fitting([draw(costs, False, compact) for compact in (False, True)], width)
     if table is None:
@@ -274,7 +267,7 @@ def first_fitting(tables: Iterable[Table], width: int) -> Table | None:
 
 
 def plain_table(title: str | None = None) -> Table:
-    """Return an empty table in the common form: one line below the head, two spaces between columns."""
+    """Return an empty table in the style of all tables: one line below the head, two spaces between columns."""
     return Table(
         title=title,
         title_justify="left",
@@ -293,7 +286,7 @@ def competitors_table(
     compact: bool = False,
     user_names: Collection[str] = (),
 ) -> Table:
-    """Return a table of the competitors, with unranked ones in sections of their own, and marks on the user's rows."""
+    """Return a table with a row for each competitor, unranked ones in sections of their own, the user's marked."""
     table = plain_table()
     table.add_column("policy", overflow="fold")
     if control:
