@@ -434,12 +434,7 @@ class Descent:
 def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
     """Train a network by gradients through the filter up to ``run.steps``, or Ctrl-C or SIGTERM; return the run.
 
-    Args:
-        run: run from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.
-        session: settings of the session.
-
-    Raises:
-        ValueError: for a control with discrete actions, or a checkpoint that cannot be read.
+    A control with discrete actions, and a checkpoint that cannot be read, raise ValueError.
     """
     if session.resume and run.is_complete:
         return run

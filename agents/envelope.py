@@ -63,10 +63,6 @@ class EnvelopeAlarm(Alarm):
 
     In training a value of a field lies outside once in ``1 / USUAL`` decisions or less; in other distributions half of
     the values do. The alarm sums the log-likelihood ratios of each field.
-
-    Args:
-        model: the model whose observations are passed.
-        range: range of the training.
     """
 
     def __init__(self, model: Model, range: TrainingRange) -> None:
@@ -124,12 +120,7 @@ class NetworkWatch:
 def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
     """Return the range of each observation field in an agent's training, as stored, else from simulated episodes.
 
-    Args:
-        cls: the task.
-        maker: factory of a learned policy or estimator, as :func:`.learned_policy.load_policy` returns it.
-
-    Returns:
-        The range; None if the training is unknown, or was on a mixture of scenarios and the file has no range.
+    None: unknown training, or a mixture of scenarios without a stored range.
     """
     stored = _stored(maker)
     if stored is None:
@@ -181,14 +172,7 @@ class Departure(NamedTuple):
 
 
 def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str, Any]) -> Departure | None:
-    """Return how the task in which an agent is to act differs from its training; None: not at all, or unknown.
-
-    Args:
-        cls: the task.
-        maker: factory of a learned policy or estimator, as :func:`.learned_policy.load_policy` returns it.
-        scenario: the scenario that the agent is to act in.
-        keywords: parameters of the task there.
-    """
+    """Return how the task in which an agent is to act differs from its training; None: not at all, or unknown."""
     stored = _stored(maker)
     if stored is None or find_mixture(cls, stored.header["run"].get("scenario")) is not None:
         return None

@@ -128,10 +128,8 @@ class Trust:
     ) -> tuple[numpy.ndarray, TrustMemory]:
         """Update the alarms with observations ``(N, fields)``; return the mask ``(N,)`` of trusted lanes, and memory.
 
-        Args:
-            observation: observations of the lanes (parallel episodes).
-            memory: memory returned by the last call; None at the first.
-            start: true where an episode begins, ``(N,)``.
+        ``start`` is true where an episode begins, ``(N,)``; ``memory`` is that of the last call, None at the
+        first.
         """
         none = 0.0 * observation[:, 0]
         alarm, envelope, active, outside = (None, None, none, none) if memory is None else memory
@@ -194,14 +192,8 @@ class Gate:
     ) -> tuple[numpy.ndarray, numpy.ndarray, GateMemory]:
         """Return the agent's actions where the gate is open and the fallback's elsewhere, the mask, and the memory.
 
-        Args:
-            observation: ``(N, fields)``.
-            action: the agent's actions, batch first.
-            memory: memory returned by the last call; None at the first.
-            start: true where an episode begins, ``(N,)``.
-
-        Returns:
-            Actions, batch first; whether the gate is open, booleans ``(N,)``; and memory.
+        Actions are batch first; ``start`` is true where an episode begins; ``memory`` is that of the last
+        call, or None.
         """
         memory = self.begin(range(len(observation))) if memory is None else memory
         opened, trust = self.trust.listen(observation, memory.trust, start)
@@ -268,13 +260,7 @@ class MonitoredMemory(NamedTuple):
 
 
 class MonitoredPolicy(Policy):
-    """A policy whose memory includes whether it is trusted; its actions do not change.
-
-    Args:
-        policy: an object with Stable-Baselines3's ``predict``.
-        trust: the rule that trusts the policy.
-        model: the model of both.
-    """
+    """A policy whose memory includes whether it is trusted; its actions do not change."""
 
     def __init__(self, policy: Any, trust: Trust, model: Model) -> None:
         super().__init__(model)
@@ -322,9 +308,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
     larger by one factor. Persistent errors hardly change the innovations and are not corrected. The agent's covariance
     is not scaled: its innovations are those before its action.
 
-    Args:
-        agent: a filter whose policy is a :class:`MonitoredPolicy`.
-        fallback: a filter.
+    The policy of ``agent`` is a :class:`MonitoredPolicy`.
     """
 
     def __init__(self, agent: LearnedEstimator, fallback: Filter[Any, Any, Any]) -> None:
@@ -519,9 +503,7 @@ def _excess_cost(name: str, fallback: str) -> tuple[float, float]:
 def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
     """Return a competitor's relative excess cost over the paper's algorithm, and that in standard errors.
 
-    Args:
-        problem: the problem of both; the episodes are validation episodes of its training distribution.
-        fallback: name of the competitor.
+    The episodes are validation episodes of the training distribution.
     """
     if fallback == problem.paper:
         return 0.0, 0.0
@@ -531,10 +513,7 @@ def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
 class PolicyMaker:
     """Factory of a wrapped policy, which is called with a model.
 
-    Args:
-        maker: the policy inside, or a factory of it.
-        wrap: function from the model and the policy inside to the wrapped policy.
-        control: control of both; default: the maker's own.
+    ``wrap`` maps a model and the policy inside to the wrapped policy.
     """
 
     kind = "policy"

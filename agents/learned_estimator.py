@@ -20,10 +20,7 @@ from ..evaluation.competitors.steered_filter import PolicyFilterState, SteeredFi
 class LearnedEstimator(SteeredFilter):
     """Filter made of a bank and the network that steers it; missing values of a measurement count as zeros.
 
-    Args:
-        model: model with the bank.
-        network: policy for the bank, on NumPy.
-        interval: measurements for which an action is held.
+    ``interval`` is the number of measurements for which an action is held.
     """
 
     def __init__(self, model: Model, network: Policy, interval: int = 1) -> None:
@@ -47,9 +44,7 @@ def fill_missing(measurement: Any) -> Any:
 class EstimatorMaker:
     """Factory of a learned estimator; an evaluation calls it with a task.
 
-    Args:
-        bank: name of the filter among the trained banks of the task.
-        policy: factory of the network for a model of that bank.
+    ``policy`` is the network's factory, for a model of the bank.
     """
 
     kind: ClassVar[Kind] = "estimator"

@@ -28,9 +28,6 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
             Stable-Baselines3 model, which can execute code while it is loaded; or the folder of a training run, for its
             best agent.
         trust: whether to load a zip.
-
-    Raises:
-        ValueError: if the content of the file or folder does not match its name, or needs ``trust``.
     """
     if name in pretrained_agents(cls.id):
         return load_policy(cls, pretrained_path(cls.id, name))
@@ -51,11 +48,7 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
 
 
 def load_zipped_model(cls: type[Task], path: Path, control: str | None, trust: bool) -> Any:
-    """Return a Stable-Baselines3 model from its zip, without residual policy or gate.
-
-    Raises:
-        ValueError: if the file is not a model, or is not trusted.
-    """
+    """Return a Stable-Baselines3 model from its zip, without residual policy or gate."""
     try:
         from .sb3_policy import load_sb3_policy
     except ImportError as error:

@@ -153,12 +153,7 @@ def _is_wrapped(model: BaseAlgorithm) -> bool:
 
 
 def statistics_places(path: Path, environment: str | None = None) -> Iterator[Path]:
-    """Yield the paths of files that may contain the normalisation of a model's zip, most specific first.
-
-    Args:
-        path: path of the zip.
-        environment: id of the model's environment.
-    """
+    """Yield the paths of files that may contain the normalisation of a model's zip, most specific first."""
     steps = re.fullmatch(r"(.+)_(\d+)_steps", path.stem)
     if steps:  # as Stable-Baselines3's CheckpointCallback names them
         yield path.with_name(f"{steps[1]}_vecnormalize_{steps[2]}_steps.pkl")
@@ -211,11 +206,7 @@ def load_sb3_policy(
 
 
 def _load_model(path: Path) -> BaseAlgorithm:
-    """Return the model in a zip, loaded with the class of its algorithm.
-
-    Raises:
-        ValueError: for an unknown algorithm.
-    """
+    """Return the model in a zip, loaded with the class of its algorithm."""
     data = load_from_zip_file(path, device="cpu")[0] or {}
     names = {cls.__name__ for cls in data["policy_class"].__mro__}
     for algorithm, policy, stored in POLICY_CLASSES:

@@ -134,11 +134,7 @@ def save_checkpoint(
 def load_checkpoint(
     run: TrainingRun, folder: Path, trust: bool
 ) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
-    """Return model, environments and normalisation of a checkpoint, to continue from.
-
-    Raises:
-        ValueError: if it is not trusted, or a file is missing or corrupt.
-    """
+    """Return model, environments and normalisation of a checkpoint, to continue from."""
     check_trust(f"the checkpoint in {folder} is loaded with pickle", trust)
     adapted = training_environment(run)
     env: Any = adapted
@@ -203,13 +199,8 @@ def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormali
 def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
     """Train an agent with Stable-Baselines3 up to ``run.steps``, or Ctrl-C or SIGTERM; return the run.
 
-    Args:
-        run: run from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.
-        session: settings of the session.
-
-    Raises:
-        ValueError: for an algorithm that does not fit the control, or a checkpoint that is not trusted or cannot be
-            read.
+    An algorithm that does not fit the control, and a checkpoint that is corrupt or not trusted, raise
+    ValueError.
     """
     if session.resume and run.is_complete:
         return run

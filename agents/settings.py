@@ -55,9 +55,6 @@ def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[st
 def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Parse words ``env.NAME=VALUE`` and ``algo.NAME=VALUE``; further dots are keys inside a mapping.
 
-    Returns:
-        Keywords of the environment, and hyperparameters.
-
     Raises:
         ValueError: for another form.
     """
@@ -82,11 +79,7 @@ def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]
 
 
 def _read_table(path: Path, needs: str) -> dict[str, Any]:
-    """Return the mapping in a YAML file.
-
-    Raises:
-        ValueError: if it cannot be read, or is not a mapping, which the error describes by ``needs``.
-    """
+    """Return the mapping in a YAML file."""
     try:
         table = convert_numbers(read_yaml(path))
     except (OSError, ValueError) as error:
@@ -115,9 +108,6 @@ def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
             keywords of the environment in ``env_kwargs``; or with the keys ``env`` and ``algo``.
         id: environment id.
 
-    Returns:
-        Keywords of the environment, and hyperparameters.
-
     Raises:
         ValueError: if the file cannot be read, is of another form, or has no section for the environment.
     """
@@ -145,13 +135,7 @@ def check_keywords(cls: type[Task], algorithm: str, keywords: Mapping[str, Any])
 
 
 def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Mapping[str, Any]) -> None:
-    """Raise ValueError for a hyperparameter that the algorithm does not have.
-
-    Args:
-        algorithm: name of the algorithm.
-        values: hyperparameters to check.
-        shipped: hyperparameters of the shipped file.
-    """
+    """Raise ValueError for a hyperparameter that the algorithm does not have."""
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
         known |= {

@@ -188,10 +188,6 @@ class RunOptions:
 def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
     """Return the record of a new training run, from a user's options and the hyperparameters in files.
 
-    Args:
-        problem: the problem of the training.
-        options: the user's options.
-
     Raises:
         ValueError: for an unknown name, a value out of its limits, a scenario that is held out, or an agent that cannot
             correct that policy or act behind a gate.
@@ -237,11 +233,7 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
 
 
 def _merge_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a run's hyperparameters and the user's keywords of the environment, merged from all sources.
-
-    Raises:
-        ValueError: for an unknown name.
-    """
+    """Return a run's hyperparameters and the user's keywords of the environment, merged from all sources."""
     shipped = read_hyperparameters(problem.id, options.algorithm)
     keywords, values = ({}, {}) if options.config is None else read_config(options.config, problem.id)
     keywords, values = merge_settings(keywords, options.keywords), merge_settings(values, options.overrides)
@@ -375,12 +367,7 @@ def schedule(name: str, value: float | str) -> Callable[[float], float]:
 
 
 def check_trust(what: str, trust: bool) -> None:
-    """Raise ValueError if a file or module that can execute code is not trusted.
-
-    Args:
-        what: the file or module, and how it is loaded.
-        trust: whether the user trusts it.
-    """
+    """Raise ValueError if a file or module that can execute code is not trusted."""
     if not trust:
         raise ValueError(
             f"{what}, which can execute code: if you made it or know who did, add --trust (in Python: trust=True)"
@@ -496,11 +483,7 @@ def has_run(folder: Path) -> bool:
 def open_run(folder: Path, requested: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
     """Begin a run in a folder or continue the one there, store its command and versions, and return it.
 
-    Args:
-        folder: folder of the run.
-        requested: the run that the user describes.
-        resume: continue the run of the folder.
-        same: keep the run's own hyperparameters, see :func:`resume_run`.
+    Arguments are those of :func:`resume_run`; ``resume`` continues the run of the folder.
 
     Raises:
         ValueError: if the folder cannot be written to, or contains a run that is not to be resumed or a different one.

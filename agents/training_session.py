@@ -28,9 +28,7 @@ def _curve(entry: ValidationEntry) -> dict[str, float]:
 def make_logger(folder: Path, steps_done: int) -> Any:
     """Return a logger of Stable-Baselines3 that writes CSV and, where it is installed, TensorBoard.
 
-    Args:
-        folder: folder of the files.
-        steps_done: environment steps before this session; a resumed run writes its own files.
+    A resumed run writes its own files, named after ``steps_done``.
     """
     from stable_baselines3.common.logger import Logger, make_output_format
 
@@ -134,13 +132,8 @@ class Trainee(NamedTuple):
 class Bookkeeping:
     """Validations, checkpoints and record of a run in training.
 
-    Args:
-        run: the record, which is updated.
-        session: settings of the session; every validation is followed by a checkpoint.
-        trainee: the agent.
-        stop: function that returns whether a stop was requested.
-        log: function that writes numbers by name at a number of environment steps.
-        began: ``time.monotonic`` before the environments were made, in s.
+    ``stop`` returns whether a stop was requested; ``began`` is ``time.monotonic`` before the environments
+    were made.
     """
 
     def __init__(

@@ -29,10 +29,7 @@ LIMIT = 10.0
 class UnrolledPolicy:
     """Forward and backward pass of a :class:`~.bptt.NetworkPolicy` over N episodes.
 
-    Args:
-        policy: the policy whose parameters are used, and to whose gradients are added.
-        envs: number of episodes.
-        decisions: largest number of decisions between two backward passes.
+    ``decisions`` is the largest number of decisions between two backward passes.
     """
 
     def __init__(self, policy: Any, envs: int, decisions: int) -> None:
@@ -95,13 +92,7 @@ class UnrolledPolicy:
 
 
 class UnrolledLayers:
-    """Linear layers, ``f([weights, bias] @ [features, 1])``; f is the rectifier, and tanh after the last of them.
-
-    Args:
-        layers: linear layers of torch.
-        envs: number of episodes.
-        decisions: largest number of decisions between two backward passes.
-    """
+    """Linear layers, ``f([weights, bias] @ [features, 1])``; f is the rectifier, and tanh after the last of them."""
 
     def __init__(self, layers: Sequence[Any], envs: int, decisions: int) -> None:
         self._layers = layers
@@ -284,11 +275,7 @@ class Teacher:
         self._lanes = Lanes(model, env.num_envs, report=_estimate)
 
     def estimates(self, identities: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the teacher's means ``(measurements, C, width)`` and covariances ``(measurements, C, C, width)``.
-
-        Args:
-            identities: identities of the episodes, ``(2, width)``.
-        """
+        """Return the teacher's means ``(measurements, C, width)`` and covariances ``(measurements, C, C, width)``."""
         self._lanes.begin(identities[:, : self._lanes.count])
         found: tuple[numpy.ndarray, numpy.ndarray] = self._lanes.run(_estimate)[0]
         return found

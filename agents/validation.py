@@ -29,11 +29,6 @@ class TrainingEpisodes:
 
     All episodes are simulated in every scenario of a mixture, and the results are weighted as in the mixture: the same
     expectation with less variance than random scenarios.
-
-    Args:
-        run: the run with environment, scenario, and parameters of the task.
-        episodes: number of episodes.
-        backend: backend of the steps.
     """
 
     def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
@@ -89,11 +84,7 @@ def validation_backend(run: TrainingRun) -> str:
 
 
 class Validation:
-    """Scores of an agent and of the paper's algorithm, if any, on the same episodes of the validation split.
-
-    Args:
-        run: the run of the agent.
-    """
+    """Scores of an agent and of the paper's algorithm, if any, on the same episodes of the validation split."""
 
     def __init__(self, run: TrainingRun) -> None:
         self.run = run

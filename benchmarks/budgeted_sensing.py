@@ -72,8 +72,7 @@ def spaced_costs(R: numpy.ndarray, agility: numpy.ndarray) -> numpy.ndarray:
 def relaxed_bound(costs: numpy.ndarray) -> numpy.ndarray:
     """Return a lower bound ``(N,)`` on the mean cost of targets that share one measurement a second.
 
-    Args:
-        costs: costs of each target by the seconds between its looks, ``(GAPS, 4, N)``.
+    ``costs`` of each target by the seconds between its looks: ``(GAPS, 4, N)``.
     """
     rates = 1.0 / numpy.arange(1.0, GAPS + 1.0)[:, None, None]
     prices = numpy.geomspace(1e-2, 1e6, 400)

@@ -73,9 +73,8 @@ of the coloured one ``coloured^2 / correlation_time`` is better determined than 
 def read_inertial(file: Path) -> Any:
     """Return rates, rad/s, and specific forces, m/s^2, forward, right and down by time, s since 1970 of GPS time.
 
-    Args:
-        file: text of seven columns, three accelerations, three rates and milliseconds, with the logger's time
-            tags in ``FILE.tag`` beside it.
+    ``file`` has seven columns, three accelerations, three rates and milliseconds; ``FILE.tag`` has the time
+    tags.
 
     Raises:
         ValueError: if either file has another format.
@@ -136,10 +135,6 @@ def read_fixes(file: Path) -> Any:
 def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
     """Return the INS aligned at the standstill and aided by RTK from there.
 
-    Args:
-        inertial: result of :func:`read_inertial`.
-        fixes: result of :func:`read_fixes`.
-
     Raises:
         ValueError: if the recording does not begin with a standstill of 5 s, or the vehicle does not move after it.
     """
@@ -149,11 +144,6 @@ def align_ins(inertial: Any, fixes: Any) -> AidedInertial:
 
 def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     """Return a drive cut into recordings of LooselyCoupledNavigation.
-
-    Args:
-        inertial: result of :func:`read_inertial`.
-        fixes: result of :func:`read_fixes`, without gaps.
-        seed: seed of the simulated fixes.
 
     Raises:
         ValueError: if positions are missing, or none is left after the alignment.
@@ -256,9 +246,7 @@ def fit_levels(
     The differences are fixes less INS positions. The receiver's noise is included: relevant are the errors that a
     filter can detect through it.
 
-    Args:
-        recorded: result of :func:`recordings`.
-        correlation_time: correlation time, s; None searches the likeliest.
+    ``correlation_time`` is in s; None searches the likeliest.
     """
     from scipy.optimize import minimize
 

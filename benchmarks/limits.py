@@ -76,15 +76,7 @@ def episode_costs(
 def nearest(
     problem: Problem, scenario: str, episodes: int, seed: int = 1, names: Sequence[str] = ()
 ) -> Nearest:
-    """Return the competitor of least cost in a scenario, compared with the reference.
-
-    Args:
-        problem: the environment.
-        scenario: name of the scenario.
-        episodes: number of episodes of each competitor.
-        seed: number of the experiment.
-        names: names of competitors; empty: all ranked ones.
-    """
+    """Return the competitor of least cost in a scenario, compared with the reference."""
     reference = problem.baselines.score_reference
     costs = episode_costs(
         problem, scenario, [*(names or names_without_random(problem)), reference], episodes, seed

@@ -78,10 +78,6 @@ def likelihood_of_sequences(recording: Recording, values: dict[str, float]) -> f
 
     Each sequence of modes has a Kalman filter; the ``SEQUENCES`` likeliest stay and none are merged. With a ratio of
     one it is that of one Kalman filter.
-
-    Args:
-        recording: recording of one track.
-        values: values of the parameters, in the units of the search.
     """
     quiet, ratio, leave_quiet, leave_noisy, scale = (10.0 ** values[f"log10_{name}"] for name in SEARCHED)
     sizes = numpy.array([quiet, quiet * ratio])

@@ -31,15 +31,7 @@ class Parity(NamedTuple):
 
 
 def parity(id: str, control: str, scenario: str, episodes: int, decisions: int | None = None) -> Parity:
-    """Run episodes on both backends with the same actions, and return the largest differences.
-
-    Args:
-        id: Gymnasium id.
-        control: control of the random actions.
-        scenario: name of the scenario.
-        episodes: number of episodes, side by side.
-        decisions: number of decisions of each episode; default: whole episodes.
-    """
+    """Run episodes on both backends with the same actions, and return the largest differences."""
     envs = [
         gymnasium.make_vec(
             id,

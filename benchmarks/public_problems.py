@@ -210,13 +210,7 @@ STARTS = ([2.0, 0.0, 0.0, 0.6], [3.0, 0.0, 2.0, 2.0])
 
 
 class WithNoises(Extended):
-    """The Kalman filter with constant Q and R in place of the model's.
-
-    Args:
-        task: the problem.
-        Q: covariance of the process noise, ``(n, n)``.
-        R: covariance of the measurement noise, ``(m, m)``.
-    """
+    """The Kalman filter with constant Q and R in place of the model's."""
 
     def __init__(self, task: Any, Q: numpy.ndarray, R: numpy.ndarray) -> None:
         super().__init__(task)
@@ -271,10 +265,6 @@ def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]
     """Return the drives of filternet's NCLT problem, and the RMSE a coordinate of the receiver alone.
 
     Where the receiver has no fix, its last position is used.
-
-    Args:
-        folder: folder of the repository.
-        name: name of the set, ``test`` or ``val``.
     """
     drives = [
         {key: value.numpy() if hasattr(value, "numpy") else value for key, value in one.items()}
@@ -418,13 +408,7 @@ class Problem(NamedTuple):
 
 
 def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: Path) -> dict[str, Any]:
-    """Return the filters of a problem by name: the model's own, tuned and trained.
-
-    Args:
-        problem: problem of the filters.
-        agents: folders of the runs of each algorithm.
-        runs: folder of the tuned values.
-    """
+    """Return the filters of a problem by name: the model's own, tuned and trained."""
     known = problem_of(problem.id).baselines
     untuned = ["extended", *(name for name in ("unscented", "kalman-imm") if name in known.estimators)]
     competitors: dict[str, Any] = {name: name for name in (*untuned, "covariance-matching")}

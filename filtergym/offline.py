@@ -54,12 +54,7 @@ class DatasetSummary(NamedTuple):
 
 
 def default_policies(problem: Problem, control: str | None = None) -> list[str]:
-    """Return the names of the paper's policy, the tuned one of least cost, and random actions.
-
-    Args:
-        problem: problem of the policies.
-        control: control in which the policies must act; None: any.
-    """
+    """Return the names of the paper's policy, the tuned one of least cost, and random actions."""
     paper = problem.baselines.score_paper
     names = [paper, problem.tuned_values.best_policy(control), RANDOM]
     own = getattr(problem.competitor(paper), "control", None) if paper else None
@@ -104,9 +99,6 @@ def write_datasets(
         progress: function that is called repeatedly with the number of decisions done.
         trust: whether to load a model's zip, which can execute code.
         **keywords: parameters of the task; also ``reward`` and ``dtype`` of ``gymnasium.make``.
-
-    Returns:
-        Summaries of the data sets, in the order of the policies.
 
     Raises:
         ValueError: for unknown names, a competitor that does not act, a scenario that is held out, a data set that
@@ -189,11 +181,7 @@ def plan_datasets(
 ) -> DatasetPlan:
     """Check all arguments of a request for data sets, and return the plan to write them.
 
-    Args:
-        problem: problem of the policies.
-        experiment: experiment on it; its keywords may also contain ``reward`` and ``dtype`` of ``gymnasium.make``.
-        policies: names or paths; errors are those of :func:`write_datasets`.
-        trust: whether to load a model's zip, which can execute code.
+    Errors are those of :func:`write_datasets`.
     """
     try:
         import h5py  # noqa: F401  (Minari reports that it is missing only when it writes)

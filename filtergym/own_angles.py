@@ -25,11 +25,7 @@ def find_periods(
 ) -> dict[int, float]:
     """Return the period of each state component that is an angle, declared or measured as one, by its index.
 
-    Args:
-        angles: unit of each declared angle, by the component's name.
-        names: names of all components.
-        places: component that each number of a measurement measures, or None.
-        channels: the sensors.
+    ``places`` are the components that the numbers of a measurement measure, or None.
 
     Raises:
         ValueError: for an unknown component or unit.

@@ -120,11 +120,7 @@ def _matrix(R: Any) -> Any:
 
 
 def _noise_arguments(block: NoiseBlock, around: Surroundings, timed: bool) -> tuple[str, ...]:
-    """Return which of x, dt and u a block's function R takes, in its order; empty for a matrix.
-
-    Raises:
-        ValueError: for an argument that the model does not have.
-    """
+    """Return which of x, dt and u a block's function R takes, in its order; empty for a matrix."""
     if not callable(block.R):
         return ()
     names = arguments(block.R) or ("x",)
@@ -209,11 +205,7 @@ def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 
 
 def _sources(what: str, given: Any) -> Mapping[str, Any]:
-    """Return covariances of process noise by the names of their sources; a single one has the name "".
-
-    Raises:
-        ValueError: for no source, or an invalid name.
-    """
+    """Return covariances of process noise by the names of their sources; a single one has the name ""."""
     if not isinstance(given, Mapping):
         return {"": given}
     if not given or not all(isinstance(name, str) and name for name in given):
@@ -334,12 +326,7 @@ def check_covariance(what: str, values: Any, size: int, definite: bool = False) 
 def trace(what: str, function: Function, size: int, results: int | None, further: int = 0) -> VectorFunction:
     """Return the traced form of a function of ``size`` numbers, and of ``further`` ones without derivative.
 
-    Args:
-        what: name of the function in errors.
-        function: the function, or a matrix.
-        size: number of arguments with a derivative.
-        results: number of its results; None: any.
-        further: number of further arguments.
+    The function has ``results`` results; None: any number of them.
 
     Raises:
         ValueError: if it cannot be traced, or returns another number of results.

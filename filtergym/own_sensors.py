@@ -68,11 +68,6 @@ def find_channels(
 ) -> tuple[Channel, ...]:
     """Return a :class:`Channel` for each sensor: its places in the measurement, period, availability and gate.
 
-    Args:
-        sensors: sensors by their names; empty: one sensor measures everything.
-        counts: number of measured numbers of each sensor.
-        interval: time between measurements, s.
-
     Raises:
         ValueError: for a sensor whose interval is shorter than ``interval``.
     """

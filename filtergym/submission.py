@@ -265,12 +265,6 @@ def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
 def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = False) -> Any:
     """Return the factory of the competitor in a submission: agent, source code or shipped filter.
 
-    Args:
-        problem: problem of the submission.
-        submission: submission from a file.
-        path: path of the file, for errors.
-        trust: whether to run source code.
-
     Raises:
         ValueError: if it contains source code and is not trusted; for an object that is no competitor, a competitor
             that uses the truth, or an agent that was trained on held-out data.
@@ -298,12 +292,7 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
 
 
 def _load_agent(problem: Problem, arrays: Arrays, path: Path) -> Any:
-    """Return the agent of a submission, loaded from its arrays.
-
-    Raises:
-        ValueError: in one printable sentence, if the arrays are no agent of the environment, or it was trained on
-            held-out data.
-    """
+    """Return the agent of a submission, loaded from its arrays."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "agent.safetensors"
         file.write_bytes(arrays.safetensors)
@@ -339,14 +328,6 @@ def make_submission(
 ) -> Submission:
     """Run a protocol with a competitor, and return the submission with its results.
 
-    Args:
-        problem: problem to solve.
-        name: name of the competitor, see :func:`pack`.
-        protocol: name of the protocol.
-        card: description by the author.
-        workers: processes that share the work.
-        progress: function that is called with the number of measurements done.
-
     Raises:
         ValueError: for a competitor that :func:`verify` would refuse.
     """
@@ -361,11 +342,7 @@ def make_submission(
 
 
 def check_submission(problem: Problem, submission: Submission, path: Path) -> Protocol:
-    """Return a submission's protocol, after a check of its digest against this package's.
-
-    Raises:
-        ValueError: for a protocol that is not this package's.
-    """
+    """Return a submission's protocol, after a check of its digest against this package's."""
     protocol, digest = protocol_of(problem, submission.protocol)
     if submission.protocol_sha256 != digest:
         raise ValueError(
@@ -406,15 +383,8 @@ def run_submission(
 ) -> Run:
     """Run the competitor of a submission over the scenarios of its protocol, and return the results.
 
-    Args:
-        problem: problem of the submission.
-        submission: submission from a file.
-        path: path of the file, for errors.
-        trust: whether to run source code.
-        workers: processes that share the work.
-        progress: function that is called with the number of measurements done.
-        seed: seed of other episodes than those of the protocol; None: those of the protocol.
-        references: whether to run the reference of the environment, too, and compare costs with it.
+    ``seed`` is that of other episodes than the protocol's; with ``references`` costs are compared with the
+    environment's reference.
 
     Raises:
         ValueError: as :func:`check_submission` and :func:`unpack`.

@@ -152,10 +152,6 @@ def covariances(benchmarks: Sequence[BenchmarkRecords]) -> Grid:
 def compare_environment(benchmark: BenchmarkRecords, width: int = 2) -> Comparison:
     """Return the tables and figure of one environment: cost against the paper's algorithm, and physical errors.
 
-    Args:
-        benchmark: the environment and its records.
-        width: width of the figure, 1 or 2 columns of a paper.
-
     Raises:
         ValueError: if the paper's algorithm, or its opponents, are not among the records.
     """
@@ -268,11 +264,7 @@ def _two_lines(record: Record | None, scale: float) -> str:
 
 
 def overview_markdown(benchmarks: Sequence[BenchmarkRecords], which: str) -> str:
-    """Return the overview table called "best", "harm" or "covariances", over all environments, in Markdown.
-
-    Raises:
-        ValueError: for another name.
-    """
+    """Return the overview table called "best", "harm" or "covariances", over all environments, in Markdown."""
     tables = {"best": summary, "harm": harm, "covariances": covariances}
     if which not in tables:
         raise ValueError(f"no table {which!r}: there are {', '.join(tables)}")

@@ -80,11 +80,7 @@ def has_compiler() -> bool:
 
 
 def compile_filter(name: str) -> bytes:
-    """Export a filter as C, compile it to WebAssembly, and return the module's bytes.
-
-    Raises:
-        subprocess.CalledProcessError: if the compiler fails.
-    """
+    """Export a filter as C, compile it to WebAssembly, and return the module's bytes."""
     stem = file_stem(name)
     sums = [
         f"    weights[{i}] = sum((const double *)&state.{member} + {first}, {count});"

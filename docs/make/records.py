@@ -76,11 +76,7 @@ class BenchmarkRecords(NamedTuple):
 
 
 def environment_id(name: str) -> str:
-    """Return the Gymnasium id of an environment with a short name, such as ``ManeuveringTarget``.
-
-    Raises:
-        ValueError: if there is none.
-    """
+    """Return the Gymnasium id of an environment with a short name, such as ``ManeuveringTarget``."""
     known = {bare_name(id): id for id in catalogue()}
     if name not in known:
         raise nearest("environment", name, known)
@@ -107,11 +103,7 @@ def write_record(name: str, record: ResultRecord, folder: Path = FOLDER) -> Path
 
 
 def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
-    """Return a record, read from its file.
-
-    Raises:
-        ValueError: if there is none of that name, or the file has other content.
-    """
+    """Return a record, read from its file."""
     path = record_file(name, folder)
     if not path.is_file():
         raise ValueError(f"no record {name!r}: {path} does not exist")

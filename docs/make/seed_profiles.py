@@ -41,9 +41,7 @@ def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] =
 
     Agents are not distinguished by a gate or by a policy that they correct.
 
-    Args:
-        records: records of training seeds; the scores are those of their first scenario, the training distribution.
-        algorithms: names of algorithms; default: all.
+    The scores are those of the first scenario of a record, the training distribution.
 
     Raises:
         ValueError: if there is no such algorithm, or no environment that all of them have.
@@ -71,12 +69,7 @@ def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] =
 
 
 def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndarray:
-    """Return the weights of runs (1), then those of each bootstrap resample, ``(1 + resamples, runs)``.
-
-    Args:
-        counts: runs of each environment.
-        resamples: number of resamples of the bootstrap.
-    """
+    """Return the weights of runs (1), then those of each bootstrap resample, ``(1 + resamples, runs)``."""
     each = [Bootstrap(count, resamples, seed).weights for seed, count in enumerate(counts)]
     return numpy.concatenate(each, axis=1) / len(counts)
 
@@ -84,9 +77,7 @@ def run_weights(counts: Sequence[int], resamples: int = RESAMPLES) -> numpy.ndar
 def interquartile_mean(scores: numpy.ndarray, weights: numpy.ndarray) -> numpy.ndarray:
     """Return the interquartile mean (2) of scores under each row of weights, ``(n,)``.
 
-    Args:
-        scores: ``(runs,)``.
-        weights: weights that sum to one, ``(n, runs)``.
+    The weights ``(n, runs)`` sum to one in a row.
     """
     order = numpy.argsort(scores)
     ends = numpy.cumsum(weights[:, order], axis=1)

@@ -47,11 +47,6 @@ def record_of(path: str) -> str:
 def number_text(path: str, interval: bool = True, folder: Path = FOLDER) -> str:
     """Return the number of a path as text for a sentence: ``-43.6 % [-45.0, -42.1]``.
 
-    Args:
-        path: path of the number.
-        interval: whether to add the interval, where there is one.
-        folder: folder of the records.
-
     Raises:
         ValueError: if the path leads nowhere.
     """

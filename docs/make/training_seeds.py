@@ -153,10 +153,6 @@ def spread(values: numpy.ndarray) -> Spread:
 def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
     """Return the training runs in some folders, all of one environment, sorted by algorithm and seed.
 
-    Args:
-        folders: folders of the runs.
-        trust: whether to import the modules that their records name; see :func:`.load_run`.
-
     Raises:
         ValueError: if they are of different environments, or runs of one algorithm differ in more than the
             seed.
@@ -206,10 +202,6 @@ def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
 def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
     """Return a figure of the validation cost of every algorithm over training.
 
-    Args:
-        data: data of a record of training seeds, or from :func:`runs_data`.
-        columns: width of the picture in columns of a paper.
-
     Raises:
         ValueError: if a run has no validations.
     """
@@ -257,13 +249,6 @@ def episode_means(
     workers: Workers | None = None,
 ) -> EpisodeMeans:
     """Evaluate runs and opponents on the same episodes of a scenario, and return their means over each episode.
-
-    Args:
-        study: runs, opponents and episodes.
-        scenario: name of the scenario.
-        progress: function that is called with the number of measurements done.
-        store: storage of the means of each. Default: none.
-        workers: processes that share the work.
 
     Raises:
         ValueError: for unknown names, and for bounds, which have no cost.

@@ -74,12 +74,7 @@ def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any]
 def fit_to_recording(problem: Problem, name: str, recording: Recording, folder: Path, seed: int) -> None:
     """Fit one filter to a whole recording, print its parameters, and write them to a file in ``folder``.
 
-    Args:
-        problem: environment of the recording.
-        name: name of a filter that can be fitted, or ``module:Class``.
-        recording: the recording.
-        folder: folder of the file.
-        seed: seed of the starts of the fit.
+    ``name`` is a filter that can be fitted, or ``module:Class``.
     """
     families = families_of(problem, recording)
     if ":" not in name and name not in families:

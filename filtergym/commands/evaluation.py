@@ -188,12 +188,6 @@ def find_participants(
     """Return the competitors to evaluate: the named ones, or those of the quick benchmark.
 
     On a recording the default is all shipped competitors except references and bounds, which need the truth.
-
-    Args:
-        problem: the environment with its competitors.
-        data: data from :func:`find_data`.
-        policies: names from the command line; empty or None: the default ones.
-        trust: load models that can execute code.
     """
     known = problem.baselines
     if policies:
@@ -279,11 +273,7 @@ def run(
 ) -> tuple[Evaluation, str, dict[str, str]]:
     """Run the competitors of an evaluation, and return the results; a failing one loses only its own row.
 
-    Args:
-        requests: one for each competitor.
-        outputs: what will be written; every number of every episode is stored only on request.
-        workers: processes that share the work.
-        store: storage of finished results until all is written.
+    Every number of every episode is stored only on request; ``store`` holds results until all is written.
 
     Returns:
         The evaluation, why it is not written as a whole (empty if it is), and the errors of failed competitors.
@@ -344,14 +334,7 @@ def write(
 ) -> None:
     """Write the requested files of an evaluation, and print its tables, sentences and the files' paths.
 
-    Args:
-        problem: the evaluated problem.
-        evaluation: the evaluation of :func:`run`.
-        refusal: why the whole of it is not written, from :func:`run`.
-        outputs: files to write.
-        learned: names of learned agents.
-        worst: worst episodes of the competitors whose cost is explained, by name.
-        user_names: names of the user's own competitors.
+    ``refusal`` is the reason, from :func:`run`, why the whole evaluation is not written.
     """
     printed, in_file = (
         tables_of(problem, evaluation, width, marked)
@@ -431,14 +414,7 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
 def departure_lines(
     problem: Problem, data: Any, learned: Sequence[Competitor], keywords: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Yield lines on the noise levels that agents observe of a log, and on how it departs from their training.
-
-    Args:
-        problem: environment of the agents.
-        data: scenario, flights or recording.
-        learned: the agents.
-        keywords: parameters of the task.
-    """
+    """Yield lines on the noise levels that agents observe of a log, and on how it departs from their training."""
     typical = data.typical if learned and isinstance(data, Recording) else {}
     for name in typical.keys() - keywords.keys():
         yield (

@@ -23,9 +23,7 @@ class _Bar(Progress):
 class ProgressLines:
     """Progress of a task as few lines of text with the remaining time; none for tasks of seconds.
 
-    Args:
-        write: function that writes a line.
-        clock: function that returns the time, s.
+    ``clock`` returns the time, s.
     """
 
     def __init__(self, write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:

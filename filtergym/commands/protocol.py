@@ -51,14 +51,8 @@ def evaluate_protocol(
 ) -> None:
     """Run a protocol and print its table, the row to quote and a BibTeX entry.
 
-    Args:
-        name: name of the protocol, or a path.
-        policies: competitors, see ``words`` of :func:`..protocol.find_entries`.
-        workers: processes that share the work.
-        json: file for the records of all scenarios; None: none.
-        trust: load models that can execute code.
-        rename: function that replaces names, see :func:`..protocol.find_entries`.
-        **options: further arguments of :func:`..protocol.run_protocol`.
+    ``policies`` are words, and ``rename`` a function, of :func:`..protocol.find_entries`; ``json`` is a file
+    for the records; options are those of :func:`..protocol.run_protocol`.
     """
     if json is not None:
         writable_file(json)

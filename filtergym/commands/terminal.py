@@ -281,11 +281,7 @@ def check_no_recording_options(truth: Any, rename: str | None, sort: bool) -> No
 
 
 def parse_renames(text: str | None) -> dict[str, list[str]]:
-    """Parse an option such as ``t=time,pos=x``; return the package's columns by each name in the file.
-
-    Raises:
-        ValueError: for text in another form.
-    """
+    """Parse an option such as ``t=time,pos=x``; return the package's columns by each name in the file."""
     pairs = [part.split("=") for part in text.split(",")] if text else []
     if not all(len(pair) == 2 and all(map(str.strip, pair)) for pair in pairs):
         raise ValueError(

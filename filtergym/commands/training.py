@@ -29,11 +29,7 @@ class Training(NamedTuple):
 
 
 def trainer_of(algo: str) -> Trainer:
-    """Return the function that trains with an algorithm: ``(run, session) -> run``.
-
-    Raises:
-        ValueError: if it needs packages that are not installed.
-    """
+    """Return the function that trains with an algorithm: ``(run, session) -> run``."""
     try:
         import torch
 
@@ -52,11 +48,6 @@ def trainer_of(algo: str) -> Trainer:
 def open_run(problem: Problem, options: RunOptions, session: Session) -> Training:
     """Begin a training run in a folder, or continue the one there; return it with its session.
 
-    Args:
-        problem: training problem.
-        options: options of the run.
-        session: settings of the training, such as the folder.
-
     Raises:
         ValueError: as of :func:`.training_run.new_run` and :func:`.training_run.open_run`.
     """
@@ -70,11 +61,7 @@ def open_runs(
 ) -> list[Training]:
     """Begin or continue a run for each seed, in folders that end with a dash and the seed; return them all.
 
-    Args:
-        problem: training problem.
-        options: options of every run, except the seed.
-        session: settings of the training; its folder is the beginning of the runs' folders.
-        seeds: seeds of the runs.
+    The folder of the session is the beginning of the runs' folders.
 
     Raises:
         ValueError: as of :func:`open_run`, and for a checkpoint that can execute code and is not trusted.

@@ -40,12 +40,6 @@ def file_stem(name: str) -> str:
 class FilterText:
     """Writer of a filter's header and source in C, with the functions ``start`` and ``update``.
 
-    Args:
-        name: name of the competitor.
-        traced: its programs.
-        scalar: type of the numbers.
-        components: name and unit of the estimated components.
-
     Attributes:
         about: paragraphs for the comment of the header.
     """

@@ -69,13 +69,7 @@ LOOK_VALUES = {
 class LogText(FilterText):
     """Writer of a filter in C, and of the C program that runs it over a user's log.
 
-    Args:
-        name: name of the competitor.
-        traced: its programs.
-        scalar: type of the numbers.
-        components: name and unit of the estimated components.
-        log_format: log format of the environment; None where it reads no logs.
-        columns: names in the log of renamed columns.
+    ``columns`` are the names in the log of renamed columns.
     """
 
     def __init__(
@@ -113,11 +107,8 @@ class LogText(FilterText):
     def fill(self, received: str, inputs: str, interval: str, others: Sequence[str] = ()) -> str:
         """Return the C statements that fill the measurement ``given`` from a row of a log.
 
-        Args:
-            received: expression of the first received number; the others follow it.
-            inputs: expression of the first input; the others follow it.
-            interval: expression of the interval.
-            others: expressions of all other numbers, in their order; default: zero.
+        ``received`` and ``inputs`` are C expressions of the first such number, ``others`` of all other
+        numbers.
         """
         lines, rest = [], iter(others)
         for row, name in enumerate(self.columns("measurement")):
@@ -240,12 +231,7 @@ class LogText(FilterText):
         return self._log(about, follow, columns, 2, limits)
 
     def _regular_log(self, numbers: Mapping[str, float], log: LogSetup) -> str:
-        """Return the text of the C program for a log of rows at one rate; empty for other logs.
-
-        Args:
-            numbers: constants of the log's format.
-            log: columns and options with which the log of the fit was read.
-        """
+        """Return the text of the C program for a log of rows at one rate; empty for other logs."""
         if "range_rate" in log.columns:
             rows = _rows_with_looks(log.columns, numbers)
         elif {"ins", "ins_x"} & {*log.columns}:

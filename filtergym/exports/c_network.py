@@ -77,13 +77,7 @@ def _width(network: "LearnedPolicy") -> int:
 
 
 def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[str, int]:
-    """Return the C function ``NAME_network(shown, memory, answer)`` of a network, and the bytes of its constants.
-
-    Args:
-        network: network to write.
-        name: beginning of all names.
-        scalar: type in which it computes.
-    """
+    """Return the C function ``NAME_network(shown, memory, answer)`` of a network, and the bytes of its constants."""
     arrays = {
         # Of a matrix its columns one after the other.
         key: numpy.ascontiguousarray(values.T)

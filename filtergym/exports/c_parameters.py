@@ -66,12 +66,6 @@ def parameter_text(
     """Return the C tables and functions of the parameters, and the first statements of ``start``.
 
     The statements reject values outside the limits, and compute the numbers ``own`` that the filter derives.
-
-    Args:
-        name: name of the filter.
-        free: its parameters.
-        scalar: type of the numbers.
-        struct: struct of the parameters.
     """
     if free.derive is None:
         return "", []

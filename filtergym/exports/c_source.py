@@ -51,13 +51,7 @@ VECTORS = 2, 50
 class Writer(LogText):
     """Writer of all C files of an exported filter: header, source, programs, test and its vectors.
 
-    Args:
-        name: name of the competitor.
-        traced: its programs.
-        scalar: type of the numbers.
-        components: name and unit of the estimated components.
-        log_format: log format of the environment; None where it reads no logs.
-        columns: names in the log of renamed columns.
+    ``columns`` are the names in the log of renamed columns.
 
     Attributes:
         limit: largest difference with which the test passes, standard deviations.
@@ -222,11 +216,7 @@ class Writer(LogText):
 def export_c(request: ExportRequest, folder: Path, precision: str = "double", command: str = "") -> Figures:
     """Compare a competitor's program with its Python form, and write it as C99; return cost and accuracy.
 
-    Args:
-        request: the competitor.
-        folder: folder of the files.
-        precision: "double" or "float".
-        command: command of the export, for the comment of the header.
+    ``precision`` is "double" or "float".
 
     Raises:
         ValueError: for a competitor that cannot be exported, or differs in this precision.
@@ -337,12 +327,6 @@ def compile_and_test(
     writer: Writer, replayed: Replay, compiler: str | None = None, flags: Sequence[str] = FLAGS
 ) -> str:
     """Compile the C test, run it, and return its output; empty without a compiler.
-
-    Args:
-        writer: writer of the filter.
-        replayed: the vectors.
-        compiler: path of the compiler; default: cc, where there is one.
-        flags: compiler flags.
 
     Raises:
         ValueError: if it does not compile, or the test fails.

@@ -109,11 +109,7 @@ def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
 
 
 def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
-    """Return an agent's stored network, and the model of its environment.
-
-    Raises:
-        ValueError: for an agent that has no plain arrays, or does not fit the environment.
-    """
+    """Return an agent's stored network, and the model of its environment."""
     maker = request.maker
     stored = maker.policy if isinstance(maker, EstimatorMaker) else maker
     if not isinstance(stored, StoredPolicy):
@@ -155,11 +151,7 @@ def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
 
 
 def network_graph(stored: StoredPolicy, model: Model) -> Any:
-    """Return an agent's stored network as an ONNX model: observation and memory in, action and memory out.
-
-    Raises:
-        ValueError: if the package is not installed.
-    """
+    """Return an agent's stored network as an ONNX model: observation and memory in, action and memory out."""
     try:
         import onnx
     except ImportError as error:
@@ -207,10 +199,6 @@ def network_graph(stored: StoredPolicy, model: Model) -> Any:
 
 def export_onnx(request: ExportRequest, path: Path) -> None:
     """Write the network of an agent as an ONNX file.
-
-    Args:
-        request: request of an agent, shipped or in a file.
-        path: path of the file.
 
     Raises:
         ValueError: for an agent without a network of plain arrays, a file that cannot be written, or without the

@@ -68,14 +68,7 @@ class Declaration(NamedTuple):
 
 
 def declaration(task: Task, maker: Any, tunables: Mapping[str, Tunable], name: str) -> Declaration:
-    """Return the parameters of an exported competitor that its user can set.
-
-    Args:
-        task: task with the current parameters.
-        maker: factory of the competitor.
-        tunables: tunable parameters by the names of competitors.
-        name: name of the competitor.
-    """
+    """Return the parameters of an exported competitor that its user can set."""
     if isinstance(maker, TunedPolicy):
         tunable, values = maker.tunable, maker.values
     else:
@@ -153,9 +146,6 @@ def _kinds(hint: Any) -> set[Any]:
 
 class ParameterGraph(Graph):
     """A graph of traced expressions in which parameters of the filter are inputs.
-
-    Args:
-        free: parameters whose numbers are the rows of ``PARAMETER``.
 
     Attributes:
         conditions: conditions of the branches, and their values.

@@ -89,11 +89,6 @@ def replay(
 ) -> tuple[TracedFilter, Replay]:
     """Trace a competitor, and run it over episodes of the test split; return traced filter and test vectors.
 
-    Args:
-        request: competitor to trace.
-        episodes: number of episodes.
-        measurements: largest number of measurements in each.
-
     Raises:
         ValueError: for a competitor that cannot be exported, or loses every episode.
     """
@@ -153,11 +148,6 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     """Run a traced filter over replayed measurements, and return the rows of its estimate, ``(T, rows, E)``.
 
     Compiled code runs in double where code can be compiled, with the C library's functions; NumPy otherwise.
-
-    Args:
-        traced: filter to run.
-        replayed: its input.
-        dtype: type of the computation.
     """
     E = replayed.initial.shape[1]
     compiled = AVAILABLE and dtype is numpy.float64

@@ -121,11 +121,8 @@ class TracedFilter(NamedTuple):
 class FilterSteps:
     """A filter's step on traced arrays, without the checks of its estimate that an evaluation makes.
 
-    Args:
-        filter: filter on traced arrays.
-        masked: function that replaces missing measurements, for a filter that never reads them.
-        decider: part that evaluates a network inside; None without one.
-        reports_feedback: whether it reports the quantity that steers the world, as a bank does.
+    ``masked`` replaces missing measurements, for a filter that never reads them; ``decider`` evaluates a
+    network inside.
     """
 
     def __init__(
@@ -214,15 +211,7 @@ def check_kind(name: str, maker: Any) -> None:
 def steps_of(
     traced: Task, control: str, maker: Any, plain: Model, graph: Graph
 ) -> tuple[FilterSteps, "NetworkPlaceholder | None"]:
-    """Return a competitor's step on traced arrays, and the placeholder of its network or None.
-
-    Args:
-        traced: task on traced arrays.
-        control: control of the competitor.
-        maker: factory of the competitor.
-        plain: model of the same parameters on NumPy.
-        graph: the open graph.
-    """
+    """Return a competitor's step on traced arrays, and the placeholder of its network or None."""
     if _traced_as(maker) == "learned estimator":
         policy, network = replace_network(maker(plain.task).network, graph)
         steered = steer(Model(traced, maker.bank), policy, 1)
@@ -391,14 +380,7 @@ def trace_filter(
 ) -> TracedFilter:
     """Return a competitor as two straight-line programs, with as many free parameters as possible.
 
-    Args:
-        task: class of the environment.
-        control: control of the competitor.
-        maker: factory of the competitor.
-        name: name of the competitor, in errors.
-        plain: model of the control on NumPy, with the parameters of the export.
-        template: initial estimate and measurement, any numbers of any width.
-        tunables: tunable parameters by the names of competitors; these and the task's are free.
+    ``template`` is an initial estimate and a measurement, any numbers of any width.
 
     Raises:
         ValueError: for a competitor that is neither estimator nor policy, or no straight line of arithmetic.
@@ -442,15 +424,8 @@ def _trace_free(
 ) -> "tuple[TracedFilter, _Nodes] | set[str]":
     """Trace a competitor with some parameters free, or return the names of those that cannot be free.
 
-    Args:
-        task: class of the environment.
-        control: control of the competitor.
-        maker: factory of the competitor.
-        plain: model of the control on NumPy.
-        template: initial estimate and measurement, any numbers of any width.
-        found: all parameters.
-        free: parameters that may become inputs.
-        fixed: graph of the filter traced without free parameters.
+    ``template`` is an initial estimate and a measurement of any width, ``fixed`` the filter traced without
+    free parameters.
     """
     graph = ParameterGraph(free)
     firsts = [0, *itertools.accumulate(len(one.values) for one in free)]
@@ -587,11 +562,7 @@ def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
 class _Derived:
     """Largest expressions of a filter that depend on parameters alone, in the order of the rows of ``DERIVED``.
 
-    Args:
-        nodes: traced filter.
-        update: nodes of an update's results, whose expressions come first.
-        start: nodes of the results of the start of a track.
-        plain: the same filter traced without parameters.
+    Those of ``update`` come first; ``plain`` is the filter traced without parameters.
 
     Attributes:
         nodes: nodes of the expressions.

@@ -84,11 +84,7 @@ def record_run(
 ) -> dict[str, numpy.ndarray]:
     """Run a policy or reference estimator, and return quantities that an evaluation does not record.
 
-    Args:
-        task: task with the actor's control.
-        actor: policy or reference estimator.
-        seeds: seed of each episode.
-        fields: function from the task and its state after a measurement to the values ``(..., N)`` to record.
+    ``fields`` maps the task and its state after a measurement to the values ``(..., N)``.
 
     Returns:
         The recorded values, ``(episodes, K, ...)`` with the other axes in reversed order.

@@ -44,10 +44,8 @@ def later(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any
 def compute_units(results: Any, progress: Progress, workers: Workers | None = None) -> Any:
     """Return nested containers with each postponed call of :func:`later` replaced by its result.
 
-    Args:
-        results: tuples, named ones too, lists and dictionaries that contain postponed calls.
-        progress: function that is called with the number of units done.
-        workers: processes that run them; default: this process, one after the other.
+    Containers are tuples, named ones too, lists and dictionaries; ``progress`` is called with the number of
+    units done.
     """
     units: list[Later] = []
     _places(results, units.append)

@@ -40,10 +40,6 @@ def improvement_verdict(section: Sequence[Quantity], parts: Sequence[Quantity]) 
 
     "Reproduced" if every change over the section lies below minus ``SUBSTANTIAL`` with its interval and no part is
     certainly worse; "not reproduced" if no change over the section is certainly below zero.
-
-    Args:
-        section: relative change over the whole section, of position and of velocity.
-        parts: relative changes over its parts (turn, recovery).
     """
     worse_somewhere = any(change.low > 0.0 for change in parts)
     if all(change.high < -SUBSTANTIAL for change in section) and not worse_somewhere:
@@ -163,12 +159,7 @@ def box_verdict(found: Sequence[GridFinding]) -> Verdict:
 
 
 def dominance_verdict(straight: Sequence[Quantity], turn: Quantity) -> Verdict:
-    """Return the verdict on "mode 1 dominates on the straight legs, mode 2 in the turn".
-
-    Args:
-        straight: mean probability of mode 1 on each straight window.
-        turn: the same in the turn.
-    """
+    """Return the verdict on "mode 1 dominates on the straight legs, mode 2 in the turn"."""
     return verdict_of([mean.low > 0.5 for mean in straight] + [turn.high < 0.5])
 
 

@@ -101,14 +101,7 @@ def fly(name: str, episodes: int, **keywords: Any) -> Run:
 
 
 def record_measurements(episodes: int, seed: int, scenario: str = "paper", **keywords: Any) -> Recording:
-    """Return measurements and truth of test episodes of ManeuveringTarget, as ``evaluate`` runs them.
-
-    Args:
-        episodes: N.
-        seed: number of the experiment.
-        scenario: name of a scenario.
-        **keywords: parameters of the task.
-    """
+    """Return measurements and truth of test episodes of ManeuveringTarget, as ``evaluate`` runs them."""
     model = make_model(ManeuveringTarget, "gain", scenario, **keywords)
     task: Any = model.task
     starts: list[Initial] = []

@@ -44,9 +44,7 @@ COORDINATE_LOSS = 0.10
 def matched_verdict(coordinates: Sequence[Quantity], others: Sequence[Quantity]) -> Verdict:
     """Return the verdict on "at most 10 % in coordinates, the other components close".
 
-    Args:
-        coordinates: ratios of the RMS position error, adaptive to matched.
-        others: ratios of other components; close is within the same 10 %.
+    The ratios are of RMS errors, adaptive to matched filter.
     """
     limit = 1.0 + COORDINATE_LOSS
     if any(r.low > limit for r in coordinates):

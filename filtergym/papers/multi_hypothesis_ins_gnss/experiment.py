@@ -146,10 +146,7 @@ class _SideBySide(Policy):
 def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict[str, Run]:
     """Run several filters over the same noise, and return their results by name.
 
-    Args:
-        scenario: scenario of the environment.
-        filters: number of runs by name, of ``FILTERS``, or "known mode", which runs alone.
-        **keywords: parameters of the task.
+    ``filters`` has the number of runs of names of ``FILTERS``, or of "known mode", which runs alone.
     """
     model = make_model(TightlyCoupledNavigation, "weights", scenario, **keywords)
     task: Any = model.task

@@ -132,8 +132,7 @@ CLAIMS = (
 def structure(tasks: Sequence[UavAutopilot]) -> dict[str, Any]:
     """Return quantities on controllability, observability and measuring interval, by name.
 
-    Args:
-        tasks: of plant P, plant U and plant P with position alone.
+    The tasks are those of plant P, plant U, and plant P with position alone.
     """
     loops = [matrices(task) for task in tasks]
 

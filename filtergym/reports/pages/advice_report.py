@@ -47,15 +47,7 @@ ROLES = {"fitted": "fitted to", "chosen": "chosen by", "judged": "judged by"}
 def advice_html(
     advice: Advice, task: Task, sentences: Sequence[str], learned: Sequence[str], settings: Settings
 ) -> str:
-    """Return the HTML report on the filter that is recommended for a recording.
-
-    Args:
-        advice: advice from :func:`~..baselines.advice.advise`.
-        task: task of the recording, with its parameters.
-        sentences: sentences that follow the first one, the verdict.
-        learned: names of shipped agents.
-        settings: command and versions.
-    """
+    """Return the HTML report on the filter that is recommended for a recording."""
     replay = advice.replay()
     return render_page(
         "advice.html.jinja",

@@ -30,12 +30,7 @@ def count_verdicts(findings: Sequence[Finding]) -> str:
 
 
 def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
-    """Return the crash test's table of one competitor, a line for each alteration of the measurements.
-
-    Args:
-        findings: findings of the competitor, in the order of the catalogue.
-        described: whether each line describes the alteration.
-    """
+    """Return the crash test's table of one competitor, a line for each alteration of the measurements."""
     left_out = [finding.alteration for finding in findings if finding.reason == NOT_CONTAINED]
     notes = f"Does not apply, as {NOT_CONTAINED}: {', '.join(left_out)}." if left_out else ""
     table = Table(

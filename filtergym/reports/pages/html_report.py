@@ -42,11 +42,7 @@ class Entry(NamedTuple):
 
 
 def report_html(results: Sequence[Result], settings: Settings) -> str:
-    """Return the HTML page of a report on results of any environments and scenarios.
-
-    Raises:
-        ValueError: if there are none.
-    """
+    """Return the HTML page of a report on results of any environments and scenarios."""
     if not results:
         raise ValueError("there are no results to report")
     groups: dict[str, list[Result]] = {}

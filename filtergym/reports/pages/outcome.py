@@ -27,13 +27,7 @@ def outcome_sentences(results: Sequence[Result]) -> list[str]:
 
 
 def own_sentences(records: Sequence[Record], user_names: Sequence[str], paper: str) -> list[str]:
-    """Return a sentence for each of the user's competitors: cost against the paper's algorithm and the best, ANEES.
-
-    Args:
-        records: records of one environment and scenario with a truth.
-        user_names: names of the user's competitors.
-        paper: name of the paper's algorithm; it may be missing in the records.
-    """
+    """Return a sentence for each of the user's competitors: cost against the paper's algorithm and the best, ANEES."""
     return [
         _own_sentence(records, name, paper)
         for name in user_names
@@ -164,13 +158,8 @@ def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) ->
     the other origin that takes no more time: a stricter test than that of their paired difference, which records
     contain only against the best.
 
-    Args:
-        records: records of one environment and scenario.
-        learned: names of learned competitors.
-        origin: "learned" or "classical", that of the best excluded.
-
-    Returns:
-        The longest such range; None where they lead nowhere, or times are unknown.
+    The longest such range; None where ``origin`` ("learned" or "classical") leads nowhere, or times are
+    unknown.
     """
     times = {name: time.nanoseconds for name, time in times_of_records(records).items()}
     costs = {

@@ -146,14 +146,8 @@ def result_of(
 ) -> Result:
     """Return an evaluation as a :class:`Result`, the content of a file of results.
 
-    Args:
-        problem: the evaluated problem.
-        evaluation: an evaluation with curves, of which those of the shown competitors are stored. Of its dataset only
-            the variables of ``drawn_episodes`` are needed.
-        learned: names of learned competitors.
-        worst: worst episodes of the competitors whose cost is explained, by name; default: the paper's algorithm,
-            without episodes.
-        user_names: names of the user's own competitors.
+    The evaluation has curves, and the variables of ``drawn_episodes``. By default the cost of the paper's
+    algorithm is explained, without worst episodes.
     """
     dataset, records, curves = evaluation.dataset, evaluation.records, evaluation.curves
     assert curves is not None
@@ -269,11 +263,7 @@ def run_benchmark(
 ) -> list[Result]:
     """Run a benchmark, write ``results.json``, and return the results; resume after an interruption.
 
-    Args:
-        folder: folder of ``results.json``; finished competitors are in ``unfinished/`` until all are done.
-        options: content of the benchmark.
-        callbacks: functions that are called meanwhile; default: none.
-        workers: processes that do the work; default: this process.
+    Finished competitors are in ``unfinished/`` of the folder until all are done.
     """
     episode_seeds(options.split, options.seed, 1)  # refuses a split that is none before anything is written
     wanted = cells(options.full, options.environments, options.split)

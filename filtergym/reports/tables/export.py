@@ -68,11 +68,7 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
 
 
 def records_as_csv(path: Path, records: Sequence[Any]) -> None:
-    """Write named tuples of one kind as CSV, a line each, all fields; empty where one is None.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
+    """Write named tuples of one kind as CSV, a line each, all fields; empty where one is None."""
     fields = records[0]._fields if records else Record._fields
     with whole_file(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)

@@ -48,10 +48,6 @@ def best_competitor(records: Sequence[Record], learned: Sequence[str] | None = N
 
     It rests on the paired ratio between the best one and the best of the other origin: where its interval contains one,
     no competitor is called best.
-
-    Args:
-        records: records of the scenario.
-        learned: names of learned competitors; default: the environment's shipped agents.
     """
     places = ranking(records)
     if not places:
@@ -68,13 +64,7 @@ def best_competitor(records: Sequence[Record], learned: Sequence[str] | None = N
 
 
 def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[str] | None = None) -> str:
-    """Return a sentence on the competitor of lowest cost, its lead, and the best one of the other origin.
-
-    Args:
-        records: records of the scenario.
-        paper: name of the paper's algorithm.
-        learned: names of learned competitors; default: the environment's shipped agents.
-    """
+    """Return a sentence on the competitor of lowest cost, its lead, and the best one of the other origin."""
     places = ranking(records)
     if not places:
         return f"On `{records[0].scenario}` nothing is ranked."

@@ -163,12 +163,6 @@ def track_of(
 ) -> xarray.Dataset | None:
     """Return the truth, measurements and estimates of one episode of an evaluation; None: not stored.
 
-    Args:
-        dataset: dataset of an evaluation with ``drawn_episodes``.
-        components: components to draw.
-        plane: whether the first two of them are the axes of a plane.
-        number: number of the episode.
-
     Returns:
         ``truth``, ``seen`` (measurements), ``estimate`` and its reported standard deviation ``sigma``, each (policy,
         component, time) where known, since in a closed loop every competitor has a truth of its own; of a plane also
@@ -226,11 +220,7 @@ def components_to_draw(
 
 
 def write_results(path: Path, results: Iterable[Result], settings: Settings) -> None:
-    """Write results to a file, completely or not at all.
-
-    Raises:
-        ValueError: if the file cannot be written.
-    """
+    """Write results to a file, completely or not at all."""
     parts = [json.dumps(_as_json(result), allow_nan=False) for result in results]
     head = json.dumps({"format": FORMAT, "settings": settings._asdict()})
     write_text(path, f'{head[:-1]}, "results": [\n' + ",\n".join(parts) + "\n]}\n")
@@ -259,11 +249,7 @@ def serialise_datasets(result: Result) -> dict[str, Any]:
 
 
 def read_results(path: Path) -> tuple[list[Result], Settings]:
-    """Return the results in a file of :func:`write_results`, or in ``results.json`` of a folder; and settings.
-
-    Raises:
-        ValueError: if the file has other content.
-    """
+    """Return the results in a file of :func:`write_results`, or in ``results.json`` of a folder; and settings."""
     path = path / RESULTS if path.is_dir() else path
     try:
         values = read_json(path)
@@ -278,11 +264,7 @@ def read_results(path: Path) -> tuple[list[Result], Settings]:
 
 
 def read_all_results(paths: Sequence[Path]) -> tuple[list[Result], Settings]:
-    """Return the results of several files in one list, and their settings.
-
-    Raises:
-        ValueError: if one cannot be read, or they contain a scenario twice.
-    """
+    """Return the results of several files in one list, and their settings."""
     read = [read_results(path) for path in paths]
     results = [result for found, _ in read for result in found]
     names = [(result.environment, result.scenario) for result in results]

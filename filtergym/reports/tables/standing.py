@@ -36,11 +36,6 @@ def _cost_and_nees(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
 def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool = False) -> xarray.Dataset:
     """Measure agents, and the competitors they are compared with, on the episodes of a run's validations.
 
-    Args:
-        run: run that gives environment, scenario and parameters.
-        agents: file of each agent, by name.
-        trust: whether to load a model, which can execute code.
-
     Returns:
         ``cost`` and ``anees`` of every episode, ``(policy, episode)``; ``role`` is "agent", "paper", "strongest
         classical" or "reference".
@@ -97,9 +92,7 @@ def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
 def standing_table(standing: xarray.Dataset, passed: Mapping[str, FirstWin | None]) -> Table:
     """Return a table of agents and their opponents: cost, difference to the paper's algorithm, consistency.
 
-    Args:
-        standing: dataset from :func:`measure_standing`.
-        passed: step at which each agent was first better than the paper's algorithm, by name.
+    ``passed`` has the step at which each agent was first better than the paper's algorithm.
     """
     bootstrap = Bootstrap(standing.sizes["episode"])
     table = plain_table(

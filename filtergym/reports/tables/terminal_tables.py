@@ -29,11 +29,7 @@ OWN_ROW = ">"
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
     """Return a record's value and interval as text in significant digits: ``67.0 [66.6, 67.4]``.
 
-    Args:
-        record: record with ``value``, ``low`` and ``high``; or None.
-        scale: factor of all three.
-        digits: number of significant digits.
-        negligible: scaled values below this are shown as 0.
+    All three are multiplied by ``scale``; scaled values below ``negligible`` are shown as 0.
     """
     if record is None or record.value is None:
         return "-"
@@ -141,13 +137,8 @@ def results_tables(
 ) -> list[Table]:
     """Return tables of all competitors, lowest cost first: cost against the paper's, consistency, score, errors.
 
-    Args:
-        records: tidy records of one environment and scenario.
-        knows: what each reference and bound knows of the truth, by its name.
-        width: columns of the terminal; errors that do not fit stand below in tables of their own, so that no number
-            is cut.
-        paper: name of the paper's algorithm, with which costs are compared.
-        user_names: names of the user's own competitors, whose rows are marked.
+    Errors that do not fit into ``width`` stand below in tables of their own; rows of ``user_names`` are
+    marked.
     """
     first = records[0]
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
@@ -327,11 +318,7 @@ def flights_table(
 ) -> Table:
     """Return a table with a row for each flight: RMSE of the paper's algorithm, and others' cost against it.
 
-    Args:
-        dataset: dataset of an evaluation of flights.
-        records: records of every flight.
-        over_all: records over all flights, which rank the competitors.
-        width: columns of the terminal; as many of the best competitors are shown as fit.
+    As many of the best competitors are shown as fit into ``width``.
     """
     tables = [_flights(dataset, records, over_all, shown) for shown in range(SHOWN_OF_FLIGHTS, 0, -1)]
     return first_fitting(tables, width) or tables[0]

@@ -63,13 +63,7 @@ def find_opponent(records: Sequence[Record], name: str) -> str:
 def worst_figures(
     worst: Mapping[str, Sequence[WorstTrack]], phrases: Mapping[str, str], columns: int
 ) -> Iterator[tuple[str, Any]]:
-    """Draw the worst episodes of each competitor; yield the name of a file, and the figure.
-
-    Args:
-        worst: episodes from :func:`find_worst`.
-        phrases: when each cause holds, by name.
-        columns: width of the figures in columns of a paper, 1 or 2.
-    """
+    """Draw the worst episodes of each competitor; yield the name of a file, and the figure."""
     for name, episodes in worst.items():
         own = [(one, one.track) for one in episodes if one.track is not None]
         titles = [_titles(one, phrases) for one, _ in own]
