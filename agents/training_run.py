@@ -268,7 +268,7 @@ def _as_integer(value: Any) -> Any:
 
 
 def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
-    """Raise ValueError if an agent cannot correct the requested policy, or act behind a gate."""
+    """Raise ValueError if the agent of a run cannot correct its policy, or act behind its gate."""
     algorithm, residual_to = options.algorithm, options.residual_to
     if len(models) > 1:
         raise ValueError(

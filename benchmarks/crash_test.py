@@ -24,7 +24,6 @@ COLUMNS = ["", "passed", "degraded", "failed", "degraded under", "failed under"]
 
 
 def row(name: str, findings: Sequence[Finding]) -> list[str]:
-    """Return a competitor's table row: counts of each verdict, and the alterations that degraded it or failed."""
     by_verdict = {
         verdict: [one.alteration for one in findings if one.verdict == verdict]
         for verdict in ("passed", "degraded", "failed")

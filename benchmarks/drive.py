@@ -109,11 +109,9 @@ def read_inertial(file: Path) -> Any:
 
 
 def read_fixes(file: Path) -> Any:
-    """Return positions (degrees, m), velocities north, east, down (m/s) and the quality of an RTKLIB solution by
-    time, s since 1970 of GPS time; quality 1 is fixed, 2 float.
+    """Return an RTKLIB solution's positions (degrees, m), velocities (m/s) and quality by time, s since 1970.
 
-    Raises:
-        ValueError: if the file contains none.
+    Velocities are north, east, down, time is GPS time; quality 1 is fixed, 2 float. A file without any raises ValueError.
     """
     import pandas
 
@@ -224,8 +222,9 @@ def errors(recorded: xarray.Dataset) -> numpy.ndarray:
 
 
 def ins_error_covariance(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
-    """Return the covariance of the environment's INS error at times, s, ``(n, n)``, m^2: the integral of a
-    constant, of an exponentially correlated and of a white rate error.
+    """Return the covariance of the INS position error at times, s, ``(n, n)``, m^2.
+
+    It is the integral of a constant, an exponentially correlated and a white rate error.
     """
     s, t, tau = time[:, None], time, levels["correlation_time"]
     coloured = 2.0 * tau * numpy.minimum(s, t) - tau**2 * (
@@ -273,7 +272,6 @@ def fit_levels(
 
 
 def report(recorded: xarray.Dataset) -> None:
-    """Print the growth of the recorded INS error over time, and that of the environment's model."""
     found = abs(errors(recorded))
     time = recorded["seconds"].to_numpy()[0]
     covariance = ins_error_covariance(time, PARAMETERS)
@@ -294,7 +292,6 @@ def report(recorded: xarray.Dataset) -> None:
 
 
 def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
-    """Draw the drive with the windows of the INS, and the growth of its error."""
     import matplotlib
 
     matplotlib.use("agg")

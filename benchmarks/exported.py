@@ -1,11 +1,11 @@
 """Every ranked competitor as C99: compiled, run over recorded episodes, and compared with its own estimates.
 
 A line for each: operations and bytes of state in double; bytes of the source, of code and constants with ``-Os``, and
-of the largest stack of a function; the largest difference to the replay in double and in float, in the standard
-deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM generates
-from the same program (a lane of 512, without a network), and in NumPy for one track. For a competitor that cannot be
-exported the line gives the reason. Times are of processor time, the least of several runs. ``--cross`` names a compiler
-of another processor, with which the files are compiled only, in double and in float.
+of the largest stack of a function; the largest difference to the replay in double and in float, in reported standard
+deviations; nanoseconds an update in C (double and float), in LLVM's code of the same program (a lane of 512, without a
+network), and in NumPy for one track. For a competitor that cannot be exported the line gives the reason. Times are of
+processor time, the least of several runs. ``--cross`` names a compiler of another processor, with which the files are
+compiled only.
 
 Example: python benchmarks/exported.py --environment ManeuveringTarget-v0 --episodes 100 --out exported.csv
 """
@@ -119,7 +119,6 @@ class Compilers(NamedTuple):
 
 
 def size_of(file: Path, compilers: Compilers) -> Size:
-    """Return the bytes of an exported filter, compiled by gcc for size."""
     code = _code_bytes(file, [compilers.own, "-fstack-usage"])
     usage = file.with_suffix(".small.su").read_text(encoding="utf-8").splitlines()
     stack = max(int(line.split("\t")[1]) for line in usage)
@@ -196,7 +195,6 @@ def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
 
 
 def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
-    """Return the nanoseconds of an update of the competitor in NumPy, for one track."""
     kind = kind_of(maker)
     keywords = getattr(maker, "task_keywords", {})
     plain = make_model(problem.task, control_of(maker, None, problem.task, name), **keywords)
@@ -228,7 +226,6 @@ def least_time(call: Any, count: int) -> float:
 def lines(
     problem: Problem, names: list[str], episodes: int, measurements: int, compilers: Compilers
 ) -> Iterator[dict[str, Any]]:
-    """Yield a line for each competitor: the figures of its export, or the reason why it cannot be exported."""
     for name in names:
         maker = find_competitor(problem, name).maker
         line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
@@ -275,7 +272,6 @@ COST = (
 
 
 def summary(found: list[dict[str, Any]]) -> str:
-    """Return two Markdown tables with a row for each environment: differences; and costs, median and range."""
     accuracy, cost = ([f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"] for names in (ACCURACY, COST))
     for environment in dict.fromkeys(line["environment"] for line in found):
         own = [line for line in found if line["environment"] == environment]

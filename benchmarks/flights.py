@@ -4,10 +4,10 @@
     python benchmarks/flights.py --out docs/data/flights.csv
 
 The sets are samples of ADS-B flights in the Python package ``traffic``, which is read, not imported. A sample of at
-least ``FEWEST`` flights is a set of its own; the other samples of its folder are another one if they have as many
-together, and the rest together is "others". Each sample has its radar in the median of its positions, the radar's noise
-is simulated, and scans are 6 s apart. Samples whose positions are more than ``COARSEST`` seconds apart are left out, as
-are those on the ground and those that demonstrate errors.
+least ``FEWEST`` flights is a set of its own; the other samples of its folder are one set if they have as many together,
+else part of "others". Each sample has its radar in the median of its positions, the radar's noise is simulated, and
+scans are 6 s apart. Samples with positions more than ``COARSEST`` seconds apart, on the ground, or that demonstrate
+errors are left out.
 """
 
 import argparse

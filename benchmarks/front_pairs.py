@@ -68,7 +68,6 @@ def main() -> None:
 
 
 def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str]) -> list[list[str]]:
-    """Return the table rows of an environment's competitors, the quickest first."""
     names = [str(name) for name in results["policy"].values]
     cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in names}
     times = {name: time_of(results.sel(policy=name)) for name in names}

@@ -3,10 +3,10 @@
 Example: python benchmarks/harm.py filtergym/UavAutopilot-v0 --episodes 500 --policy bptt
 
 Each agent runs alone and behind the gate (``gated:NAME``), and so does the fallback of that gate, on the test split. A
-cell is a scenario or a stress. Harm is counted where the 95 % interval of the cost against the paper's algorithm,
-geometric mean of the episodes' ratios, lies above +2 % as a whole. A track counts as lost where the cost of an episode
-is ten times that of the paper, and above the 99 % quantile of the paper's episodes in that cell. ``--cells`` prints
-every cell.
+cell is a scenario or a stress. Harm is counted where the whole 95 % interval of the cost against the paper's algorithm,
+geometric mean of the episodes' ratios, lies above +2 %. A track counts as lost where the cost of an episode is ten
+times that of the paper, and above the 99 % quantile of the paper's episodes in that cell. ``--cells`` prints every
+cell.
 """
 
 import argparse
@@ -97,7 +97,6 @@ def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
 
 
 def summary(problem: Problem, policy: str, cells: list[Cell]) -> str:
-    """Return a competitor's row of the table: cells harmed, worst cell and its cost, range of ANEES, lost tracks."""
     worst = max(cells, key=lambda cell: cell.ratio[0])
     anees = [cell.anees for cell in cells]
     outside = sum(not CONSISTENT[0] <= value <= CONSISTENT[1] for value in anees)

@@ -62,7 +62,6 @@ def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> 
 
 
 def truths(pool: Pool) -> list[float]:
-    """Return the true value of every statistic: that of all episodes, in the order of ``STATISTICS``."""
     ratio = pool.own / pool.paper
     return [
         float(numpy.expm1(numpy.log(ratio).mean())),
@@ -72,7 +71,6 @@ def truths(pool: Pool) -> list[float]:
 
 
 def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
-    """Return the estimate and interval of every statistic from a sample, in the order of ``STATISTICS``."""
     own, paper = bootstrap.means(numpy.stack([pool.own, pool.paper], axis=1)).T
     return [
         bootstrap.geometric_difference(pool.own, pool.paper),

@@ -52,7 +52,6 @@ class Nearest(NamedTuple):
 
 
 def names_without_random(problem: Problem) -> list[str]:
-    """Return the names of all ranked competitors but the one with random actions."""
     policies = problem.baselines.policies
     return [name for name in ranked_names(problem) if policies.get(name) is not RandomPolicy]
 

@@ -5,8 +5,8 @@
     python benchmarks/optimised_kalman.py --kalmannet KalmanNet_TSP
 
 Greenberg, Yannay and Mannor, "Optimization or Architecture: How to Hack Kalman Filtering", NeurIPS 2023. Their package
-fits all entries of Q and R, through Cholesky factors, by descent on the squared error of tracks with truth. It takes
-matrices; where the model is not linear, a subclass of a few lines linearises it as the extended Kalman filter does.
+fits all entries of Q and R, through Cholesky factors, by descent on the squared error of tracks with truth. Where the
+model is not linear, a subclass linearises it as the extended Kalman filter does.
 
 It is trained on simulated episodes of the training split. The resulting Q and R are judged in our Kalman filter, on the
 episodes of all other filters; a check compares the estimates with those of the package's filter. The record is
@@ -104,7 +104,6 @@ class ExtendedOptimised(okf.OKF):  # type: ignore[misc]
 
 
 def make_filter(problem: Problem, folder: str) -> okf.OKF:
-    """Return OKF's untrained filter for a problem."""
     n = len(problem.h)
     options = {
         "H": torch.tensor(problem.h),
@@ -118,7 +117,6 @@ def make_filter(problem: Problem, folder: str) -> okf.OKF:
 
 
 def estimates_of(model: okf.OKF, values: numpy.ndarray) -> numpy.ndarray:
-    """Return the estimates of OKF's filter over tracks of measurements, ``(tracks, T, n)``."""
     found = numpy.empty((*values.shape[:2], model.dim_x))
     with torch.no_grad():
         for track, row in zip(values, found, strict=True):

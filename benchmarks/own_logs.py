@@ -43,9 +43,7 @@ CANDIDATES = 40
 
 
 def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's positions from GPS (3 m) and odometry (0.2 m/s); Q by hand: white acceleration, 2
-    m/s^2 in a second.
-    """
+    """Return filterpy's positions from GPS (3 m) and odometry (0.2 m/s); Q by hand: acceleration 2 m/s^2."""
     kf, last = KalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([100.0, 100, 25, 25]), []
     columns = ("time", "gps_x", "gps_y", "odometry_x", "odometry_y")
@@ -63,9 +61,7 @@ def gps_odometry(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's levels from a gauge (2 cm) and a stick (1 cm); by hand: rate 0.02 m/h in an hour,
-    drift 5 cm a day.
-    """
+    """Return filterpy's levels from gauge (2 cm) and stick (1 cm); by hand: rate 0.02 m/h, drift 5 cm a day."""
     kf, last = KalmanFilter(3, 1), 0.0
     kf.x, kf.P, found = np.array([10.0, 0, 0]), np.diag([0.01, 0.0025, 0.0025]), []
     for t, gauge, stick in zip(log["time"] / 3600, log["gauge"], log["stick"], strict=True):
@@ -83,9 +79,7 @@ def level_gauge(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's roll and pitch; by hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad since the drone
-    accelerates.
-    """
+    """Return filterpy's roll and pitch; by hand: gyroscope 0.02 rad/s, accelerometer 0.1 rad."""
     kf, last = ExtendedKalmanFilter(4, 2), 0.0
     kf.x, kf.P, found = np.zeros(4), np.diag([0.01, 0.01, 0.0025, 0.0025]), []
     rows = zip(*(log[n] for n in ("time", "gyro_p", "gyro_q", "roll_angle", "pitch_angle")), strict=True)
@@ -105,9 +99,7 @@ def pitch_roll(log: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def battery(log: dict[str, np.ndarray]) -> np.ndarray:
-    """Return filterpy's charge of a battery from current (50 mA) and voltage (10 mV); Q by hand: 0.1 % and 1
-    mV in a minute.
-    """
+    """Return filterpy's charge from current (50 mA) and voltage (10 mV); Q by hand: 0.1 % and 1 mV a minute."""
     kf, last = ExtendedKalmanFilter(2, 1), 0.0
     kf.x, kf.P, found = np.array([0.8, 0]), np.diag([0.01, 1e-4]), []
     slope = lambda s: np.array([[0.9 - 1.2 * s[0] + 1.65 * s[0] ** 2, -1.0]])  # noqa: E731
@@ -224,7 +216,6 @@ def problem_id(name: str) -> str:
 
 
 def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
-    """Return the columns by name of each recording in a CSV file."""
     table = np.genfromtxt(file, delimiter=",", names=True)
     return [
         {name: table[name][table["recording"] == number] for name in table.dtype.names}
@@ -233,7 +224,6 @@ def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
 
 
 def compare(name: str, folder: Path) -> list[list[str]]:
-    """Run all filters on a machine's logs, and return its rows of the table."""
     module = importlib.import_module(name)
     problem = problem_of(problem_id(name))
     log, judged = (read_recording(folder / f"{name}{part}.csv", problem.id) for part in ("", "_judged"))

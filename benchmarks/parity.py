@@ -63,7 +63,6 @@ def _difference(one: numpy.ndarray, other: numpy.ndarray) -> numpy.ndarray:
 
 
 def all_parities(ids: list[str], episodes: int) -> Iterator[Parity]:
-    """Yield the differences between the backends in every control and scenario of some environments."""
     for id in ids:
         for control in catalogue()[id].controls:
             for scenario in catalogue()[id].scenarios:

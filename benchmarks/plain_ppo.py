@@ -112,7 +112,6 @@ def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
 
 
 def table(runs: list[dict]) -> Table:
-    """Return a table of cost differences: mean over the seeds with Student's interval, and every seed."""
     from scipy.stats import t
 
     title = "Stable-Baselines3, its defaults and ours: cost against the paper, %"

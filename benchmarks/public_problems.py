@@ -116,12 +116,12 @@ def flow(x: Any, steps: int = 4) -> list[Any]:
 
 
 def order_five(x: Any) -> list[Any]:
-    """Return the state after an interval by the series of order five: the simulation's transition."""
+    """Return the state after an interval by the series of order five, as in the simulation."""
     return taylor(x, 5)
 
 
 def order_two(x: Any) -> list[Any]:
-    """Return the state after an interval by the series of order two: a filter's approximate transition."""
+    """Return the state after an interval by the series of order two, a filter's approximation."""
     return taylor(x, 2)
 
 
@@ -343,7 +343,6 @@ def tune_scales(id: str, name: str, runs: Path) -> Any:
 
 
 def train(id: str, algorithm: str, steps: int, seed: int, runs: Path) -> str:
-    """Train an agent on training episodes, unless ``runs`` contains it; return its folder."""
     folder = runs / f"{short_name(id)}.{algorithm}.{seed}"
     if not (folder / "best").exists():
         words = ["train", f"{MODULE}:{id}", "--algo", algorithm, "--steps", str(steps), "--seed", str(seed)]
@@ -485,7 +484,6 @@ def _text(value: float, digits: int) -> str:
 
 
 def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the columns and rows of the table of the problems of state-space models."""
     rows = []
     if "noise_floor_db" in figures:
         floor = _text(figures["noise_floor_db"], 3)
@@ -508,7 +506,6 @@ def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the columns and rows of the table of drives, published results first."""
     rows = [["published", name, *(_text(v, 2) for v in values), "", ""] for name, values in PUBLISHED.items()]
     for one in figures["drives"]:
         anees = ", ".join(_text(one["anees"][date], 1) for date in DATES) if "anees" in one else ""
@@ -518,7 +515,6 @@ def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECORDS) -> None:
-    """Write the records ``public_problems`` and ``public_drives`` from all results."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = {
         PROBLEMS: (problem_table, "noise_floor_db", "rows"),

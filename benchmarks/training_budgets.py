@@ -24,7 +24,6 @@ BUDGETS = (100_000, 1_000_000, 10_000_000)
 
 
 def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
-    """Train one run for each seed, and return the runs' folders; finished runs are skipped."""
     words = ["train", id, "--algo", algo, "--steps", str(steps), "--seeds", f"0-{seeds - 1}", "--no-compare"]
     command = [sys.executable, "-m", "filtergym", *words, "--out", str(run)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

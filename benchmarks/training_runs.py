@@ -29,10 +29,6 @@ HEADER = ("environment", "scenario", "opponent", "less the opponent, %", "runs, 
 
 
 def rows_of(id: str, agents: list[str], opponents: list[str], episodes: int) -> Iterator[list[str]]:
-    """Yield the table rows of an environment: agents against opponents, in each scenario.
-
-    Opponents that the environment does not have are left out.
-    """
     problem = problem_of(id)
     known = [name for name in opponents if name in shipped_names(problem)]
     bootstrap = Bootstrap(episodes)

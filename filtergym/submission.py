@@ -328,6 +328,14 @@ def make_submission(
 ) -> Submission:
     """Run a protocol with a competitor, and return the submission with its results.
 
+    Args:
+        problem: problem to solve.
+        name: name of the competitor, see :func:`pack`.
+        protocol: name of the protocol.
+        card: description by the author.
+        workers: processes that share the work.
+        progress: function that is called with the number of measurements done.
+
     Raises:
         ValueError: for a competitor that :func:`verify` would refuse.
     """

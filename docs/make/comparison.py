@@ -56,12 +56,11 @@ def compared_policies(benchmark: BenchmarkRecords) -> list[str]:
 
 
 def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
-    """Return the records over whole episodes, by competitor, metric, component and window."""
     return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Return a competitor's cells: cost against the paper's, lost tracks, means, ANEES and time in one scenario."""
+    """Return a competitor's cells: cost against the paper's, lost tracks, means, ANEES and time."""
     values = _by_name(records)
     return [
         with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),

@@ -129,7 +129,7 @@ def round_number(value: float | None) -> float | None:
 
 
 def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
-    """Return a value as JSON text, with a line for each flat or deeply nested entry."""
+    """Return a value as JSON text, a line for each entry that is flat or nested deeply."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     if depth == 0 or not any(isinstance(each, (dict, list)) for each in inside):
         return json.dumps(value, ensure_ascii=False)

@@ -311,7 +311,7 @@ def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[Evaluati
 
 @functools.cache
 def _own_digest() -> str:
-    """Return a SHA-256 digest of the code in this folder, part of the keys of stored means."""
+    """Return a SHA-256 digest of the code in this folder, a part of the keys of stored means."""
     return files_digest([Path(__file__).parent])
 
 

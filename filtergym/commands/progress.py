@@ -14,8 +14,6 @@ STEP = 0.05
 
 
 class _Bar(Progress):
-    """A progress bar that disappears at the end."""
-
     def write_line(self, text: str) -> None:
         """Ignore the line: the bar shows the progress."""
 

@@ -122,10 +122,7 @@ def _train_here(training: Training, trainer: Trainer) -> None:
 
 
 def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[Path, TrainingRun]:
-    """Train runs in parallel processes, and return those that have begun by their folders.
-
-    The reports of a run are printed when it has ended.
-    """
+    """Train runs in parallel processes; return those that have begun by their folders, and print their reports."""
     found = {}
     sizes = [training.run.steps for training in waiting]
     with progress_bar() as bar:

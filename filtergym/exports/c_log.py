@@ -285,7 +285,6 @@ class RegularReading(NamedTuple):
 
 
 def _all_columns(first: list[str], columns: Mapping[str, str]) -> list[str]:
-    """Return the column names ``first``, then the others of a log without time and recording."""
     return [*first, *(name for name in columns if name not in (*first, "time", RECORDING))]
 
 

@@ -71,7 +71,6 @@ def scratch_size(network: "LearnedPolicy") -> int:
 
 
 def _width(network: "LearnedPolicy") -> int:
-    """Return the largest width of a network's layers and input, in values."""
     outputs = [len(values) for key, values in network.arrays.items() if "weight" in key]
     return max([len(network.arrays["observation_mean"]), *outputs])
 

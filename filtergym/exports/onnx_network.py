@@ -46,7 +46,7 @@ class _Graph:
         return names[0]
 
     def split(self, whole: str, count: int, width: int, name: str) -> list[str]:
-        """Add a split of columns into ``count`` parts of ``width`` to the graph; return their names."""
+        """Add a split of columns into parts to the graph; return the parts' names."""
         parts = [f"{name}_{i}" for i in range(count)]
         sizes = self.constant(f"{name}_widths", [width] * count, numpy.int64)
         self.node("Split", [whole, sizes], *parts, axis=1)

@@ -169,7 +169,7 @@ class ParameterGraph(Graph):
         return {row for argument, row in inputs if argument == PARAMETER}
 
     def value(self, node: int) -> Any:
-        """Return a node's value with the default parameters; None where it depends on other inputs."""
+        """Return a node's value with the default parameters; None if it depends on other inputs."""
         if node in self.usual:
             return self.usual[node]
         for part in self.live([node]):

@@ -205,8 +205,6 @@ class _CompiledUpdate:
 
 
 class _Code:
-    """A program compiled for E lanes (parallel episodes); a call returns the rows of its results."""
-
     def __init__(self, code: StraightLineProgram, E: int) -> None:
         self.E = E
         self._inputs = sorted({step.arguments for step in code.steps if step.operation == "input"})

@@ -87,7 +87,7 @@ def advice_html(
 
 
 def _drawn_names(advice: Advice) -> list[str]:
-    """Return the names of the filters that the pictures show, the advised one first."""
+    """Return the filters drawn in pictures, by name, the advised one first."""
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
 
 

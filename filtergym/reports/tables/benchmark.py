@@ -251,7 +251,6 @@ class _Results:
             self._reported += 1
 
     def all(self) -> list[Result]:
-        """Return the results of all complete cells, in their order."""
         return [result for result in self._results if result is not None]
 
 

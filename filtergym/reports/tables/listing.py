@@ -82,7 +82,7 @@ def _shorten(head: str, text: str, width: int) -> str:
 
 
 def _hang(head: str, text: str, width: int | None) -> str:
-    """Return a text beside its head, wrapped with a hanging indent."""
+    """Return a text beside its head, with a hanging indent."""
     if width is None:
         return f"{head} {text}"
     lines = textwrap.wrap(

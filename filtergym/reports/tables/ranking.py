@@ -103,7 +103,6 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
 
 
 def _share(share: float) -> str:
-    """Return a share of the bootstrap resamples as a percentage."""
     return f"{100.0 * share:.1f} % of cases" if share >= 0.001 else "less than 0.1 % of cases"
 
 

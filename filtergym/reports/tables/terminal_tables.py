@@ -325,7 +325,6 @@ def flights_table(
 
 
 def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int) -> Table:
-    """Return the table of flights with at most ``most`` competitors beside the paper's algorithm."""
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
     names = [name for name, kind, _ in rank_competitors(over_all) if kind in RANKED]
     shown, paper = main_components(over_all), dataset.attrs["paper"]
