@@ -292,7 +292,7 @@ def _reward_to_descend(run: TrainingRun) -> str:
     return "cost" if kind == "relative" else kind
 
 
-def _reward_with_teacher(run: TrainingRun) -> TrainingObjective:
+def _training_objective(run: TrainingRun) -> TrainingObjective:
     """Return the objective of a run: its reward, and the share of a teacher's estimates in it.
 
     Raises:
@@ -352,14 +352,14 @@ class Descent:
         step_eagerly(self.optimiser)
         self.steps_done: int = 0
 
-    def flight(self) -> Callable[[Callable[[], None]], float]:
-        """Return a function that simulates an episode in every environment, descends, and returns the mean cost."""
+    def episode_function(self) -> Callable[[Callable[[], None]], float]:
+        """Return a function that simulates an episode in every environment, with gradient steps by its argument."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
         teacher, penalty = self.values.get("teacher"), self.values.get("action_penalty", 0.0)
         check("action_penalty", penalty, float, ParameterLimits(at_least=0.0))
         if env.backend == "compiled":
-            reward = _reward_with_teacher(self.run)
+            reward = _training_objective(self.run)
             beside = None if teacher is None else Teacher(env, teacher)
             return Unrolled(env, policy, truncation, reward, beside, gate, largest, penalty).descend_episodes
         if teacher is not None:
@@ -444,7 +444,7 @@ def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
         descent.load_checkpoint(session.folder / "checkpoint")
     else:
         measure_normalisation(descent.env, descent.policy)
-    fly = descent.flight()
+    fly = descent.episode_function()
     logger = make_logger(session.folder / "log", descent.steps_done)
 
     def descend() -> None:

@@ -123,7 +123,7 @@ class Trust:
             raise ValueError(f"window must be at least one decision, got {self.window!r}")
         self.envelope: EnvelopeAlarm | None = None if envelope is None else EnvelopeAlarm(model, envelope)
 
-    def listen(
+    def update(
         self, observation: numpy.ndarray, memory: TrustMemory | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, TrustMemory]:
         """Update the alarms with observations ``(N, fields)``; return the mask ``(N,)`` of trusted lanes, and memory.
@@ -196,7 +196,7 @@ class Gate:
         call, or None.
         """
         memory = self.begin(range(len(observation))) if memory is None else memory
-        opened, trust = self.trust.listen(observation, memory.trust, start)
+        opened, trust = self.trust.update(observation, memory.trust, start)
         other, fallback = self.fallback.predict(observation, memory.fallback, start, deterministic=True)
         aligned = opened.reshape(-1, *[1] * (numpy.ndim(action) - 1))
         return numpy.where(aligned, action, other), opened, GateMemory(trust, fallback)
@@ -274,7 +274,7 @@ class MonitoredPolicy(Policy):
         """Return the policy's actions unchanged, and the memory with the mask of trust."""
         memory, trust = (None, None) if state is None else state[:2]
         action, memory = self.policy.predict(observation, memory, start, deterministic=True)
-        trusted, trust = self.trust.listen(observation, trust, start)
+        trusted, trust = self.trust.update(observation, trust, start)
         return action, MonitoredMemory(memory, trust, trusted)
 
 

@@ -232,7 +232,7 @@ def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
         if not has_type(header["fields"], list[str]):
             raise ValueError("its header has no list of fields")
         _check_run(header["run"])
-        header["answers"] = _count_answers(arrays, len(header["fields"]))
+        header["answers"] = _count_outputs(arrays, len(header["fields"]))
     except FileNotFoundError as error:
         raise ValueError(f"no learned policy at {path}") from error
     except (SafetensorError, ValueError, TypeError, AttributeError, KeyError) as error:
@@ -253,7 +253,7 @@ def _check_run(run: Any) -> None:
         raise ValueError("env_kwargs of its run must map names to values")
 
 
-def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
+def _count_outputs(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
     """Return a network's number of outputs, from the shapes of its arrays.
 
     Raises:

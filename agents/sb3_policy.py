@@ -73,7 +73,7 @@ class Sb3Policy:
         self.observation_space: Any = model.observation_space
         self.action_space: Any = model.action_space
         self.normalisation = model.get_vec_normalize_env() if normalisation is None else normalisation
-        self.task_keywords: dict[str, Any] = _reach(model)
+        self.task_keywords: dict[str, Any] = _action_range(model)
         if control is not None:
             self.control = control
         name = name or f"this model of {type(model).__name__}"
@@ -107,7 +107,7 @@ class Sb3Policy:
         return self.model.predict(observation, state, episode_start, deterministic)
 
 
-def _reach(model: BaseAlgorithm) -> dict[str, Any]:
+def _action_range(model: BaseAlgorithm) -> dict[str, Any]:
     """Return the task parameters that set the range of actions in a model's environment, where not default."""
     held = model.get_env()
     inner: Any = None if held is None else held.unwrapped

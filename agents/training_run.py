@@ -256,7 +256,7 @@ def _check_environment(
     parameters = {name: value for name, value in keywords.items() if name in known}
     models = [make_model(problem.task, control, name, **parameters) for name in scenarios]
     if options.residual_to or options.gated:
-        _check_around(options, models)
+        _check_residual_and_gate(options, models)
     for name, words in (("reward", REWARDS), ("dtype", DTYPES)):
         if name in keywords and keywords[name] not in words:
             raise nearest(name, keywords[name], words)
@@ -267,7 +267,7 @@ def _as_integer(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
+def _check_residual_and_gate(options: RunOptions, models: Sequence[Model]) -> None:
     """Raise ValueError if the agent of a run cannot correct its policy, or act behind its gate."""
     algorithm, residual_to = options.algorithm, options.residual_to
     if len(models) > 1:
@@ -481,7 +481,7 @@ def has_run(folder: Path) -> bool:
 
 
 def open_run(folder: Path, requested: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
-    """Begin a run in a folder or continue the one there, store its command and versions, and return it.
+    """Begin a run in a folder or continue the one there, and return its record with command and versions.
 
     Arguments are those of :func:`resume_run`; ``resume`` continues the run of the folder.
 

@@ -111,7 +111,7 @@ def read_inertial(file: Path) -> Any:
 def read_fixes(file: Path) -> Any:
     """Return an RTKLIB solution's positions (degrees, m), velocities (m/s) and quality by time, s since 1970.
 
-    Velocities are north, east, down, time is GPS time; quality 1 is fixed, 2 float. A file without any raises ValueError.
+    Velocities are north, east, down, time is GPS time; quality 1 is fixed, 2 float. An empty file raises ValueError.
     """
     import pandas
 

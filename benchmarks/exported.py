@@ -138,7 +138,7 @@ def _code_bytes(file: Path, compiler: list[str]) -> int:
 def run_in_c(
     name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compilers: Compilers
 ) -> tuple[float, float, Writer, Size]:
-    """Run a filter in C over test vectors; return largest difference in deviations, ns an update, writer, size."""
+    """Compile a filter and run it over test vectors; return difference in deviations, ns an update, writer, size."""
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
     batch = BATCH.format(

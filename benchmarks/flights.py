@@ -60,7 +60,7 @@ def main() -> None:
     competitors = {one.name: one.maker for one in found}
     rows = []
     for smoothing in (SMOOTHING, 0.0):
-        for name, flights in sets(smoothing).items():
+        for name, flights in flight_sets(smoothing).items():
             pieces, _ = flights.flyable(INTERVAL, numpy.inf)
             data = problem.evaluate(
                 competitors, flights, episodes=len(pieces), seed=1, sampling_interval=INTERVAL
@@ -80,7 +80,7 @@ def main() -> None:
     print_tables(table)
 
 
-def sets(smoothing: float) -> dict[str, Flights]:
+def flight_sets(smoothing: float) -> dict[str, Flights]:
     """Return the sets of flights of the package ``traffic`` by name, the largest first."""
     own: dict[str, list] = {}
     rest: dict[str, list] = {}

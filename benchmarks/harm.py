@@ -62,7 +62,7 @@ def cells_of(problem: Problem) -> Iterator[tuple[str, str, dict[str, Any]]]:
             yield f"+{name}", known.scenario, {**known.usual, **keywords}
 
 
-def fly(
+def evaluate_cell(
     problem: Problem,
     makers: dict[str, Any],
     episodes: int,
@@ -124,7 +124,7 @@ if __name__ == "__main__":
         makers = competitors_of(problem, args.policy or pretrained_agents(problem.id))
         found: dict[str, list[Cell]] = {name: [] for name in makers}
         for cell in cells_of(problem):
-            for name, own in fly(problem, makers, args.episodes, args.split, cell).items():
+            for name, own in evaluate_cell(problem, makers, args.episodes, args.split, cell).items():
                 found[name].append(own)
                 if args.cells:
                     print(

@@ -159,7 +159,7 @@ def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndar
     return np.sqrt(total.reshape(count, episodes) / recording.rows)
 
 
-def limit(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
+def least_error_factors(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
     """Return the factors on Q and R of least error on a recording, by random search, by name."""
     rng, best, width = np.random.default_rng(0), np.zeros(len(names)), 2.0
     for _ in range(3):
@@ -242,7 +242,7 @@ def compare(name: str, folder: Path) -> list[list[str]]:
     several = {
         "as written": dict.fromkeys(names, 1.0),
         "fitted": fitted,
-        "limit": limit(task, judged, names),
+        "limit": least_error_factors(task, judged, names),
     }
     for who, factors in several.items():
         if name == "late_vision":

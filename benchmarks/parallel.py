@@ -46,7 +46,7 @@ def resident_memory(processes: list[int]) -> float:
     return total / 2**20
 
 
-def filtergym(*words: str) -> tuple[float, float, float]:
+def run_filtergym(*words: str) -> tuple[float, float, float]:
     """Run a ``filtergym`` command; return its seconds, processor seconds, and peak memory of its processes, GiB."""
     began, most = time.monotonic(), 0.0
     command = [sys.executable, "-m", "filtergym", *words]
@@ -72,7 +72,7 @@ def speed(words: list[str], jobs: int) -> None:
         one, many = Path(folder) / "one", Path(folder) / "many"
         found = {}
         for out, further in ((one, ()), (many, ("--jobs", str(jobs)))):
-            found[out] = filtergym("benchmark", *words, "--out", str(out), *further)
+            found[out] = run_filtergym("benchmark", *words, "--out", str(out), *further)
             seconds, used, _ = found[out]
             print(
                 f"{' '.join(['benchmark', *words, *further])}: {seconds:.0f} s, {used:.0f} s of processors",
@@ -90,7 +90,7 @@ def memory(episodes: int, jobs: int) -> None:
     for name in COMPETITORS:
         words += ["--policy", name]
     with tempfile.TemporaryDirectory() as folder:
-        seconds, _, largest = filtergym(*words, "--out", folder)
+        seconds, _, largest = run_filtergym(*words, "--out", folder)
     print(f"{episodes} episodes, {len(COMPETITORS)} competitors, {jobs} processes: {seconds:.0f} s, "
           f"most memory of all together {largest:.2f} GiB")  # fmt: skip
 

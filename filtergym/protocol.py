@@ -240,14 +240,14 @@ class ProtocolResult(NamedTuple):
         return ", ".join(dict.fromkeys(one.entry.name for one in self.environments))
 
     @property
-    def complete(self) -> bool:
-        """Whether every environment of the protocol has an entry; otherwise there is no number."""
+    def is_complete(self) -> bool:
+        """Whether every environment of the protocol has an entry, without which there is no overall number."""
         return len(self.environments) == len(self.protocol.environments)
 
     @property
     def cost(self) -> IntervalEstimate | None:
         """Geometric mean over the environments of the cost ratios, less one, with interval; None if not complete."""
-        if not self.complete:
+        if not self.is_complete:
             return None
         bootstrap = Bootstrap(self.protocol.episodes, self.protocol.resamples)
         logarithms = numpy.stack([one.logarithms for one in self.environments], axis=1)
@@ -256,13 +256,13 @@ class ProtocolResult(NamedTuple):
     @property
     def lost(self) -> float | None:
         """Mean over the environments of the share of lost tracks; None if not complete."""
-        return float(numpy.mean([one.lost.value for one in self.environments])) if self.complete else None
+        return float(numpy.mean([one.lost.value for one in self.environments])) if self.is_complete else None
 
     @property
     def time(self) -> ProcessorTime | None:
         """Geometric mean over the environments of the time of a measurement; None if it is unknown in any of them."""
         times = [one.time for one in self.environments if one.time is not None]
-        if not self.complete or len(times) < len(self.environments):
+        if not self.is_complete or len(times) < len(self.environments):
             return None
         mean = math.exp(sum(math.log(time.nanoseconds) for time in times) / len(times))
         return ProcessorTime(mean, all(time.compiled for time in times), any(time.own for time in times))

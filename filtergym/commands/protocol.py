@@ -115,7 +115,7 @@ def _table(found: ProtocolResult) -> Table:
         "are held out from training the worst is named. ns is the competitor's processor time of a measurement on one "
         "core of this machine."
     )
-    if not found.complete:
+    if not found.is_complete:
         table.caption += "\nNot all environments were entered: there is no number over all."
     return table
 

@@ -80,7 +80,10 @@ def _gated_recurrent(graph: _Graph, x: str, width: int) -> str:
 
 
 def _long_short_term(graph: _Graph, x: str, width: int) -> str:
-    """Add a step of the long short-term memory (Gers et al., 2000), output then cells; return its output's name."""
+    """Add a step of the long short-term memory (Gers et al., 2000); return the name of its output.
+
+    The memory has the output first, then the cells.
+    """
     shown, cells = graph.split("memory", 2, width, "memory_part")
     from_input = graph.linear(x, "lstm_input_weight", "lstm_input_bias")
     from_memory = graph.linear(shown, "lstm_memory_weight", "lstm_memory_bias")

@@ -48,10 +48,10 @@ def compute_units(results: Any, progress: Progress, workers: Workers | None = No
     units done.
     """
     units: list[Later] = []
-    _places(results, units.append)
+    _replace_units(results, units.append)
     done = check_workers(workers).results(_unit, units, [1] * len(units), progress)
     found = iter(done)
-    return _places(results, lambda unit: next(found))
+    return _replace_units(results, lambda unit: next(found))
 
 
 def _unit(unit: Later, tick: Progress) -> Any:
@@ -60,16 +60,16 @@ def _unit(unit: Later, tick: Progress) -> Any:
     return found
 
 
-def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
+def _replace_units(part: Any, instead: Callable[[Later], Any]) -> Any:
     """Return nested containers with ``instead(unit)`` in place of each postponed call, in order."""
     if isinstance(part, Later):
         return instead(part)
     if isinstance(part, dict):
-        return {key: _places(value, instead) for key, value in part.items()}
+        return {key: _replace_units(value, instead) for key, value in part.items()}
     if isinstance(part, list):
-        return [_places(value, instead) for value in part]
+        return [_replace_units(value, instead) for value in part]
     if isinstance(part, tuple):
-        values = [_places(value, instead) for value in part]
+        values = [_replace_units(value, instead) for value in part]
         return type(part)(*values) if hasattr(part, "_fields") else tuple(values)
     return part
 

@@ -170,7 +170,7 @@ def ramp_starts(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
     return alarms
 
 
-def pair(squares: numpy.ndarray, window: tuple[int, int] | None) -> list[str]:
+def rms_texts(squares: numpy.ndarray, window: tuple[int, int] | None) -> list[str]:
     """Return position and velocity RMS of a window (None: peaks) as texts, such as ``135.68 ± 0.31``."""
     position, velocity = map(quantity, rms(squares, window).T)
     return [f"{position:.2f}", f"{velocity:.3f}"]
@@ -317,7 +317,7 @@ def quantities(r: Results) -> dict[str, Any]:
             quantity(errors[:, row, column] / errors.min(axis=(1, 2)) - 1.0)
             for errors in grid_errors(r.grids["gains used"], WINDOWS["all"])
         ],
-        "imm": pair(imm, WINDOWS["all"]),
+        "imm": rms_texts(imm, WINDOWS["all"]),
         "fixed": rms(r.exact["fixed gain 0.65"], WINDOWS["all"])[0],
         "quiet": _grid_text(findings(r, "gains used", WINDOWS["pre"])),
         "readings": _readings(r),
@@ -355,7 +355,9 @@ def _straight(imm: numpy.ndarray, adaptive: numpy.ndarray) -> str:
     """Return a text with the RMS on both straight legs, IMM against adaptive filter."""
     straight = []
     for window in (WINDOWS["pre"], WINDOWS["post"]):
-        rows = zip(pair(imm, window), pair(adaptive, window), changes(imm, adaptive, window), strict=True)
+        rows = zip(
+            rms_texts(imm, window), rms_texts(adaptive, window), changes(imm, adaptive, window), strict=True
+        )
         parts = [
             f"{name} {ours} against {theirs} {unit} ({change:+.1%})"
             for (ours, theirs, change), (name, unit) in zip(rows, COMPONENTS, strict=True)
@@ -403,8 +405,12 @@ def tables(r: Results) -> list[Grid]:
         last = squares.shape[1]
         moved = [(a + later, min(b + later, last)) for a, b in list(WINDOWS.values())[:-1]]
         scans = squares[0].argmax(axis=0) + 1
-        peaks = [f"{peak} @{scan}" for peak, scan in zip(pair(squares, None), scans, strict=True)]
-        return [name, *(" / ".join(pair(squares, window)) for window in (*moved, WINDOWS["all"])), *peaks]
+        peaks = [f"{peak} @{scan}" for peak, scan in zip(rms_texts(squares, None), scans, strict=True)]
+        return [
+            name,
+            *(" / ".join(rms_texts(squares, window)) for window in (*moved, WINDOWS["all"])),
+            *peaks,
+        ]
 
     spans = [f"{name} {first}-{last}" for name, (first, last) in WINDOWS.items()]
     header = ["algorithm", *spans, "peak position", "peak velocity"]
@@ -473,7 +479,7 @@ def tables(r: Results) -> list[Grid]:
             f"Whole-run RMS on the gain grid, canonical reading ({unit})",
             ["alpha_1 \\ alpha_2", *(f"{high:g}" for high in HIGH_GAINS)],
             [
-                [f"{low:g}", *(" / ".join(pair(squares, WINDOWS["all"])) for squares in cells)]
+                [f"{low:g}", *(" / ".join(rms_texts(squares, WINDOWS["all"])) for squares in cells)]
                 for low, cells in zip(LOW_GAINS, r.grids["gains used"], strict=True)
             ],
         ),

@@ -88,7 +88,7 @@ class Run(NamedTuple):
     """Estimate minus truth in the first episode, ``(K, 4)``."""
 
 
-def fly(name: str, episodes: int, **keywords: Any) -> Run:
+def run_policy(name: str, episodes: int, **keywords: Any) -> Run:
     """Run a policy, reference or bound over the paper's flight; return its errors, probabilities and gains."""
     one = evaluate_policy(ManeuveringTarget.id, name, "paper", episodes, seed=SEED, **keywords)
     nothing = numpy.empty((0, 0))
@@ -135,7 +135,7 @@ def grid_row(recording: Recording, likelihood: Likelihood, low: float) -> list[n
 
 def squares_of(name: str, episodes: int, **keywords: Any) -> numpy.ndarray:
     """Return the mean squares ``(1 + resamples, K, 2)`` of a policy's errors over the paper's flight."""
-    return fly(name, episodes, **keywords).squares
+    return run_policy(name, episodes, **keywords).squares
 
 
 class Results(NamedTuple):
@@ -180,7 +180,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
     results = Results(
         episodes,
         grid_episodes,
-        main={name: later(fly, name, episodes) for name in NAMES},
+        main={name: later(run_policy, name, episodes) for name in NAMES},
         exact=exact | {"best gain schedule, flight known": exactly(schedule)},
         forced={k: exactly(ramp_schedule(low, high, scans, k)) for k in range(first, last + 1)},
         boxed={gains: rivals(gains=gains) for gains in BOX_PAIRS},

@@ -25,7 +25,7 @@ DIFFERENCES = {
 }  # fmt: skip
 
 
-def roots(r: Results) -> tuple[dict[str, Quantity], dict[str, Quantity]]:
+def rms_errors(r: Results) -> tuple[dict[str, Quantity], dict[str, Quantity]]:
     """Return the root mean square errors of example (a), and of example (b), by name."""
     a = {name: quantity(numpy.sqrt(means(r.example.squares[name]))) for name in DIFFERENCES}
     return a, {name: quantity(numpy.sqrt(squares)) for name, squares in r.squares.items()}
@@ -112,7 +112,7 @@ CLAIMS = (
 
 def quantities(r: Results) -> dict[str, Any]:
     """Return the quantities that the claims' texts and verdicts contain, by name."""
-    a, b = roots(r)
+    a, b = rms_errors(r)
     p, gains = PARAMETERS, dict(zip(("white", "reduced", "best"), GAINS.values(), strict=True))
 
     def change(name: str, other: str) -> Quantity:
@@ -142,7 +142,7 @@ def quantities(r: Results) -> dict[str, Any]:
 
 def tables(r: Results) -> list[Grid]:
     """Return the report's tables: root mean squares measured and exact, and solutions of the Riccati equation."""
-    a, b = roots(r)
+    a, b = rms_errors(r)
     theory, exact, agreement = r.example.theory, exact_root_mean_squares(), riccati_agreement()
     return [
         Grid(

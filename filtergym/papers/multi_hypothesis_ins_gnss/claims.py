@@ -181,7 +181,7 @@ def quantities(r: Results) -> dict[str, Any]:
         [loss(course[name], MOTION) for course in r.courses.values()] for name in ("Singer", ADAPTIVE)
     )
     settings = {name: loss(run, SHORTEST_LEG + 1) for name, run in r.settings.items()}
-    paired = kinematic[ADAPTIVE].some(0, few)
+    paired = kinematic[ADAPTIVE].slice_runs(0, few)
     room = [
         [quantity(run.rms(c, window)) for c in range(2) for run in (adaptive, best)]
         for window in WINDOWS.values()

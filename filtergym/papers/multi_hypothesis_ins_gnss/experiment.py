@@ -101,7 +101,7 @@ class Run(NamedTuple):
     nis: numpy.ndarray
     """Normalised innovation squared over its degrees of freedom, ``(E, K)``."""
 
-    def some(self, first: int, end: int) -> "Run":
+    def slice_runs(self, first: int, end: int) -> "Run":
         """Return the results of the runs ``first`` to ``end``, without the last."""
         return Run(*(series[first:end] for series in self))
 
@@ -173,7 +173,8 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
     run = Run(**record_run(model, actor, seeds, fields))
     ends = numpy.cumsum(list(filters.values()))
     return {
-        name: run.some(end - count, end) for (name, count), end in zip(filters.items(), ends, strict=True)
+        name: run.slice_runs(end - count, end)
+        for (name, count), end in zip(filters.items(), ends, strict=True)
     }
 
 

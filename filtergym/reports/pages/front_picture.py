@@ -43,7 +43,7 @@ def front_images(results: Sequence[Result]) -> list[FrontImage]:
         words = " ".join(
             f"{what}: {', '.join(map(_place, listed))}." for what, listed in lists.items() if listed
         )
-        encoded = base64.b64encode(_draw(panel, columns=1)).decode()
+        encoded = base64.b64encode(_panel_svg(panel, columns=1)).decode()
         found.append(FrontImage(title, words, f"data:image/svg+xml;base64,{encoded}"))
     return found
 
@@ -54,8 +54,8 @@ def _place(point: Point) -> str:
 
 
 @in_print
-def _draw(panel: FrontPanel, *, columns: int) -> bytes:
-    """Draw a panel of cost against time; return it as SVG, the same bytes every time."""
+def _panel_svg(panel: FrontPanel, *, columns: int) -> bytes:
+    """Draw a panel of cost against time, and return its SVG: the same bytes every time."""
     from matplotlib import rc_context
 
     # Names are of anybody: between two dollars they are no formulas.

@@ -52,7 +52,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         {
             "id": id,
             "anchor": f"e{number}",
-            "dots": pack(_dots(group)) if len(group) > 1 else None,
+            "dots": pack(_scenario_costs(group)) if len(group) > 1 else None,
             "paper": group[0].paper,
             "cells": [_cell(result, f"e{number}s{i}", group) for i, result in enumerate(group)],
         }
@@ -210,7 +210,7 @@ def _front(result: Result) -> list[list[Any]]:
     ]
 
 
-def _dots(group: Sequence[Result]) -> dict[str, Any]:
+def _scenario_costs(group: Sequence[Result]) -> dict[str, Any]:
     """Return the data of the picture of cost in all scenarios of an environment."""
     shown = next((result for result in group if result.default), group[0])
     return {
