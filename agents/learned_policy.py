@@ -346,7 +346,7 @@ class StoredPolicy:
 
 
 def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
-    """Return the factory of a learned policy or estimator, loaded from a file of an environment.
+    """Return the factory of the learned policy or estimator in a file; it must be of the environment ``cls``.
 
     Raises:
         ValueError: if the file is not a learned policy, or belongs to another environment.

@@ -101,7 +101,7 @@ def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
 
 
 def as_saved_agent(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPolicy | Sb3Policy:
-    """Return an agent's network as a :class:`.LearnedPolicy`, several times as fast as the model.
+    """Return an agent's network as a fast :class:`.LearnedPolicy`; an agent that it cannot represent unchanged.
 
     An agent that a learned policy cannot represent is returned unchanged.
     """

@@ -170,7 +170,7 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
 def dataset(
     truth: numpy.ndarray, ins: numpy.ndarray, fix: numpy.ndarray, deviation: float, starts: numpy.ndarray
 ) -> xarray.Dataset:
-    """Return recordings as a dataset in the format of recordings' files.
+    """Return a drive's windows as an xarray dataset, in the format of a file of recordings.
 
     Args:
         truth: true positions from the start of each window on, m, ``(episode, 1 + time, axis)``.

@@ -182,7 +182,7 @@ def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[st
 
 
 def processor_time(name: str, folder: Path) -> float:
-    """Return the processor seconds of the page's commands (fit, evaluate, export) for a machine."""
+    """Return the processor seconds of fit, evaluation and export of a filter for one of the machines."""
     machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", children_time()
     for words in (
         ["advise", folder / f"{name}.csv", "--environment", machine, "--out", filter],

@@ -309,7 +309,7 @@ def _store_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> N
 
 
 def datasets_table(summaries: Iterable[DatasetSummary]) -> Table:
-    """Return a table of written data sets for the terminal, grouped by environment."""
+    """Return a table of written data sets for the terminal: environment, size and mean return."""
     table = plain_table()
     table.add_column("data set", overflow="fold")
     table.add_column("environment", overflow="fold")

@@ -35,7 +35,7 @@ def panels_of(benchmarks: Sequence[BenchmarkRecords]) -> list[FrontPanel]:
 
 @in_print
 def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
-    """Draw the fronts of several environments in one picture, with its legend in the empty place."""
+    """Draw the cost-time fronts of several environments in one picture, with the legend in the empty place."""
     figure, axes = figure_with_pairs(len(panels) // 2 + 1, columns)
     cells = axes.ravel().tolist()
     for axis, panel in zip(cells, panels, strict=False):

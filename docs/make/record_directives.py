@@ -192,7 +192,7 @@ class BudgetsTable(_Rendered):
 
 
 class SeedsTables(_Rendered):
-    """``{seeds} ENVIRONMENT``: every training run, and the spread of each algorithm; without a name, all means."""
+    """``{seeds} ENVIRONMENT``: every training run, and the spread of each algorithm; without a name, means of all."""
 
     def markdown(self) -> str:
         """Return the tables of training seeds in Markdown."""
@@ -264,7 +264,7 @@ class EnvironmentTable(_Rendered):
     option_spec: ClassVar[Any] = {"environment": directives.unchanged_required}
 
     def markdown(self) -> str:
-        """Return the table of the code in Markdown."""
+        """Return the named table of an environment, or that of causes, in Markdown."""
         if self.argument_text == "causes":
             return causes_table()
         if "environment" not in self.options:

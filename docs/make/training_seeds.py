@@ -323,7 +323,7 @@ def _means_of(asked: EvaluationRequest, tick: Callable[[int], None]) -> PolicyMe
 
 
 def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
-    """Yield the statistics of an evaluation: mean cost of every episode, and mean square of every component."""
+    """Yield the statistics of an evaluation: mean cost and mean squared errors of every episode."""
     yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     first, last = windows_of(run)["all"]
     for component in select_components(list(components_and_groups(run))):
@@ -585,7 +585,7 @@ def seeds_markdown(record: ResultRecord) -> str:
 
 
 def seeds_overview(records: Sequence[ResultRecord]) -> str:
-    """Return a Markdown table: mean cost over training seeds of every algorithm in every environment.
+    """Return a Markdown table: cost of every algorithm against the paper's, mean over training seeds, by environment.
 
     Beside them stands the opponent of lowest cost that is no reference. Agents are not distinguished by a gate or by a
     policy that they correct.

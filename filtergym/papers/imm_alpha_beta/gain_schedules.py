@@ -16,7 +16,7 @@ from .alpha_beta_errors import ErrorMoments, propagate_error
 
 
 class Flight(NamedTuple):
-    """The x coordinate of one flight: its manoeuvre, and the variance of its measurements."""
+    """Manoeuvre of one flight along x, scan by scan, and the variances of its measurements."""
 
     displacement: numpy.ndarray
     """Displacement by the manoeuvre in each scan, m, ``(K,)``."""
@@ -29,7 +29,7 @@ class Flight(NamedTuple):
 
 
 def maneuver_flight(parameters: ManeuveringTargetParameters) -> Flight:
-    """Return the x coordinate of the paper's flight, with its manoeuvre and measurement variances."""
+    """Return the paper's manoeuvre along x, as displacement and velocity change per scan, and sensor variances."""
     p, T = parameters, parameters.sampling_interval
     first, last = p.maneuver_steps
     scans = numpy.arange(1, p.horizon + 1)

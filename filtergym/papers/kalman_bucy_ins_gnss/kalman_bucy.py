@@ -53,7 +53,7 @@ def _information(C: ArrayLike, Q: ArrayLike, size: int) -> Matrix:
 
 
 def riccati_scalar(a: float, w: float, s: float, R0: float, times: ArrayLike) -> Matrix:
-    """Return the covariance (5) of a scalar model with constant coefficients, in closed form.
+    """Return the solution of the Riccati equation (5) of a scalar model, in closed form.
 
     With ``gamma = sqrt(a^2 + w s)`` and ``u = tanh(gamma t) / gamma`` (``t`` where gamma is zero),
     ``R = (R0 (1 + a u) + w u) / (1 + (s R0 - a) u)``. It equals the usual form
@@ -93,7 +93,7 @@ def riccati_hamiltonian(
     R0: ArrayLike,
     times: ArrayLike,
 ) -> Matrix:
-    """Return the covariance (5) by the exponential of the Hamiltonian matrix, exact for constant coefficients.
+    """Return the solution of the Riccati equation (5) by the exponential of the Hamiltonian matrix.
 
     ``d/dt [P1; P2] = [[-A^T, C^T Q^-1 C], [BGB^T, A]] [P1; P2]``, ``P1(0) = I``, ``P2(0) = R0``,
     ``R = P2 P1^-1``. P1 grows without limit and its columns become parallel, so the solution is restarted.
@@ -136,7 +136,7 @@ def riccati_hamiltonian(
 def riccati_ode(
     A: ArrayLike, BGBt: ArrayLike, C: ArrayLike, Q: ArrayLike, R0: ArrayLike, times: ArrayLike
 ) -> Matrix:
-    """Return the covariance (5) by numerical integration (Runge-Kutta of order 8, relative tolerance 1e-11).
+    """Return the solution of the Riccati equation (5) by Runge-Kutta steps of order 8, to 1e-11.
 
     Arguments, result and errors as in :func:`riccati_hamiltonian`.
     """
@@ -173,7 +173,7 @@ class Moments(NamedTuple):
 def moments(
     A: ArrayLike, U: ArrayLike, BGBt: ArrayLike, m0: ArrayLike, Theta0: ArrayLike, times: ArrayLike
 ) -> Moments:
-    """Return the mean and covariance of the process by equations (6), exact for constant coefficients and input.
+    """Return mean and covariance of a linear process by equations (6), exact for constant coefficients and input.
 
     Args:
         A: ``(n, n)``, 1/s.

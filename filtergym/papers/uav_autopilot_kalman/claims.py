@@ -172,7 +172,7 @@ def quantities(r: Results) -> dict[str, Any]:
     tasks = [r.noise[case]["kalman"].task for case in (*plants, "P, H = [1 0]")]
 
     def mean_ratio(values: Callable[[Any], numpy.ndarray]) -> list[float]:
-        """Return the mean without the filter over the mean with it, for both plants."""
+        """Return, for both plants, a signal's mean without the filter over its mean with the filter."""
         return [float(values(a).mean() / values(b).mean()) for a, b in zip(raw, ours, strict=True)]
 
     return {

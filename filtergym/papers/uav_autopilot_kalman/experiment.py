@@ -210,7 +210,7 @@ def flatness(values: numpy.ndarray) -> float:
 
 
 def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the theoretical power spectra of output and nodes under white noise, by name."""
+    """Return the theoretical power spectra of the loop's signals under white noise, by name."""
     (F, B, H, L, K, Q, R), T = matrices(task), interval(task)
     n, m = len(F), len(R)
     loop = linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)
