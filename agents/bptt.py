@@ -371,7 +371,7 @@ class Descent:
         )
 
     def update(self) -> float:
-        """Do an optimiser step along the accumulated gradient, and return the gradient's norm."""
+        """Clip the accumulated gradient, do an optimiser step, and return the gradient's norm before clipping."""
         norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.values["max_grad_norm"])
         self.optimiser.step()
         self.optimiser.zero_grad()

@@ -178,7 +178,7 @@ class UpdateTimes(_Rendered):
     """``{update-times}``: the time of an update of running filters, beside those of other libraries."""
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return file name, alternative text and figure of the bars."""
+        """Return file name, alternative text and figure of the bars of update times."""
         rows = self.record("online_time").data["rows"]
         return "update_times", "Bars: median time of an update of each filter", draw_update_times(rows)
 
@@ -228,7 +228,7 @@ class TrainingCurves(_Rendered):
         return {**data, "runs": [run for run in data["runs"] if run[0] in data.get("curves", {})]}
 
     def markdown(self) -> str:
-        """Return a sentence on the runs without a curve; empty without such runs."""
+        """Return a sentence on the algorithms whose curves the record lacks; empty if it has them all."""
         shown = {run[1] for run in self.data["runs"]}
         every = dict.fromkeys(run[1] for run in self.record(f"{SEEDS}/{self.argument_text}").data["runs"])
         missing = ", ".join(f"`{name}`" for name in every if name not in shown)

@@ -278,7 +278,7 @@ def loss(run: Run, motion: int) -> Loss:
 
 
 class Wait(NamedTuple):
-    """Seconds until the filter has adapted to a change of motion; NaN where it never adapts."""
+    """Mean, shortest and longest time, s, until a filter has adapted to a change of motion; NaN: never."""
 
     mean: float
     first: float

@@ -297,7 +297,7 @@ def covariances(task: UavAutopilot, **changes: Any) -> numpy.ndarray:
 
 
 def covariance_curves(task: UavAutopilot) -> dict[str, numpy.ndarray]:
-    """Return :func:`covariances` of plant U with and without the correcting term of (12), by case."""
+    """Return :func:`covariances` of plant U by (12), and in cases such as without measurements, by case."""
     names = [c.name for c in task.components]
     H = numpy.eye(len(names))
     rate, elevator = names.index("rate"), names.index("elevator")

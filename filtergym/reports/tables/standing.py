@@ -70,7 +70,7 @@ def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool =
 
 
 def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
-    """Return the name of the shipped classical competitor of lowest cost, tuned or not; None without any."""
+    """Return the cheapest classical competitor but the paper's algorithm, tuned or not, by name; None without any."""
     problem, known = run.problem, run.problem.baselines
     makers = {
         name: problem.competitor(name)
