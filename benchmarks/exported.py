@@ -173,7 +173,6 @@ def run_in_c(
 
 
 def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
-    """Return the nanoseconds of an update of one lane of many, in LLVM's code of the same program."""
     program = traced.update
     # Input and output must not be the same memory: the state after an update goes elsewhere.
     after = max(STATE, MEASUREMENT, ANSWER, ESTIMATE, SHOWN, 3) + 1

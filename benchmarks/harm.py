@@ -53,7 +53,6 @@ class Cell(NamedTuple):
 
 
 def cells_of(problem: Problem) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield name, scenario and task keywords of every scenario and stress of a problem."""
     for scenario in problem.task.scenarios:
         yield scenario, scenario, {}
     if problem.id in STRESSES:
@@ -85,7 +84,6 @@ def evaluate_cell(
 
 
 def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
-    """Return the factories of the paper's algorithm, the gate's fallback, and each agent alone and gated."""
     fallback = problem.baselines.fallback or problem.paper
     first = dict.fromkeys([problem.baselines.compared_paper, fallback])
     makers = {name: problem.competitor(name) for name in first}

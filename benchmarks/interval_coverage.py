@@ -48,7 +48,6 @@ class Pool(NamedTuple):
 
 
 def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> numpy.ndarray:
-    """Return a competitor's mean cost of every episode of the validation split, ``(episodes,)``."""
     problem = problem_of(f"filtergym/{environment}-v0")
     split = "validation" if problem.task.scenarios[scenario].training else "test"
     experiment = problem.experiment(scenario, episodes, 1, split)

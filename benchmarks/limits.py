@@ -59,8 +59,6 @@ def names_without_random(problem: Problem) -> list[str]:
 def episode_costs(
     problem: Problem, scenario: str, names: Sequence[str], episodes: int, seed: int
 ) -> dict[str, numpy.ndarray]:
-    """Return the mean cost of every episode, ``(episodes,)``, of each competitor by name."""
-
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
 

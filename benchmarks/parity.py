@@ -31,7 +31,6 @@ class Parity(NamedTuple):
 
 
 def parity(id: str, control: str, scenario: str, episodes: int, decisions: int | None = None) -> Parity:
-    """Run episodes on both backends with the same actions, and return the largest differences."""
     envs = [
         gymnasium.make_vec(
             id,

@@ -62,7 +62,6 @@ def arguments() -> argparse.Namespace:
 
 
 def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
-    """Train an agent once; return its costs with those of the paper's algorithm and of the action zero."""
     import torch
 
     from filtergym.agents import to_sb3

@@ -420,7 +420,6 @@ def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: 
 
 
 def tune_drives(recording: Recording) -> dict[str, float]:
-    """Return the factors on R and Q with the least squared error over the validation drives, by name."""
     from scipy.optimize import minimize
 
     def cost(logarithms: numpy.ndarray) -> float:

@@ -2,10 +2,9 @@
 
     python benchmarks/training_budgets.py --runs runs/budgets
 
-Each is a separate run with the settings of ``filtergym train``, whose learning rate falls over its own length; runs in
-the folder are not repeated. TightlyCoupledNavigation is left out: there a decision takes ten measurements of three
-filters, and the shipped runs have 100,000 of them. The best agent of each run is evaluated on the episodes of the test
-split.
+Each is a separate run of ``filtergym train``, whose learning rate falls over its own length; runs in the folder are not
+repeated. TightlyCoupledNavigation is left out: its decisions take ten measurements of three filters, and its shipped
+runs have 100,000 of them. The best agent of each run is evaluated on the episodes of the test split.
 """
 
 import argparse

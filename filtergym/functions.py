@@ -227,5 +227,9 @@ def _model_of(env: Any) -> Any:
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:
-    """Return a record of every metric of every policy with its interval, from the result of :func:`evaluate`."""
+    """Return a record of every metric of every policy, with its interval, the environment's metrics included.
+
+    Args:
+        dataset: from :func:`evaluate`; see :func:`.evaluation.running.metrics.tidy_records`.
+    """
     return metrics.tidy_records(dataset, problem_of(dataset.attrs["environment"]).baselines.metrics)

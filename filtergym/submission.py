@@ -180,6 +180,9 @@ def protocol_of(problem: Problem, name: str) -> tuple[Protocol, str]:
 def read_submission(path: Path) -> tuple[Submission, str]:
     """Return the submission in a file, without running any of it, and the file's SHA-256 digest.
 
+    Args:
+        path: path of the file.
+
     Raises:
         ValueError: if the file is no submission.
     """
@@ -189,6 +192,10 @@ def read_submission(path: Path) -> tuple[Submission, str]:
 
 def write_submission(path: Path, submission: Submission) -> str:
     """Write a submission to a file, and return the SHA-256 digest of the file.
+
+    Args:
+        path: path of the file.
+        submission: submission to write.
 
     Raises:
         ValueError: if the file cannot be written, or is larger than a reader accepts.
@@ -445,7 +452,12 @@ class Deviation(NamedTuple):
 
 
 def deviation(claimed: Sequence[Figure], repeated: Sequence[Figure]) -> Deviation:
-    """Return the largest deviation of results from a second run over the same episodes, without times."""
+    """Return the largest deviation of results from a second run over the same episodes, without times.
+
+    Args:
+        claimed: results of a file.
+        repeated: results of the second run.
+    """
     stated, known = _by_name(claimed), _by_name(repeated)
     worst = Deviation(0.0, "")
     if stated.keys() != known.keys() or len(stated) != sum(f.metric != TIME for f in claimed):
@@ -472,6 +484,10 @@ def deviation(claimed: Sequence[Figure], repeated: Sequence[Figure]) -> Deviatio
 
 def fresh_deviation(claimed: Sequence[Figure], fresh: Sequence[Figure]) -> Deviation:
     """Return the largest deviation of results from those over other episodes, by both intervals, without times.
+
+    Args:
+        claimed: results of a file, which hold on their own episodes.
+        fresh: results on fresh episodes, of the same scenarios and metrics.
 
     Raises:
         KeyError: for other scenarios or metrics.

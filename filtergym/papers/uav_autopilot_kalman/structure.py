@@ -50,7 +50,7 @@ def spectral_width(task: UavAutopilot) -> float:
 
 
 class Approximation(NamedTuple):
-    """RMS errors of three extrapolations of the output over one interval, relative to its deviation."""
+    """RMS errors of three approximations of the output in one interval, relative to its deviation."""
 
     constant: float
     linear: float
@@ -58,7 +58,7 @@ class Approximation(NamedTuple):
 
 
 def approximation_errors(task: UavAutopilot) -> Approximation:
-    """Return the errors of three extrapolations of the output over one interval, in the settled loop."""
+    """Return the errors of three approximations of the output in one interval, in the settled loop."""
     loop, T = _settled_loop(task), interval(task)
     X = linear_systems.stationary_covariance(*loop)
     coordinates = numpy.eye(len(X))
