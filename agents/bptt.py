@@ -353,7 +353,7 @@ class Descent:
         self.steps_done: int = 0
 
     def episode_function(self) -> Callable[[Callable[[], None]], float]:
-        """Return a function that simulates an episode in every environment, with gradient steps by its argument."""
+        """Return a function that simulates episodes, calls its argument at each gradient step, and returns the cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
         teacher, penalty = self.values.get("teacher"), self.values.get("action_penalty", 0.0)

@@ -254,7 +254,7 @@ def _check_run(run: Any) -> None:
 
 
 def _count_outputs(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
-    """Return a network's number of outputs, from the shapes of its arrays.
+    """Check that the arrays of a network fit together, and return its number of outputs.
 
     Raises:
         ValueError: if an array is missing or unknown, or does not fit the others or a ``width`` of so many fields.

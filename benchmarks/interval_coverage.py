@@ -79,7 +79,7 @@ def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
 
 
 def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
-    """Return for each statistic the share of intervals with the truth, and of misses below it, as text."""
+    """Return for each statistic the share of intervals that hold the truth, and of misses below it, as text."""
     generator, bootstrap = numpy.random.default_rng(number), Bootstrap(number)
     true = numpy.array(truths(pool))
     below, above = numpy.zeros(len(true)), numpy.zeros(len(true))

@@ -147,7 +147,7 @@ class FrontFigure(_Rendered):
     """``{front-figure} ENVIRONMENT ...``: accuracy against time; default: all environments."""
 
     def figure(self) -> tuple[str, str, Any]:
-        """Return file name, alternative text and figure of the fronts."""
+        """Return file name, alternative text and figure of the cost-time fronts."""
         names = self.argument_text.split() or recorded_environments()
         panels = panels_of([self.benchmark(name)[0] for name in names])
         if not panels:

@@ -220,7 +220,7 @@ def advise_on_log(
 
 
 def _advice_maker() -> Callable[..., str]:
-    """Return :func:`.advice_html`; raise ValueError if the packages of HTML reports are not installed."""
+    """Return the function that makes a page of advice; raise ValueError if its packages are not installed."""
     report_maker()
     from ..reports.pages.advice_report import advice_html
 

@@ -140,7 +140,7 @@ class FilterSteps:
         )
 
     def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
-        """Return the filter's state after a measurement, and by name mean, covariance and likelihoods."""
+        """Return the filter's state after a measurement, and numbers by name, such as mean and covariance."""
         own, received = self.filter, measurement if self.masked is None else self.masked(measurement)
         after = own.step(state, FilterInput(received))
         records = own.records(after, received)
@@ -537,7 +537,7 @@ class _Nodes(NamedTuple):
 
 
 def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
-    """Return the constants of a filter traced without free parameters, by the node in their place with them."""
+    """Compare traces without and with free parameters; return constants of the first by node of the second."""
     one, other, found = plain.graph, free.graph, dict[int, float]()
     waiting = list(zip(plain.wanted, free.wanted, strict=True))
     seen = set(waiting)

@@ -68,7 +68,7 @@ def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verd
 
 
 def in_band(found: Loss) -> bool:
-    """Return whether the median time to loss of track is within the paper's band, and most runs lose it."""
+    """Return whether the median time to loss of track is in the paper's band, and over 95 % of runs lose it."""
     return found.rate > 0.95 and BAND[0] <= found.median <= BAND[1]
 
 
