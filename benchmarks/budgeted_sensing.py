@@ -36,7 +36,7 @@ def interval(values: Any, digits: int = 3) -> str:
 
 
 def episode_rows(scenario: str, competitors: dict[str, Any]) -> list[list[str]]:
-    """Return table rows: cost of each policy in a scenario, relative to the rival's on the same noise."""
+    """Return table rows: cost of each policy relative to the rival's on the same noise, and lost targets."""
     dataset = filtergym.evaluate(
         sensing.BudgetedSensing.id, competitors, scenario=scenario, episodes=EPISODES[scenario]
     )

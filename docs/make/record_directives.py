@@ -319,7 +319,7 @@ class Playground(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Return a node with the playground's element, scripts and colours."""
+        """Return the nodes of the playground: its element, scripts, and a picture where scripts are off."""
         page = Path(self.env.doc2path(self.env.docname)).parent
         static = os.path.relpath(Path(self.env.srcdir) / "_static", page)
         picture = nodes.image(uri=self.arguments[0], alt="Tracks of four filters, their errors and weights")

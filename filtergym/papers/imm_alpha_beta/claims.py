@@ -142,7 +142,7 @@ def grid_finding(errors: numpy.ndarray) -> GridFinding:
 
 
 def findings(r: Results, likelihood: Likelihood, window: tuple[int, int] | None) -> list[GridFinding]:
-    """Return the minimum on the gain grid for position, and that for velocity."""
+    """Return the least RMS error on the gain grid, of position and of velocity, with its gains."""
     return [grid_finding(errors) for errors in grid_errors(r.grids[likelihood], window)]
 
 
