@@ -488,7 +488,8 @@ def _compiled_decision(
         return lambda: setting_up
 
     def measure() -> float:
-        first, spent = [], []
+        first: list[float] = []
+        spent: list[float] = []
         while len(spent) < FEWEST_RUNS or (sum(spent) < TIMED_SECONDS and len(spent) < MOST_RUNS):
             first.append(run(1))  # in turn: an error of the first decision must not enter every measurement
             spent.append(run(count))

@@ -194,9 +194,9 @@ def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) ->
         if (r.metric, r.window) == (HEADLINE, "all") and r.kind in RANKED and r.value is not None
     }
     known = [place.policy for place in ranking(records) if place.policy in times and place.policy in costs]
-    allowed = sorted({times[name].nanoseconds: times[name] for name in known}.items())
+    allowed = {times[name].nanoseconds: times[name] for name in known}
     lead: Lead | None = None
-    for (first, quickest), (last, _) in itertools.pairwise([*allowed, (math.inf, None)]):
+    for first, last in itertools.pairwise([*sorted(allowed), math.inf]):
         # Names are in the order of their cost.
         mine, other = (
             next(
@@ -204,7 +204,7 @@ def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) ->
                     name
                     for name in known
                     if ((name in learned) == (origin == "learned")) is own
-                    and (times[name].nanoseconds <= first if own else not is_quicker(quickest, times[name]))
+                    and (times[name].nanoseconds <= first if own else not is_quicker(allowed[first], times[name]))
                 ),
                 None,
             )
