@@ -204,7 +204,11 @@ def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) ->
                     name
                     for name in known
                     if ((name in learned) == (origin == "learned")) is own
-                    and (times[name].nanoseconds <= first if own else not is_quicker(allowed[first], times[name]))
+                    and (
+                        times[name].nanoseconds <= first
+                        if own
+                        else not is_quicker(allowed[first], times[name])
+                    )
                 ),
                 None,
             )
