@@ -29,7 +29,6 @@ class Update(NamedTuple):
 
 
 def _with_batch_axis(matrix: Array) -> Array:
-    """Return a matrix that is shared by the batch with a last axis of one."""
     return matrix[..., None] if matrix.ndim == 2 else matrix
 
 

@@ -30,7 +30,7 @@ TOGETHER = 8192
 
 
 class Scans(Sequence[Any]):
-    """Sequence of the scans of a track, each as arrays ``(..., N)`` made on first use.
+    """Sequence of the scans of a track, each a view of nested arrays made on first use, ``(..., N)``.
 
     Args:
         arrays: nested tuples of arrays ``(K, ..., N)``.
@@ -56,14 +56,14 @@ class Scans(Sequence[Any]):
 
 
 def stack_scans(scans: Sequence[Any]) -> Any:
-    """Return nested arrays ``(..., N)`` of each scan stacked along a time axis, ``(..., K, N)``."""
+    """Stack the nested arrays ``(..., N)`` of each scan along a time axis, ``(..., K, N)``."""
     if isinstance(scans, Scans):
         return map_nested(lambda values: numpy.moveaxis(values, 0, -2), scans.arrays)
     return map_nested(lambda *arrays: namespace(arrays[0]).stack(arrays, axis=-2), *scans)
 
 
 def join(stretches: Sequence[Any]) -> Any:
-    """Return nested arrays ``(..., scans, N)`` concatenated along the time axis."""
+    """Concatenate nested arrays ``(..., scans, N)`` along the time axis."""
     return map_nested(lambda *arrays: namespace(arrays[0]).concat(arrays, axis=-2), *stretches)
 
 
@@ -73,7 +73,7 @@ def take_scans(part: Any, scans: slice) -> Any:
 
 
 def over_time(function: Step, *parts: Any) -> Any:
-    """Return the results of a function at all scans of a track, from one call with the scans in the batch axis.
+    """Apply a function to all scans of a track in one call, with the scans in the batch axis.
 
     Args:
         function: function of nested arrays ``(..., N)`` that treats each episode separately.
@@ -88,7 +88,9 @@ def over_time(function: Step, *parts: Any) -> Any:
 
 
 def by_stretches(function: Step, *parts: Any) -> Callable[[slice], Any]:
-    """Return a function that calls :func:`over_time` for a slice of the scans of ``parts``."""
+    """Return a function of a slice of scans, which applies ``function`` to those scans of ``parts`` in one
+    call.
+    """
     return lambda stretch: over_time(function, *(take_scans(part, stretch) for part in parts))
 
 
@@ -98,7 +100,7 @@ def _flatten_time(values: Array) -> Array:
 
 
 def repeat(part: Any, last: tuple[int, int]) -> Any:
-    """Return nested arrays broadcast to these sizes of the last two axes, which may be one."""
+    """Broadcast the last two axes of nested arrays to the sizes ``last``."""
     return map_nested(
         lambda values: namespace(values).broadcast_to(values, (*values.shape[:-2], *last)), part
     )
@@ -169,7 +171,9 @@ def _scan(part: Any, place: int) -> Any:
 def _run_lagged(
     step: Step, track: Track, nothing_later: Callable[[slice], Carried], lag: int, scans: slice
 ) -> Carried:
-    """Return the carried values of some scans with a fixed lag, by ``lag`` steps of all these scans together."""
+    """Return carried values with a fixed lag, by ``lag`` steps in each of which all ``scans`` advance
+    together.
+    """
     last = min(scans.stop - 1 + lag, track.scans)  # of the scans that these depend on
     given, carried = track.given(slice(scans.start, last)), nothing_later(slice(scans.start, last + 1))
     end = take_scans(carried, slice(-1, None))

@@ -36,9 +36,8 @@ def _check(alpha: float, T: float) -> None:
 
 
 def acceleration_response(alpha: float, T: float) -> numpy.ndarray:
-    """Return position, velocity and acceleration after T of a unit acceleration at 0, ``(3,)``.
-
-    It is the last column of Phi.
+    """Return position, velocity and acceleration a time T after a unit acceleration, ``(3,)``: the last
+    column of Phi.
 
     Args:
         alpha: inverse correlation time of the acceleration, 1/s; 0 is a constant acceleration.
