@@ -63,7 +63,7 @@ def isolate_estimator(name: str) -> Program:
 
 
 def isolate_source(text: str, attribute: str, name: str, file: Path | None = None) -> Program:
-    """Return a program that runs the estimator class of a source text in a sandboxed process.
+    """Return a program that runs an estimator class, given as source text, in a sandboxed process.
 
     Args:
         text: source text of its module.
@@ -115,7 +115,7 @@ def _shared_modules() -> dict[str, str]:
 
 
 def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
-    """Yield the paths below a folder without forbidden ones; the folder itself if it contains none."""
+    """Yield the paths below a folder, as high as possible, that contain no forbidden path."""
     real = place.resolve()
     if not real.exists() or any(real.is_relative_to(other) for other in forbidden):
         return
@@ -127,5 +127,5 @@ def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
 
 
 def find_isolated(name: str, inner: str, problem: Any, find: Any) -> Competitor:
-    """Return the competitor for the name ``isolated:module:Class``."""
+    """Return the competitor named ``isolated:module:Class``, an estimator in a sandboxed process."""
     return Competitor(name, isolate_estimator(inner))

@@ -43,9 +43,8 @@ if TYPE_CHECKING:
 
 
 def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> str:
-    """Return the name of the control (the quantity that actions change) in which a competitor runs.
-
-    It is the policy's own, or one whose spaces fit those of a learned model.
+    """Return the control in which a competitor runs: a policy's own, or the first whose spaces fit a learned
+    model.
 
     Args:
         maker: maker of the competitor, or the competitor itself.
@@ -81,7 +80,7 @@ def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> s
 
 
 def check_observation(model: Model, policy: Any, name: str) -> None:
-    """Raise ValueError if a learned policy expects observations of another shape, or privileged ones."""
+    """Raise ValueError if a learned policy expects observations of another shape, or privileged ones (truth)."""
     space = getattr(policy, "observation_space", None)
     if isinstance(space, gymnasium.spaces.Dict):
         raise ValueError(
@@ -150,13 +149,12 @@ class Experiment:
         return _experiment_on, (importable_name(self.task), others)
 
     def make_task(self) -> Task:
-        """Return the task of the environment, with the scenario and the parameters."""
+        """Make the environment's task, with the scenario and the parameters."""
         return make_task(self.task, self.scenario, **self.keywords)
 
     def make_model(self, maker: Any, control: str) -> Model:
-        """Return the model (task, bank and control) in which a competitor runs.
-
-        The experiment's keywords override those that the competitor was tuned with.
+        """Make the model (task, bank and control) in which a competitor runs, with its own and the
+        experiment's keywords.
         """
         keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
         return make_model(
@@ -165,7 +163,7 @@ class Experiment:
 
 
 def _experiment_on(name: str, others: Mapping[str, Any]) -> Experiment:
-    """Return an experiment on the environment of this name, from the other fields; for unpickling."""
+    """Make an experiment on the environment of this name, when it is unpickled."""
     return Experiment(task_class(name), **others)
 
 
@@ -217,7 +215,7 @@ def run_competitors(
     progress: Progress | None = None,
     workers: Workers | None = None,
 ) -> "xarray.Dataset":
-    """Return the dataset of :func:`run_experiment`, without its note on intervals of a single episode."""
+    """Run competitors as :func:`run_experiment`, without its note on intervals of a single episode."""
     if progress is not None and not callable(progress):
         raise ValueError(
             f"progress must be a function of the number of measurements done, got {quote_shortened(progress)}"
@@ -243,7 +241,7 @@ def run_competitors(
 
 
 class Piece(NamedTuple):
-    """Some episodes of one competitor as a unit of parallel work: plain data for any process."""
+    """Some episodes of one competitor as a unit of parallel work, which another process can run."""
 
     experiment: Experiment
     name: str
@@ -268,7 +266,9 @@ LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 
 
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
-    """Run some episodes of one competitor; return its values at all measurements by name, ``(episodes, time, ...)``."""
+    """Run some episodes of one competitor; return the values at all measurements by name, ``(episodes, time,
+    ...)``.
+    """
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
     kept, drawn = StoredValues(experiment.tracks), None
@@ -306,7 +306,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
 
 
 def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
-    """Raise ValueError if a task records a value under the name ``action`` or ``lost``."""
+    """Raise ValueError if a task records a value under a reserved name, ``action`` or ``lost``."""
     for taken in {"action", "lost"} & found.keys():
         raise ValueError(
             f"{model.task.id} records a value named {taken!r}, a name that an evaluation uses for "
@@ -315,7 +315,7 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
 
 
 class Plan(NamedTuple):
-    """Prepared evaluation: its episodes and models, from checked arguments."""
+    """Prepared evaluation with checked arguments: its episodes, and the model of every competitor."""
 
     experiment: Experiment
     """The experiment; its scenario is read from files."""
@@ -332,7 +332,7 @@ class Plan(NamedTuple):
     lengths: numpy.ndarray | None
 
     def piece(self, name: str, first: int, count: int, here: bool) -> Piece:
-        """Return some episodes of a competitor as a unit of parallel work; ``here``: with its model."""
+        """Return some episodes of a competitor as a unit of work; ``here``: with its model, for this process."""
         model = self.models[name]
         return Piece(
             self.experiment,
@@ -347,12 +347,12 @@ class Plan(NamedTuple):
         )
 
     def time(self, name: str) -> ProcessorTime | None:
-        """Return the measured processor time of a competitor, see :func:`.rollout.measure_time`."""
+        """Measure the processor time of a competitor for a measurement, see :func:`.rollout.measure_time`."""
         with report_running(name, timed=False):
             return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
     def arrays(self, episodes: int, drawn: int) -> StackedArrays:
-        """Return preallocated arrays for the values of all competitors in some episodes."""
+        """Return preallocated arrays for all competitors' values in some episodes."""
         acting = [
             name
             for name, model in self.models.items()
@@ -361,7 +361,7 @@ class Plan(NamedTuple):
         return StackedArrays(self.models, acting, episodes, drawn)
 
     def dataset(self, arrays: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
-        """Return the dataset of an evaluation from the arrays of values and the seeds of their episodes."""
+        """Return the dataset of an evaluation from its arrays and the seeds of the episodes."""
         experiment = self.experiment
         dataset = with_named_axes(arrays, self.kinds, self.models, self.scenario.windows, seeds)
         if self.flight_numbers is not None and self.lengths is not None:
@@ -397,9 +397,7 @@ class Plan(NamedTuple):
 def plan_of(
     experiment: Experiment, competitors: Mapping[str, Any], first: int = 0, end: int | None = None
 ) -> Plan:
-    """Check the arguments of an evaluation; return its episodes, models and kinds of competitors.
-
-    Errors as of :func:`run_experiment`.
+    """Check the arguments of an evaluation; return its episodes, and each competitor's model and kind.
 
     Args:
         experiment: the episodes and options.
@@ -460,12 +458,7 @@ def plan_of(
 
 
 def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
-    """Raise ValueError for a task or competitor that another process cannot import or unpickle.
-
-    Args:
-        task: task class of the environment.
-        competitors: competitors by name.
-    """
+    """Raise ValueError for a task or competitor that cannot be imported or unpickled in another process."""
     if importable_name(task).startswith("__main__:"):
         raise ValueError(
             f"{task.id} is registered by the running program, which other processes do "
@@ -483,7 +476,7 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
 def _flights_in_turn(
     model: Model, split: str, seed: int, episodes: int
 ) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
-    """Return seeds, flight numbers and lengths of episodes that fly each flight equally often, at least once."""
+    """Return seeds, flight numbers and lengths of episodes that fly each flight equally often."""
     count = len(model.task.flights)
     share = -(-episodes // count)
     found: list[int] = []

@@ -11,7 +11,7 @@ Stored = TypeVar("Stored")
 
 
 def read_json(path: Path) -> Any:
-    """Return the contents of a JSON file, as Python values.
+    """Read a JSON file, with checks of its size and nesting; return Python values.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -26,7 +26,7 @@ def read_json(path: Path) -> Any:
 
 
 def restore(cls: type[Stored], values: Any) -> Stored:
-    """Make a dataclass or named tuple from a dictionary of its fields, with a check of their types.
+    """Make a dataclass or named tuple from a dictionary of its fields, whose types are checked.
 
     Raises:
         ValueError: if a field is missing, unknown, or not of its declared type.
