@@ -5,9 +5,8 @@ long as the sum is positive (Page's cumulative sum, 1954); the alarm sounds wher
 fault a sum with limit h reaches it once in exp(h) decisions or less (Lorden, 1971), so the limit follows from the
 tolerated number of false alarms.
 
-Signs of a fault are innovations that are larger than a filter expects, smaller, or to one side, and a reading that
-repeats itself. A missing measurement counts as a sign where the filter does not model it, as with fixed gains; a Kalman
-filter only predicts then.
+Signs of a fault are innovations that are larger than expected, smaller, or to one side, and a reading that
+repeats itself. A missing measurement counts where the filter does not model it, as with fixed gains.
 
 An environment names its alarm in ``Baselines.alarm``; the default is :class:`InnovationAlarm`.
 """
@@ -31,7 +30,8 @@ CERTAIN = math.inf
 
 
 def scale_ratio(squares: Any, degrees: Any, factor: float) -> Any:
-    """Return the log-likelihood ratio of innovations whose variance is ``factor`` times the expected one.
+    """Return the log-likelihood ratio of innovations with ``factor`` times the expected variance to the
+    expected one.
 
     Args:
         squares: normalised innovation squared, chi-square without a fault.
@@ -47,7 +47,8 @@ def shift_ratio(normalised: Any, mean: float) -> Any:
 
 
 def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
-    """Return the log-likelihood ratios of innovations that are larger, smaller, or to one side, ``(N, 4 C)``.
+    """Return log-likelihood ratios of too large, too small and shifted innovations to expected ones, ``(N, 4
+    C)``.
 
     Args:
         normalised: innovations over their predicted deviation, ``(N, C)``.
@@ -59,7 +60,7 @@ def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> nump
 
 
 def fault_evidence(wrong: numpy.ndarray) -> numpy.ndarray:
-    """Return the log-likelihood ratio ``(N, 1)``: ``CERTAIN`` where ``wrong`` ``(N,)`` is true, else zero."""
+    """Return ``CERTAIN`` as log-likelihood ratio where ``wrong`` ``(N,)`` is true, else zero, ``(N, 1)``."""
     return numpy.where(wrong, CERTAIN, 0.0)[:, None]
 
 
@@ -73,7 +74,7 @@ class Sums(NamedTuple):
 
 
 class Alarm:
-    """Base of the alarms: subclasses compute the evidence of a fault.
+    """Base of the alarms, by cumulative sums; subclasses compute the evidence of each kind of fault.
 
     Args:
         model: model whose observations it receives.
@@ -109,15 +110,13 @@ class Alarm:
     def update(
         self, observation: numpy.ndarray, memory: Sums | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, Sums]:
-        """Update the cumulative sums with an observation; return which lanes have a fault, and the memory.
+        """Update the cumulative sums with an observation; return a mask ``(N,)`` of episodes with a fault,
+        and the memory.
 
         Args:
             observation: ``(N, fields)``.
             memory: memory that the last call returned; None at the first.
             start: true where an episode begins, ``(N,)``.
-
-        Returns:
-            Whether there is a fault, booleans ``(N,)``, and memory.
         """
         before = numpy.full_like(observation, math.nan) if memory is None else memory.observation
         evidence = self.evidence(observation, numpy.where(start[:, None], math.nan, before))

@@ -78,7 +78,7 @@ class Artefact(NamedTuple):
 
 
 def log_setup(problem: Problem, recording: Any) -> LogSetup:
-    """Return the options with which a recording was read, to read such a log again."""
+    """Return the options with which a recording was read, so that such a log can be read again."""
     parameters = recording.scenario(problem.task, {}).parameters
     left_out = "horizon", "decision_interval"
     deviations, source = dict(recording.deviations), recording.deviations_from
@@ -160,11 +160,7 @@ def write_advised(
 
 
 def read_artefact(path: Path, problem: Problem) -> Artefact:
-    """Return the content of an advised filter's file.
-
-    Args:
-        path: path of a file of :func:`write_advised`.
-        problem: problem in which it is to run.
+    """Read the file of an advised filter.
 
     Raises:
         ValueError: if the file cannot be read, or is of another environment or no filter of it.
@@ -186,7 +182,7 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
 
 
 def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
-    """Return the validated options for reading the log from a file's entry; None without one."""
+    """Validate the log options in a file's entry; None without an entry."""
     if log is None:
         return None
     kinds = {
@@ -227,7 +223,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
 
 
 def _is_place(origin: Mapping[str, float]) -> bool:
-    """Return whether an origin has a valid latitude and longitude, and a height near the Earth."""
+    """Return whether an origin has a valid latitude, longitude and height."""
     largest = {"latitude": 90.0, "longitude": 360.0, "altitude": 1e6}
     return origin.keys() == largest.keys() and all(abs(origin[key]) <= most for key, most in largest.items())
 

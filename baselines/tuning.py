@@ -1,4 +1,4 @@
-"""Tuning of classical competitors on training episodes, so that learned agents are compared with tuned ones.
+"""Tuning of classical competitors on training episodes.
 
 The search is SciPy's differential evolution over the limits that a policy declares, started from its untuned
 values; every candidate runs on the same episodes of the training split, so differences are not noise. Costs are
@@ -59,7 +59,7 @@ class Candidate(NamedTuple):
 
 
 def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
-    """Return the cost of every episode for the search, ``(episodes,)``: its mean cost, or (1) with likelihood."""
+    """Run a candidate; return the cost of every episode for the search, ``(episodes,)``: mean cost, or (1)."""
     keywords, make = candidate.tunable.apply(candidate.values)
     cls, control = candidate.problem.task, candidate.tunable.control
     model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
@@ -88,8 +88,8 @@ def geometric_cost(costs: numpy.ndarray) -> float:
 
 
 def is_better(costs: numpy.ndarray, others: numpy.ndarray) -> bool:
-    """Return whether costs are significantly lower than others on the same episodes, by the geometric mean of their
-    ratios.
+    """Return whether costs are significantly lower than others, by the geometric mean of their ratios by
+    episode.
     """
     return Bootstrap(len(costs)).estimate(numpy.log(costs / others)).high < 0.0
 
@@ -118,7 +118,7 @@ class _Generations:
     Args:
         tunable: declaration of the searched values.
         allowed: number of candidates within the budget.
-        measure: returns the cost of a candidate's values.
+        measure: function from a candidate's values to its cost.
     """
 
     def __init__(
@@ -129,7 +129,9 @@ class _Generations:
         self.best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
 
     def cost(self, vector: numpy.ndarray) -> float:
-        """Return the cost of a vector of candidate values; infinite when the search's budget is spent."""
+        """Return the cost of a vector of candidate values, and remember the best; infinite when the budget is
+        spent.
+        """
         if self.spent >= self.allowed:
             return math.inf
         values = dict(zip(self.tunable.limits, map(float, vector), strict=True))
@@ -139,7 +141,7 @@ class _Generations:
         return cost
 
     def run(self, population: int, generator: numpy.random.Generator) -> dict[str, float]:
-        """Run differential evolution from a population until the budget is spent; return the best vector."""
+        """Run differential evolution from a population until the budget is spent; return the best values."""
         from scipy.optimize import differential_evolution
 
         limits = list(self.tunable.limits.values())
@@ -160,11 +162,7 @@ class _Generations:
 
 
 def _scenario(problem: Problem, name: str | None) -> Scenario:
-    """Return the scenario of a search by its name; None: the default one.
-
-    Raises:
-        ValueError: if it is held out.
-    """
+    """Return the scenario of a search by its name; raise ValueError for a held-out one."""
     chosen = find_scenario(problem.task, name)
     if not chosen.training:
         allowed = [s.name for s in problem.task.scenarios.values() if s.training]
@@ -182,19 +180,16 @@ def tune(
     workers: Workers | None = None,
     store: Store | None = None,
 ) -> Tuned:
-    """Search the values of a policy or estimator on training episodes, and return the best ones.
+    """Search the values of a policy or estimator on training episodes; return the best ones.
 
     Args:
         problem: problem of the policy.
         policy: name of a tunable policy or estimator.
         search: options of the search.
-        progress: function that is called with the number of environment steps done.
-        workers: processes that share the episodes of a candidate; candidates run one after another, since the search
-            uses the results of each. Default: this process.
-        store: storage for the costs of candidates until the search has ended, so that a second call continues an
-            interrupted
-            search: it evaluates the same candidates. Costs of a user's environment are not stored, since its code may
-            have changed. Default: no costs are stored.
+        progress: function called with the number of environment steps done.
+        workers: processes for the episodes of a candidate; candidates run one after another.
+        store: storage of candidates' costs, with which a second call continues an interrupted search; not
+            used for a user's environment.
 
     Raises:
         ValueError: for a policy that cannot be tuned, a held-out scenario, a budget too small for one generation, or a
@@ -245,7 +240,7 @@ def tune(
 
 
 def _search_content(problem: Problem, search: Search, tunable: Tunable, scenario: Scenario) -> list[Any]:
-    """Return what determines a candidate's cost beside values and code, as the key of stored costs."""
+    """Return all that determines a candidate's cost beside values and code, as the key of stored costs."""
     limited = {name: list(limit) for name, limit in tunable.limits.items()}
     how = [search.seed, search.episodes, search.backend, tunable.likelihood]
     return [problem.id, scenario.name, limited, dict(tunable.start), *how]

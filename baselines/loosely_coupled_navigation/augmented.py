@@ -1,10 +1,7 @@
 """The augmented filter of LooselyCoupledNavigation with receiver noise as reported, or estimated.
 
-A policy under ``gain`` runs it in parallel with the plain scheme; an estimator reports it.
-
-The receiver may not report a change. So the noise is estimated from the innovations, starting from the reported
-variance; the estimate restarts when the report changes. One receiver measures all axes: an innovation is the root of
-their mean square.
+The noise is estimated from the innovations (root of the mean square of all axes), starting from the reported
+variance; the estimate restarts when the report changes.
 """
 
 from collections.abc import Iterable
@@ -29,7 +26,8 @@ LIMITS = {"mehra": {"window": (5.0, WINDOW, 150.0)}, "sage-husa": _FADING, "vari
 def with_rules(
     host: type, name: str, description: str, rules: Iterable[str] = RULES
 ) -> tuple[dict[str, Variant], dict[str, Tunable]]:
-    """Return variants of a policy or estimator with each rule for the receiver's noise, and their tunable values.
+    """Return variants of a policy or estimator with each rule for the receiver's noise, and what can be tuned
+    of them.
 
     Args:
         host: its class, which takes the task, a rule, and the arguments of the rule.
@@ -65,8 +63,8 @@ class AugmentedMemory(NamedTuple):
 
 
 class AugmentedFilter:
-    """The augmented filter (INS error with drift and coloured rate error) without the position, which the caller
-    stores.
+    """Augmented filter of the INS error (position, drift, coloured rate error); the caller stores the
+    position.
 
     Args:
         parameters: parameters of the task.
@@ -81,13 +79,15 @@ class AugmentedFilter:
         """Return the filter's memory at the start of the track: zero errors with the prior covariance.
 
         Args:
-            none: zeros, ``(A, N)``.
+            none: zeros of the shape of a position, ``(A, N)``.
         """
         p, zero = self.parameters, none[0]
         return AugmentedMemory(none, none, p.prior_covariance(zero), zero, self.noise.start(zero), zero)
 
     def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
-        """Return the displacement by the estimated rate errors in a step, m, ``(A, N)``, and the predicted memory."""
+        """Predict over a step; return the displacement by the estimated rate errors, m, ``(A, N)``, and the
+        memory.
+        """
         p, s = self.parameters, self.parameters.sampling
         P = ins_gnss.predict_augmented(memory.covariance, s, *p.variance_growth)
         displacement = s.step * memory.drift + s.drive * memory.coloured
@@ -96,7 +96,7 @@ class AugmentedFilter:
     def update(
         self, memory: AugmentedMemory, innovation: Array, reported: Array, available: Array
     ) -> tuple[Array, AugmentedMemory]:
-        """Return the correction of the position by a measurement, m, ``(A, N)``, and the updated memory.
+        """Update with a measurement; return the correction of the position, m, ``(A, N)``, and the memory.
 
         Args:
             memory: memory after :meth:`predict`.

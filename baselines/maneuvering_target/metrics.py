@@ -36,7 +36,8 @@ def gospa(distance: numpy.ndarray, cutoff: float = CUTOFF) -> numpy.ndarray:
 
 
 def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
-    """Return the index of the first of ``LASTING`` scans in a row beyond ``CUTOFF``, ``(episodes,)``; -1 without any.
+    """Return the first of ``LASTING`` scans in a row with an error beyond ``CUTOFF``, ``(episodes,)``; -1
+    without.
 
     Args:
         distance: distance between target and track, m, ``(episodes, time)``.
@@ -50,7 +51,7 @@ def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics, by name; empty without clutter and for a bound."""
+    """Return each episode's terms of the metrics in clutter, by name; empty without clutter and for a bound."""
     if "false_association" not in run or str(run["kind"].values) == "bound":
         return MetricInputs()
     distance = numpy.sqrt(squared_errors(run, "position", groups_of(run)))

@@ -1,7 +1,6 @@
 """Smoothers of ManeuveringTarget: its Kalman filters with later scans.
 
-They are not causal. Their forward passes are those estimators, so that with lag zero they return the same estimates;
-for scans that missed the target they only predict, backward too.
+Their forward passes are those estimators; with lag zero they return the same estimates.
 """
 
 from collections.abc import Sequence
@@ -44,7 +43,9 @@ class ConstantVelocitySmoother(ConstantVelocity):
     def smooth(
         self, measurements: Sequence[Measurement], states: Sequence[EstimateState]
     ) -> tuple[Array, Array]:
-        """Return means and covariances of the whole track, smoothed with all later scans or those within the lag."""
+        """Return means ``(4, K, N)`` and covariances of a track, smoothed with all later scans or those within
+        the lag.
+        """
         filtered = smoothing.Gaussian(*scans.stack_scans(states)[:2])
         motion = scans.by_stretches(self._motion, filtered.mean, scans.stack_scans(measurements))
         smoothed = smoothing.smooth(filtered, motion, self.lag)
@@ -67,7 +68,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         self.lag = lag
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """Return transition and process noise of every filter over intervals.
+        """Return transition and process noise of every filter over intervals, and the predicted means.
 
         Args:
             mixed: mean from which each filter starts, ``(n, M, N)``.
@@ -95,7 +96,9 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
     def smooth(
         self, measurements: Sequence[Measurement], states: Sequence[KalmanMixture]
     ) -> tuple[Array, Array]:
-        """Return means and covariances of the whole track, smoothed with all later scans or those within the lag."""
+        """Return means ``(4, K, N)`` and covariances of a track, smoothed with all later scans or those within
+        the lag.
+        """
         filtered = smoothing.GaussianMixture(*scans.stack_scans(states)[3:])
         arrival = scans.by_stretches(self._arrival, filtered, scans.stack_scans(measurements))
 
@@ -120,7 +123,9 @@ class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleMode
     """
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """Return transition and process noise of every filter; arguments of :meth:`KalmanIMMSmoother.motions`."""
+        """Return transition, process noise and predicted mean of every filter; see
+        :meth:`KalmanIMMSmoother.motions`.
+        """
         xp = self.xp
         F, unit = self.motion(T)
         nothing = 0.0 * unit[0]

@@ -25,18 +25,13 @@ LASTING = 10
 
 
 def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -> IntervalEstimate:
-    """Return the mean of values over the mean of counts, over episodes, with its interval."""
+    """Return ``mean(values) / mean(counts)`` over episodes with its interval."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
 
 
 def find_lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
-    """Return a boolean mask of the times at which a condition begins to hold for ``steps`` steps in a row.
-
-    Args:
-        condition: ``(episodes, time)`` booleans.
-        steps: number of steps.
-    """
+    """Return a mask of the times from which on a condition holds for ``steps`` steps in a row."""
     sums = numpy.cumsum(numpy.pad(condition, ((0, 0), (1, 0))), axis=1)
     held = numpy.zeros_like(condition)
     if condition.shape[1] >= steps:
@@ -55,7 +50,7 @@ class Switch(NamedTuple):
 
 
 def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switch]:
-    """Return every change of the true hypothesis, with the bank's delay in following it.
+    """Find every change of the true hypothesis, and the bank's delay in following it.
 
     The delay ends at the first step from which the probability of the new hypothesis exceeds one half for
     ``LASTING`` steps (or until the next change, if that comes sooner).
@@ -130,12 +125,7 @@ def _integrity(run: "xarray.Dataset") -> Arrays:
 
 
 def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarray:
-    """Return a boolean mask of the steps at which the NIS, summed over the last ``TESTED`` steps, exceeds its limit.
-
-    Args:
-        nis: normalised innovation squared, ``(episodes, time)``.
-        degrees: its degrees of freedom, ``(episodes, time)``.
-    """
+    """Return a mask of the steps at which the NIS, summed over the last ``TESTED`` steps, exceeds its limit."""
 
     def summed(values: numpy.ndarray) -> numpy.ndarray:
         sums = numpy.cumsum(numpy.pad(values, ((0, 0), (TESTED, 0))), axis=1)
@@ -146,7 +136,7 @@ def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarra
 
 
 def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Arrays:
-    """Return each episode's false alarms, and whether and when its first fault is detected, by name."""
+    """Return each episode's share of false alarms, and whether and when its first fault is detected, by name."""
     fault, first = numpy.logical_or.reduce(fails, axis=1), fails.argmax(axis=1)
     steps, length = numpy.arange(alarm.shape[1]), alarm.shape[1]
     # A fault has effects after its end: only alarms before the first fault are false.
@@ -165,11 +155,7 @@ def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Array
 
 
 def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
-    """Return counts of changes, of missed ones, and summed delays, s, from and to each hypothesis.
-
-    Returns:
-        ``(episodes, M, M, 3)``.
-    """
+    """Count changes, missed ones and summed delays, s, from and to each hypothesis, ``(episodes, M, M, 3)``."""
     found = numpy.zeros((episodes, len(HYPOTHESES), len(HYPOTHESES), 3))
     for s in changes:
         seen = math.isfinite(s.wait)

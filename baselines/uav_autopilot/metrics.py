@@ -1,4 +1,4 @@
-"""Metrics of the loop of UavAutopilot, in addition to those of the estimate."""
+"""Metrics of UavAutopilot's control loop, such as output variance and detection of raised noise."""
 
 import math
 from collections.abc import Mapping
@@ -62,12 +62,11 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: numpy.ndarray) -> numpy.ndarray:
-    """Return each episode's results ``(episodes, 6)`` of a test that detects raised noise from innovations.
+    """Test each episode for raised noise by its innovations; return the results ``(episodes, 6)``.
 
-    The alarm is Page's cumulative sum of the log-likelihood ratio of innovations with ``LARGER`` times their variance
-    (E. S. Page, Continuous inspection schemes, Biometrika 41 (1954), 100-115), its limit by G. Lorden, Annals of
-    Mathematical Statistics 42 (1971), 1897-1908, as in :mod:`..alarm`. The onset is the first time that noise is raised
-    in an episode that does not begin with raised noise.
+    The alarm is Page's cumulative sum of the log-likelihood ratio of innovations with ``LARGER`` times their
+    variance (E. S. Page, Continuous inspection schemes, Biometrika 41 (1954), 100-115), its limit by G.
+    Lorden, Annals of Mathematical Statistics 42 (1971), 1897-1908, as in :mod:`..alarm`.
 
     Args:
         nis: normalised innovation squared, NaN where no reading was received, ``(episodes, time)``.
@@ -167,7 +166,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
 
 
 def _variance(averaged: Arrays, of: str, episodes: int) -> numpy.ndarray:
-    """Return the unbiased variance across episodes at each time, of the data and of every bootstrap resample."""
+    """Return the unbiased variance over episodes at each time, in the data and in every bootstrap resample."""
     biased = averaged[f"{of}_square"] - averaged[of] ** 2
     return numpy.asarray(biased * (episodes / max(episodes - 1, 1)))
 

@@ -18,7 +18,7 @@ class Stationary(NamedTuple):
 
 
 def stationary(task: UavAutopilot, name: str) -> Stationary | None:
-    """Return cost and variances of a policy's or reference's steady-state loop, by the Lyapunov equation; or None.
+    """Return cost and variances of a policy's or reference's steady-state loop, by the Lyapunov equation.
 
     Returns:
         None where the loop is not linear with constant coefficients (levels that change, dropouts, actions

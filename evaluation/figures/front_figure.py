@@ -51,14 +51,14 @@ class FrontPanel(NamedTuple):
 
     @property
     def top(self) -> float:
-        """Upper limit of the cost axis, relative to the paper's algorithm, %."""
+        """Highest cost that is drawn, relative to the paper's algorithm, %."""
         ranked = [point for point in self.points if point.kind in RANKED or point.name == self.reference]
         usual = min(max((point.cost for point in ranked), default=0.0), _percent(MOST_ABOVE))
         return max([usual, *(point.cost for point in ranked if point.name in self.own)])
 
     @property
     def beyond(self) -> list[Point]:
-        """Ranked competitors whose cost is above the upper limit of the axis."""
+        """Ranked competitors whose cost is too high to be drawn."""
         return [point for point in self.points if point.kind in RANKED and point.cost > self.top]
 
 
