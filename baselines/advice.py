@@ -197,12 +197,7 @@ class Anchor(NamedTuple):
 
 
 class Prices(Mapping[str, Mapping[str, int] | None]):
-    """Costs of an update of each competitor, computed at first use; None where the cost is unknown.
-
-    Args:
-        makers: competitors by name.
-        price_of: function from name and maker to the costs of an update: ``operations`` and further measures.
-    """
+    """Costs of an update of each competitor, by name, computed at first use; None where the cost is unknown."""
 
     def __init__(
         self, makers: Mapping[str, Any], price_of: Callable[[str, Any], Mapping[str, int] | None]

@@ -49,10 +49,6 @@ def shift_ratio(normalised: Any, mean: float) -> Any:
 def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
     """Return log-likelihood ratios of too large, too small and shifted innovations to expected ones, ``(N, 4
     C)``.
-
-    Args:
-        normalised: innovations over their predicted deviation, ``(N, C)``.
-        there: whether each innovation exists; the value of a missing one is ignored.
     """
     ratios = [scale_ratio(normalised**2, 1.0, factor) for factor in (LARGER, SMALLER)]
     ratios += [shift_ratio(normalised, mean) for mean in (SHIFT, -SHIFT)]
@@ -74,11 +70,7 @@ class Sums(NamedTuple):
 
 
 class Alarm:
-    """Base of the alarms, by cumulative sums; subclasses compute the evidence of each kind of fault.
-
-    Args:
-        model: model whose observations it receives.
-    """
+    """Base of the alarms, by cumulative sums; subclasses compute the evidence of each kind of fault."""
 
     window: ClassVar[int] = 30
     """Decisions for which an alarm remains relevant: the memory of the disturbed filters."""
@@ -91,19 +83,15 @@ class Alarm:
         self.decisions: int = max(self.task.horizon // self.task.decision_interval, 1)
 
     def measurements(self, before: numpy.ndarray) -> numpy.ndarray:
-        """Return the number of measurements since the last observation, ``(N, 1)``; one at the start.
-
-        Args:
-            before: the last observation, ``(N, fields)``; NaN where an episode begins.
+        """Return the number of measurements since the last observation ``before``, ``(N, 1)``; one at the
+        start.
         """
         return numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Return the log-likelihood ratio of each kind of fault to no fault, ``(N, kinds)``.
 
-        Args:
-            observation: ``(N, fields)``.
-            before: the last observation; NaN where an episode begins.
+        ``before`` is the last observation; NaN where an episode begins.
         """
         raise NotImplementedError
 
@@ -112,11 +100,6 @@ class Alarm:
     ) -> tuple[numpy.ndarray, Sums]:
         """Update the cumulative sums with an observation; return a mask ``(N,)`` of episodes with a fault,
         and the memory.
-
-        Args:
-            observation: ``(N, fields)``.
-            memory: memory that the last call returned; None at the first.
-            start: true where an episode begins, ``(N,)``.
         """
         before = numpy.full_like(observation, math.nan) if memory is None else memory.observation
         evidence = self.evidence(observation, numpy.where(start[:, None], math.nan, before))

@@ -50,10 +50,6 @@ def _declared_baselines(task: type[Task]) -> Baselines:
 def add_baselines(task: type[Task], table: Baselines) -> None:
     """Register the baselines of a user's environment, after a check of their names.
 
-    Args:
-        task: class of the environment's task.
-        table: its baselines.
-
     Raises:
         ValueError: if the table refers to an unknown name.
     """

@@ -28,12 +28,7 @@ MOST_MEASUREMENTS = 100_000
 
 
 def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
-    """Return the filter families of an environment that can be fitted to a recording, by name.
-
-    Args:
-        problem: problem of the filters.
-        recording: recording that sets the limits of the parameters; None: those of a typical recording.
-    """
+    """Return the filter families of an environment that can be fitted to a recording, by name."""
     known = problem.baselines
     if known.log_families is not None:
         return dict(known.log_families(recording))
@@ -223,7 +218,6 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
 
 
 def _is_place(origin: Mapping[str, float]) -> bool:
-    """Return whether an origin has a valid latitude, longitude and height."""
     largest = {"latitude": 90.0, "longitude": 360.0, "altitude": 1e6}
     return origin.keys() == largest.keys() and all(abs(origin[key]) <= most for key, most in largest.items())
 

@@ -92,13 +92,7 @@ class Fit(NamedTuple):
 
 
 class ScaledNoise(Filter[Task, Any, Any]):
-    """A filter run with scaled deviations of measurements; its state is the inner filter's.
-
-    Args:
-        own: the filter.
-        scaled: function of a measurement and a factor that multiplies the stated deviations by it.
-        factor: a number, or ``(N,)``.
-    """
+    """A filter run with scaled deviations of measurements; its state is the inner filter's."""
 
     def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], factor: Any) -> None:
         super().__init__(own.task)
@@ -162,13 +156,7 @@ class RobustState(NamedTuple):
 
 
 class RobustEstimator(Filter[Task, Any, RobustState]):
-    """A filter that treats every measurement either as stated or as an outlier, whichever is likelier.
-
-    Args:
-        own: the filter, which reports the log-likelihood.
-        scaled: function of a measurement and a factor that multiplies the stated deviations by it.
-        share: share of outliers, a number, or ``(N,)``.
-    """
+    """A filter that treats every measurement either as stated or as an outlier, whichever is likelier."""
 
     def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], share: Any) -> None:
         super().__init__(own.task)
@@ -235,14 +223,7 @@ def with_outliers(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tunable
 
 
 def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: int = STARTS) -> Fit:
-    """Fit the parameters of an estimator by maximum likelihood, the best of several starts.
-
-    Args:
-        likelihood: likelihood of the tunable's parameters.
-        tunable: the estimator, with limits.
-        seed: seed of the starts.
-        starts: number of starts.
-    """
+    """Fit the parameters of an estimator by maximum likelihood, the best of several starts."""
     ends = _find_maxima(likelihood, tunable, seed, starts)
     values = [-likelihood.count * float(end.fun) for end in ends]
     best = int(numpy.argmax(values))
@@ -254,12 +235,6 @@ def fit_stretches(
 ) -> Fit:
     """Fit parameters to stretches of a long recording; return the search's end that is likeliest on the
     whole.
-
-    Args:
-        likelihood: likelihood of the stretches.
-        tunable: the estimator, with limits.
-        whole: the likelihood of the whole.
-        seed: seed of the starts.
     """
     ends = _find_maxima(likelihood, tunable, seed, STARTS)
     values = whole(numpy.array([end.x for end in ends]).T).tolist()

@@ -284,14 +284,7 @@ def score_log(
     roles: Roles,
     tick: Callable[[float], None] = lambda share: None,
 ) -> LogScores:
-    """Run competitors over a log; return the sums of their likelihoods and errors.
-
-    Args:
-        experiment: experiment on the recording.
-        competitors: makers by name.
-        roles: roles of the measurements of the recording.
-        tick: function that is called with the share of the work done.
-    """
+    """Run competitors over a log; return the sums of their likelihoods and errors."""
     with numpy.errstate(all="ignore"):  # a diverging filter is judged by its numbers
         plan = plan_of(experiment, competitors)
         scores, runs = LogScores(plan, roles), _start_runs(plan, report_scores)

@@ -54,16 +54,7 @@ def judge_onboard(
     makers: Mapping[str, Any],
     track: OnboardTrack,
 ) -> OnboardJudgement | None:
-    """Compare a vehicle's own filter with others on withheld fixes; None without its estimates at them.
-
-    Args:
-        problem: problem of the recording.
-        recording: positions in metres around its origin.
-        keywords: parameters of the task.
-        share: spans of its measurements for fit, choice and judgement.
-        makers: competitors by name, the advised one first.
-        track: estimates of the vehicle's own filter.
-    """
+    """Compare a vehicle's own filter with others on withheld fixes; None without its estimates at them."""
     times = recording.log_time
     if not recording.origin or times is None or times.dtype.kind != "f":
         return None

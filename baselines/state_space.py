@@ -162,7 +162,6 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
     """The Kalman filter of the user's model, extended where it is not linear, as an estimator.
 
     Args:
-        task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
         **noises: factors on some sources of Q, and on R of some sensors, by their names with ``_noise``.
@@ -217,7 +216,6 @@ class ExtendedSmoother(Extended):
     """The Kalman filter of the user's model, smoothed with all later measurements (Rauch, Tung and Striebel 1965).
 
     Args:
-        task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
         lag: number of later measurements that each estimate uses; default: all of them.
@@ -255,11 +253,6 @@ class ExtendedSmoother(Extended):
     def _filter_in_order(self, settled: EstimateState, measured: StateSpaceMeasurement) -> EstimateState:
         """Filter a track again with late values in their places; return the estimates at start and
         measurements.
-
-        Args:
-            settled: estimates ``lateness`` measurements before the start and before each measurement, ``(...,
-                K + 1, N)``.
-            measured: measurements in order, ``(..., K, N)``.
         """
         K = measured.available.shape[-2]
         known = max(K - self.task.parameters.lateness, 0)

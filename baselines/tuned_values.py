@@ -109,11 +109,7 @@ class TunedValues:
         return min(found, key=lambda name: found[name], default=None)
 
     def values(self, policy: str) -> tuple[dict[str, float], str]:
-        """Return the stored values of a policy by name, and the path of their file.
-
-        Raises:
-            ValueError: if the policy was never tuned, or its file is broken.
-        """
+        """Return the stored values of a policy by name, and the path of their file."""
         for place, table in self._tables():
             if policy in table:
                 return self._check(table[policy].get("values"), policy, place), str(place)
@@ -164,13 +160,7 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
 
 
 def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) -> TunedPolicy:
-    """Return the maker of a policy or estimator with these values.
-
-    Args:
-        name: name of environment and policy; the same name means the same code.
-        tunable: declaration of the values.
-        values: values by name.
-    """
+    """Return the maker of a policy or estimator with these values."""
     keywords, make = tunable.apply(values)
     content = f"{name} {sorted(values.items())!r}"
     return TunedPolicy(keywords, tunable.control, make, content, tunable.anchored, tunable, values)

@@ -113,13 +113,7 @@ class Search:
 
 
 class _Generations:
-    """Candidates of a search, evaluated within the budget, and the best of them so far.
-
-    Args:
-        tunable: declaration of the searched values.
-        allowed: number of candidates within the budget.
-        measure: function from a candidate's values to its cost.
-    """
+    """Candidates of a search, evaluated within the budget, and the best of them so far."""
 
     def __init__(
         self, tunable: Tunable, allowed: int, measure: Callable[[Mapping[str, float]], float]

@@ -28,12 +28,6 @@ def with_rules(
 ) -> tuple[dict[str, Variant], dict[str, Tunable]]:
     """Return variants of a policy or estimator with each rule for the receiver's noise, and what can be tuned
     of them.
-
-    Args:
-        host: its class, which takes the task, a rule, and the arguments of the rule.
-        name: name of the host, to which that of the rule is added.
-        description: description of the host, to which that of the rule is added.
-        rules: names of the rules for the receiver's noise; default: all.
     """
     variants, tunables = {}, {}
     for rule in rules:
@@ -65,10 +59,6 @@ class AugmentedMemory(NamedTuple):
 class AugmentedFilter:
     """Augmented filter of the INS error (position, drift, coloured rate error); the caller stores the
     position.
-
-    Args:
-        parameters: parameters of the task.
-        noise: model of the receiver's noise.
     """
 
     def __init__(self, parameters: LooselyCoupledNavigationParameters, noise: MeasurementNoise) -> None:
@@ -76,10 +66,8 @@ class AugmentedFilter:
         self.noise = noise
 
     def start(self, none: Array) -> AugmentedMemory:
-        """Return the filter's memory at the start of the track: zero errors with the prior covariance.
-
-        Args:
-            none: zeros of the shape of a position, ``(A, N)``.
+        """Return the memory at the start: zero errors, of the shape ``(A, N)`` of ``none``, with the prior
+        covariance.
         """
         p, zero = self.parameters, none[0]
         return AugmentedMemory(none, none, p.prior_covariance(zero), zero, self.noise.start(zero), zero)

@@ -26,14 +26,7 @@ class Navigator(NamedTuple):
 
 
 def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: Any) -> Likelihood:
-    """Return log-likelihood and NIS of a position fix; NaN where there is none.
-
-    Args:
-        innovation: measurement less prediction, m, ``(A, N)``.
-        variance: its variance for each axis, m^2, ``(N,)``.
-        available: one where there is a fix, ``(N,)``.
-        xp: array namespace.
-    """
+    """Return log-likelihood and NIS of a position fix; NaN where there is none."""
     there, axes = available > 0.0, innovation.shape[0]
     S = xp.where(there, variance, 1.0)
     nis = ordered_sum(innovation * innovation) / S

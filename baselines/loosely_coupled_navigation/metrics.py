@@ -81,12 +81,7 @@ def recovery_times(
 
 
 def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
-    """Return a mask ``(episodes, time)`` of alarms: the NIS over the last ``WINDOW`` fixes exceeds its limit.
-
-    Args:
-        nis: normalised innovation squared, NaN without a fix, ``(episodes, time)``.
-        degrees: degrees of freedom of the NIS of a fix.
-    """
+    """Return a mask ``(episodes, time)`` of alarms: the NIS over the last ``WINDOW`` fixes exceeds its limit."""
     sums, fixes = (
         numpy.cumsum(numpy.pad(values, ((0, 0), (WINDOW, 0))), axis=1)
         for values in (numpy.nan_to_num(nis), ~numpy.isnan(nis))

@@ -26,7 +26,6 @@ class SageHusaProcessNoise(KalmanModel):
     """A Kalman filter that estimates its acceleration noise from its own corrections (Sage and Husa 1969).
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration at the start, m/s^2.
         forgetting: factor on the weight of the past at each scan.
         least: smallest standard deviation of the acceleration, m/s^2.
@@ -84,7 +83,6 @@ class VariationalBayes(KalmanModel):
     Along x and y it estimates the ratio of the true variance to that of the radar.
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration, m/s^2.
         forgetting: rho, factor on the information about the noise at each scan.
         shape: half the number of measurements to which the radar's own variance is equivalent at the start.

@@ -24,7 +24,6 @@ class DeadReckoning(KalmanModel):
     Equations: ``filters/dead_reckoning.py``. It runs on recordings with a second sensor alone.
 
     Args:
-        task: the problem.
         error_deviation: standard deviation of the slow error of the measured positions, m.
         correlation_time: correlation time of that error, s.
         drift: drift of dead reckoning, m over the root of a metre of travelled distance.
@@ -81,9 +80,6 @@ def regress_odometry(recording: Recording) -> tuple[float, float]:
 
     Iteratively reweighted least squares: a displacement off by e counts as ``|e|^-1.5``. Where the target
     does not move, 1 and 0.
-
-    Args:
-        recording: recording with a second sensor.
     """
     measured, found, moved = recording.measurements, [], []
     for episode, rows in enumerate(recording.rows.tolist()):

@@ -55,7 +55,6 @@ class ProbabilisticDataAssociation(AllPlots, ConstantVelocity):
     """One Kalman filter of constant velocity that weighs all plots of a scan (Bar-Shalom and Tse 1975).
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
     """
 

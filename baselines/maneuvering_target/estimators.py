@@ -20,7 +20,6 @@ class ConstantVelocity(KalmanModel):
     """One Kalman filter of constant velocity.
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
     """
 
@@ -50,7 +49,6 @@ class KalmanInteractingMultipleModel(KalmanModel):
     """The usual IMM over two Kalman filters of constant velocity, without and with white acceleration.
 
     Args:
-        task: the problem.
         accelerations: standard deviation of the acceleration of each filter, m/s^2.
         stay: probability of each mode to last another scan; all others are equally likely next.
     """
@@ -131,7 +129,6 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
     IEEE Trans. AES 51, 2015, 2975-2986), not as one with a turn rate of zero and no variance.
 
     Args:
-        task: the problem.
         accelerations: standard deviation of the acceleration of each filter, the turn's last, m/s^2.
         turn_rate_start: standard deviation of the turn rate of a turn that begins, degrees/s.
         turn_rate_change: standard deviation of its change from scan to scan, degrees/s.

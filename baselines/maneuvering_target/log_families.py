@@ -31,8 +31,8 @@ class ConstantAcceleration(KalmanModel):
     """One Kalman filter of constant acceleration.
 
     Args:
-        task: the problem.
-        jerk: standard deviation of the change of the acceleration in a second, constant from scan to scan, m/s^3.
+        jerk: standard deviation of the change of the acceleration in a second, constant from scan to scan,
+            m/s^3.
         acceleration: standard deviation of the acceleration at the start, m/s^2.
     """
 

@@ -25,7 +25,6 @@ class ConstantVelocitySmoother(ConstantVelocity):
     """One Kalman filter of constant velocity with white acceleration, smoothed (Rauch, Tung and Striebel 1965).
 
     Args:
-        task: the problem.
         acceleration: standard deviation of the acceleration, m/s^2.
         lag: number of later scans that each estimate uses; default: all of them.
     """
@@ -56,7 +55,6 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
     """The usual IMM over two Kalman filters of constant velocity, smoothed by a second filter backward in time.
 
     Args:
-        task: the problem.
         lag: number of later scans that each estimate uses; default: all of them.
         **arguments: arguments of :class:`.KalmanInteractingMultipleModel`.
     """
@@ -68,12 +66,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         self.lag = lag
 
     def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
-        """Return transition and process noise of every filter over intervals, and the predicted means.
-
-        Args:
-            mixed: mean from which each filter starts, ``(n, M, N)``.
-            T: intervals, s, ``(N,)``.
-        """
+        """Return transition and process noise of every filter over intervals, and the predicted means."""
         F, unit = self.motion(T)
         Q = self.xp.stack([variance * unit for variance in self.variances], axis=2)
         F = F[:, :, None]
@@ -117,7 +110,6 @@ class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleMode
     transition is zero there, and its noise is the variance of a turn that begins.
 
     Args:
-        task: the problem.
         lag: number of later scans that each estimate uses; default: all of them.
         **arguments: arguments of :class:`.KalmanTurnInteractingMultipleModel`.
     """

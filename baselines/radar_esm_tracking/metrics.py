@@ -44,7 +44,7 @@ def time_quantile(
         first: index of the first time with the condition, or the number of times, ``(episodes,)``.
         is_counted: whether an episode counts, ``(episodes,)`` booleans.
         seconds: times, s, ``(T,)``.
-        share: share, such as 0.5 for the median.
+        share: share of the episodes.
     """
     times = numpy.append(seconds, math.inf)[first]
     return bootstrap.interval(bootstrap.quantiles(times, share, is_counted))

@@ -75,7 +75,6 @@ class _Posterior(Policy):
         raise NotImplementedError
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the class probabilities as action: the weights of the filters."""
         return imm.softmax(self.log_posterior(observation)).T, None
 
 
@@ -113,7 +112,6 @@ class JointType(_Posterior):
     """Posterior over type and class together: right where a target has one type.
 
     Args:
-        model: the environment's model for the policy.
         refused: weight of a decision that the gate rejects, 0 to 1.
         esm: weight of any decision, 0 to 1.
     """
@@ -136,9 +134,8 @@ class ForgettingJointType(JointType):
     """Posterior over type and class together where the class may change, and the type with it: old evidence fades.
 
     Args:
-        model: the environment's model for the policy.
-        change: probability that the class changes from one decision to the next; by default once in 500 scans,
-            four times the length of an episode.
+        change: probability that the class changes from one decision to the next; by default once in 500
+            scans, four times the length of an episode.
         refused: weight of a decision that the gate rejects, 0 to 1.
         esm: weight of any decision, 0 to 1.
     """
@@ -172,7 +169,6 @@ class Leaky(_Posterior):
     Only the weights leak; the filters stay as they are (``class_transition`` would mix them too).
 
     Args:
-        model: the environment's model for the policy.
         leak: probability that the class changes in one scan, shared equally by the others.
         esm: weight of a decision, 0 to 1.
     """
@@ -222,7 +218,6 @@ ESTIMATORS = {
 
 
 def _tunable_bayes(name: str, prior: ClassPrior, **limits: tuple[float, float, float]) -> Tunable:
-    """Declare the tunable values of the filter that applies Bayes' rule to classes and types."""
     change = (-4.0, math.log10(prior.change_rate), -1.0)
     found = tunable(
         ESTIMATORS[name], log10_change_rate=change, coloured=(0.05, prior.coloured, 0.7), **limits

@@ -18,10 +18,9 @@ class HuberBank(HypothesisBank):
     update would not follow.
 
     Args:
-        task: the problem.
         thresholds: threshold of each group of sensors by its name; a group without one has plain updates.
-        manoeuvre: limit of the short average of the normalised innovation squared of a rate, under the hypothesis with
-            the smallest one; from it on updates without accelerometers are plain.
+        manoeuvre: limit of the short average of the normalised innovation squared of a rate, under the
+            hypothesis with the smallest one; from it on updates without accelerometers are plain.
     """
 
     def __init__(
@@ -56,7 +55,6 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
     See ``filters/extended_kalman.py``.
 
     Args:
-        task: the problem.
         thresholds: threshold of each group of sensors by its name; default: the usual one for all.
         manoeuvre: see :class:`HuberBank`; by default every update is robust.
     """
@@ -100,7 +98,6 @@ class HuberStuckCheck(Huber):
     accelerometer agrees with the prediction from its own readings.
 
     Args:
-        task: the problem.
         rates: threshold of the pseudorange rates; that of the pseudoranges is the usual one.
         manoeuvre: see :class:`HuberBank`.
     """

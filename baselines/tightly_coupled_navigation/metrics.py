@@ -53,7 +53,7 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
     """Find every change of the true hypothesis, and the bank's delay in following it.
 
     The delay ends at the first step from which the probability of the new hypothesis exceeds one half for
-    ``LASTING`` steps (or until the next change, if that comes sooner).
+    ``LASTING`` steps or until the next change.
 
     Args:
         true_mode: ``(episodes, time)`` integers.

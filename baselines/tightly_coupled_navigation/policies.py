@@ -57,7 +57,6 @@ class FixedRobust(ConstantPolicy):
     See ``HuberBank``.
 
     Args:
-        model: the environment's model for the policy.
         accelerometers: constant action that raises their noise, at the whole reach (`noise_reach` of one).
         pseudoranges: strength of the robust update of these, 0 to 1.
         rates: strength of the robust update of their rates, 0 to 1.
@@ -81,7 +80,6 @@ class NisAdaptive(Policy):
     accelerometers, which may stick; one of the accelerometers may also be a manoeuvre.
 
     Args:
-        model: the environment's model for the policy.
         threshold: threshold of the average per observation; a consistent filter has 1.
         rates: power of the rates' excess in their own variance.
         accelerometers: power of the rates' excess in the variance of the accelerometers.
@@ -139,7 +137,6 @@ HYPOTHESES_ON_FAULTS = {
 
 
 def _tunable_hypotheses(name: str, prior: FaultPrior) -> Tunable:
-    """Declare the tunable values of the bank with hypotheses on faults."""
     found = tunable(
         HYPOTHESES_ON_FAULTS[name],
         leg=(1.0, prior.leg, 10.0),

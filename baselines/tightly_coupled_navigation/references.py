@@ -52,7 +52,6 @@ class _KnownMode:
         self.size: int = gnss_ins.SIZE + task.satellites
 
     def start(self, initial: Initial, truth: Truth) -> KnownModeState:
-        """Return the state at the initial estimate, with the true hypothesis."""
         mean, covariance = range_errors.start(
             initial.mean,
             initial.covariance,
@@ -80,13 +79,7 @@ class _KnownMode:
         )
 
     def predict_track(self, truth: Truth, track: KnownModeState, noises: Array) -> KnownModeState:
-        """Predict the state to the present measurement under the true hypothesis.
-
-        Args:
-            truth: truth at that measurement.
-            track: state after the last measurement.
-            noises: covariance of the process noise of every hypothesis, ``(n, n, M)``.
-        """
+        """Predict the state to the present measurement under the true hypothesis."""
         xp, task, T = self.task.xp, self.task, self.task.common.T
         jumped = truth.jumped > 0.0
         at_once = (truth.mode == SINGER) & (track.mode != SINGER) & ~jumped
@@ -120,7 +113,6 @@ class _KnownMode:
         return self.reset_acceleration(track, jumped, push)
 
     def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
-        """Return the expected sensor readings of a state, and the rows of their Jacobian there."""
         return range_errors.observe(
             state,
             measurement.satellite_position,

@@ -38,7 +38,6 @@ class InnovationAdaptive(Policy):
     noisier sensor.
 
     Args:
-        model: the environment's model for the policy.
         window: effective length of the window, measurements.
         memory: factor on the last logarithm, 0 to 1.
         offset: logarithm (base 10) of the factor when the innovations are as predicted.
@@ -114,7 +113,6 @@ BANKS: dict[str, Any] = {
 
 
 def _tunable_bank(name: str, prior: LevelPrior) -> Tunable:
-    """Declare the tunable values of the bank over noise levels."""
     found = tunable(
         BANKS[name],
         log10_gust_change=(-3.5, math.log10(prior.gust_change), -1.0),

@@ -118,7 +118,6 @@ class _KnownNoise:
         )
 
     def sensor_variances(self, truth: Truth) -> Array:
-        """Return the variance of each sensor's white noise at this measurement, ``(m, N)``."""
         return self.variances * truth.sensor_level**2
 
 

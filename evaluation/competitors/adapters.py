@@ -68,11 +68,8 @@ def check_update_order(estimator: Any) -> None:
 class SingleTrackEstimator(ABC):
     """Base class of estimators of a single track; it runs one track object for each episode.
 
-    Subclasses define :meth:`begin`, :meth:`step` and :meth:`estimate`. They may change a track in
-    place. Those with random numbers must seed them for each track, so that an episode does not depend on the others.
-
-    Args:
-        task: stored as ``self.task``; ``task.parameters`` contains every constant.
+    Subclasses define :meth:`begin`, :meth:`step` and :meth:`estimate`. They may change a track in place, and
+    must seed random numbers for each track.
 
     Raises:
         ValueError: if ``state`` lacks a component of the task.
@@ -126,9 +123,6 @@ class SingleTrackEstimator(ABC):
 
         It must be a linear function of the state. By default it is the position, for tasks whose measurement has
         ``position`` and ``variance``; None where it is not ``available``.
-
-        Raises:
-            ValueError: if the measurement lacks these fields.
         """
         if not hasattr(measurement, "position") or not hasattr(measurement, "variance"):
             raise ValueError(

@@ -34,11 +34,7 @@ SHOWN = 5
 
 
 class FileEstimates:
-    """Maker of a competitor from a file of estimates, see :mod:`..storage.estimate_tables`.
-
-    Args:
-        path: path of the file.
-    """
+    """Maker of a competitor from a file of estimates, see :mod:`..storage.estimate_tables`."""
 
     kind = "estimator"
 
@@ -53,8 +49,7 @@ class FileEstimates:
             tracks: name of each track, by the seed of its episode.
 
         Raises:
-            ValueError: if it cannot be read, has other tracks or another clock, or lacks components that the cost
-                needs.
+            ValueError: for a file that cannot be read, or does not match the evaluation.
         """
         name = str(self.path)
         table = read_estimates(self.path, [component.name for component in task.components])
@@ -90,8 +85,6 @@ class TrackEstimates(NamedTuple):
 def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, numpy.ndarray] | None:
     """Return the times of a recording's measurements by track, s by the clock of the estimates; None in a
     simulation.
-
-    Seconds count from the log's first measurement or are the log's own, whichever matches more rows.
     """
     import pandas
 
@@ -136,7 +129,6 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
 
 
 def _tolerance(task: Task) -> float:
-    """Return the largest permitted difference of the times of a row and its measurement, s."""
     return min(SAME_TIME, 0.25 * _usual_interval(task))
 
 
@@ -189,13 +181,7 @@ class FileState(NamedTuple):
 
 
 class FileTrack(Filter[Task, Any, FileState]):
-    """Filter whose estimates are the rows of a file.
-
-    Args:
-        task: the estimation problem.
-        estimates: estimates of the file.
-        names: name of the track of each episode.
-    """
+    """Filter whose estimates are the rows of a file; ``names`` are the tracks of its episodes."""
 
     in_python = True
 

@@ -42,12 +42,7 @@ class AdaptedState(NamedTuple):
 
 
 class Adapter(Filter[Task, Any, AdaptedState]):
-    """Filter that calls a user's estimator, see :class:`.kinds.Estimator`.
-
-    Args:
-        task: the estimation problem.
-        estimator: the estimator, made for the task.
-    """
+    """Filter that calls a user's estimator, see :class:`.kinds.Estimator`."""
 
     def __init__(self, task: Task, estimator: Any) -> None:
         super().__init__(task)
@@ -139,10 +134,10 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
     estimates.
 
     Args:
-        task: the estimation problem.
         wrapped: the filter; None while the steps of the world are traced.
         name: kind and name of the competitor, for error messages.
-        count: number of episodes; further lanes repeat the last episode. None: all lanes are used as they are.
+        count: number of episodes; further lanes repeat the last episode. None: all lanes are used as they
+            are.
         stated: components that the filter reports, where ``wrapped`` is None.
     """
 
@@ -192,11 +187,7 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         return self.initialise(FilterInput(initial))
 
     def update(self, state: AdaptedState, inputs: FilterInput) -> AdaptedState:
-        """Update the wrapped filter; return the state with its estimate, checked for shape and type.
-
-        Raises:
-            ValueError: if its estimate is no array of the required shape.
-        """
+        """Update the wrapped filter; return the state with its estimate, checked for shape and type."""
         self.step_number += 1
         inputs = self._repeat_last(inputs)
         with explain_errors(f"{self.name} failed at measurement {self.step_number}"):
@@ -303,7 +294,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed, missing)
 
     def _stated(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Replace components that the filter never reports by mean 0 and covariance of the identity."""
+        """Fill components that the filter never reports: mean 0, covariance of the identity."""
         if self.stated is None:
             return mean, covariance
         known, deviations = map(numpy.array, self.stated)
@@ -354,7 +345,7 @@ def find_fault(mean: Array, covariance: Array, earlier_fault: Array, any_missing
     Args:
         mean: means, ``(C, N)``.
         covariance: covariances, ``(C, C, N)``.
-        earlier_fault: number of the reason why the episode was lost earlier, ``(N,)``; zero where it was not.
+        earlier_fault: number of the reason why the episode was lost earlier, ``(N,)``; or zero.
         any_missing: above zero where a measurement was missing so far, ``(N,)``.
         xp: array namespace.
 
@@ -516,7 +507,7 @@ def close_loop(
         last: number of the last measurement of the episodes; None: unknown.
 
     Raises:
-        ValueError: if it cannot be made, lacks a method of its kind, or is a reference that does not declare every
+        ValueError: if it cannot be made, lacks a method, or is a reference that does not declare every
             disturbance.
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):

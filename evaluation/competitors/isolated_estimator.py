@@ -238,11 +238,7 @@ def restrict_process(readable: list[str], listable: list[str], apart: bool) -> s
 
 
 class SharedModules:
-    """Finder and loader of modules whose source texts are in the request, and of the packages that contain them.
-
-    Args:
-        texts: source texts by the names of modules.
-    """
+    """Finder and loader of modules whose source texts are in the request, by name, and of their packages."""
 
     def __init__(self, texts: dict[str, str]) -> None:
         from importlib.machinery import ModuleSpec

@@ -63,14 +63,7 @@ def isolate_estimator(name: str) -> Program:
 
 
 def isolate_source(text: str, attribute: str, name: str, file: Path | None = None) -> Program:
-    """Return a program that runs an estimator class, given as source text, in a sandboxed process.
-
-    Args:
-        text: source text of its module.
-        attribute: name of its class.
-        name: name of the competitor, for error messages.
-        file: file of the text, if there is one; the process can read its folder.
-    """
+    """Return a program that runs an estimator class, given as source text, in a sandboxed process."""
     folder = [] if file is None else [str(file.parent.absolute())]
     libraries = _libraries()
     # Some editable installations hold links to files, so the folders of these count, too.

@@ -111,8 +111,7 @@ def check_competitor(name: str, competitor: Any, kind: Kind | None = None) -> An
         kind: required kind; default: its own.
 
     Raises:
-        ValueError: if it lacks a method of its kind; or if its ``update`` takes the memory after the
-            measurement.
+        ValueError: for a missing method, or an ``update`` that takes the memory after the measurement.
     """
     kind = kind or kind_of(competitor)
     methods = {"policy": ("predict",), "smoother": ("start", "update", "smooth")}.get(
@@ -171,16 +170,13 @@ class Policy:
         episode_start: numpy.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[numpy.ndarray, Any]:
-        """Return the actions for a batch of observations, and the memory for the next call.
+        """Return the actions for a batch of observations, batch first, and the memory for the next call.
 
         Args:
             observation: ``(N, len(model.fields))``, or one observation without the batch axis.
             state: memory that the last call returned; None at the first call.
             episode_start: mask of new episodes, ``(N,)`` booleans.
             deterministic: as in Stable-Baselines3; classical policies ignore it.
-
-        Returns:
-            Actions, batch first, and the memory for the next call.
         """
         single = observation.ndim == 1
         batch = observation[None] if single else observation
@@ -262,12 +258,7 @@ DRAWN_AT_ONCE = 32
 
 
 class RandomActions:
-    """Random actions of parallel episodes, with a random generator for each episode.
-
-    Args:
-        generators: random generators, one for each episode.
-        space: Gymnasium space of one action.
-    """
+    """Random actions of parallel episodes, from one generator for each episode and the space of one action."""
 
     def __init__(self, generators: Sequence[numpy.random.Generator], space: Any) -> None:
         self._generators, self._space = generators, space

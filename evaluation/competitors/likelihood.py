@@ -70,11 +70,11 @@ def cut_windows(
 
     Args:
         recording: recording of the task.
-        task: task on NumPy arrays; its log format defines the start of a track. Without one, or where a window begins
-            with the recording, the recording's own initial estimate applies.
+        task: task on NumPy arrays; its log format starts a track inside the recording.
         spans: measurements that count in the likelihood.
-        warm_up: number of measurements to process before those that count, where there are as many.
-        every: of measurements with a field ``available``, one in ``every`` is received, the others are missing.
+        warm_up: number of measurements to process before those that count.
+        every: of measurements with a field ``available``, one in ``every`` is received, the others are
+            missing.
     """
     template, like = measure_once(type(task)(task.parameters), recording.measurements)
     starts, pieces, counted = [], [], []
@@ -176,10 +176,6 @@ class WindowLikelihood:
         apply: function from parameters to the task's keywords and the estimator's maker.
         in_lanes: whether every parameter can be an array ``(N,)``; otherwise candidates run one after another.
 
-    Attributes:
-        names: names of the parameters.
-        count: number of measurements that count.
-
     Raises:
         ValueError: if the estimator returns no log-likelihood of measurements, or none counts.
     """
@@ -221,10 +217,8 @@ class WindowLikelihood:
         return other
 
     def __call__(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood of all measurements that count, nats, ``(C,)``; -inf where it is not finite.
-
-        Args:
-            values: parameters, candidates last, ``(P, C)``.
+        """Return the log-likelihood of all measurements that count for parameters ``(P, C)``, nats, ``(C,)``;
+        -inf if not finite.
         """
         if not self.in_lanes and values.shape[1] > 1:
             return numpy.concatenate([self(values[:, [i]]) for i in range(values.shape[1])])

@@ -45,11 +45,9 @@ class OnlineFilter:
     Args:
         model: model with the bank of the competitor's control; its world takes measurements from outside.
         competitor: policy or estimator, or its maker.
-        name: name of the competitor, for error messages.
         tracks: number of parallel tracks.
         watch: comparison of a network's inputs with those of its training; None without a network.
-        lag: number of measurements, or time, by which a measurement may be late; see :meth:`update`. Each measurement
-            within the lag is stored with the states of the filter and of the policy or estimator.
+        lag: number of measurements, or time, by which a measurement may be late; see :meth:`update`.
 
     Raises:
         ValueError: for a competitor that needs the truth or later measurements.
@@ -167,7 +165,7 @@ class OnlineFilter:
 
         Args:
             first: ``time`` and values of the sensors of the first measurement, as in :meth:`update`.
-            second: ``time`` and values of the sensors of the second measurement.
+            second: those of the second measurement.
 
         Raises:
             ValueError: for values that are missing or unknown, or where two measurements cannot start a track.

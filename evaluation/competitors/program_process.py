@@ -112,7 +112,7 @@ class ProgramProcess:
         Args:
             request: bytes of the request.
             size: number of bytes of the response; None: it is a line.
-            most: maximal bytes of a line.
+            most: limit of bytes of a line.
 
         Raises:
             Failure: if there is no such response in time.
@@ -134,11 +134,7 @@ class ProgramProcess:
                 self._read(key.fd)
 
     def send(self, message: bytes) -> None:
-        """Write a message without a response to the program.
-
-        Raises:
-            Failure: if the program does not read it in time.
-        """
+        """Write a message without a response to the program."""
         self.exchange(message, 0)
 
     def finish(self) -> None:

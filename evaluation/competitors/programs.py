@@ -83,11 +83,6 @@ def search_path() -> str:
 class Program:
     """A program that competes as an estimator; a call with a task returns that estimator.
 
-    Args:
-        command: the program and its arguments, one text as in a shell; no shell runs it.
-        limits: limits of its time for each response and of its memory.
-        words: see the attributes, also for the other arguments.
-
     Raises:
         ValueError: if there is no such program, or no system on which it could run.
     """
@@ -189,10 +184,6 @@ class ProgramEstimator:
     """Estimator that runs a program for all episodes, see :class:`.kinds.Estimator`.
 
     A fault of the program does not end an evaluation: all tracks are lost with a warning.
-
-    Args:
-        task: the estimation problem.
-        program: the program to run.
 
     Attributes:
         tracks: number of the N lanes that are tracks; the others repeat the last one.

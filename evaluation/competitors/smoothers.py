@@ -20,13 +20,7 @@ from .filters import AdaptedState, Checked, find_fault, is_lacking
 
 
 class SmoothedTrack(Filter[Task, Any, int]):
-    """Filter that replays the estimates of a smoother; its state is the number of measurements.
-
-    Args:
-        task: the estimation problem.
-        means: smoothed means at K measurements, ``(C, K, N)``.
-        covariances: smoothed covariances, ``(C, C, K, N)``.
-    """
+    """Filter that replays the estimates of a smoother; its state is the number of measurements."""
 
     in_python = True
 
@@ -67,12 +61,6 @@ def check_open_loop(model: Model, name: str) -> None:
 def run_forward(model: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Run a smoother over episodes of one length; return means ``(C, K, N)`` and covariances ``(C, C, K,
     N)``.
-
-    Args:
-        model: model with the smoother as its filter.
-        lanes: episodes of the model, with their first measurement.
-        length: number of measurements of each episode.
-        name: name of the smoother, for error messages.
 
     Raises:
         ValueError: if its estimates have other shapes.
@@ -124,13 +112,7 @@ def _run_compiled(model: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans
 
 
 def run_stretches(lanes: Lanes, report: Report, length: int) -> Iterator[Any]:
-    """Run compiled episodes; yield reports on successive stretches of measurements, ``(scans, ..., N)``.
-
-    Args:
-        lanes: compiled episodes, whose filter has no policy.
-        report: function of model and episode that returns arrays ``(..., N)``, see :meth:`.Lanes.run`.
-        length: number of measurements of each episode.
-    """
+    """Run compiled episodes; yield reports on successive stretches of measurements, ``(scans, ..., N)``."""
     together = max(1, TOGETHER // lanes.width)
     for first in range(0, length, together):
         yield lanes.run(report, measurements=min(together, length - first))[0]
@@ -153,13 +135,6 @@ def report_smoothed(
 ) -> Iterator[dict[str, numpy.ndarray]]:
     """Yield reports on the smoothed estimates by stretches of measurements, arrays ``(scans, ..., N)`` by
     name.
-
-    Args:
-        model: model with the smoothed track as its filter.
-        lanes: compiled episodes of the same world that have just begun, with any filter.
-        track: the smoothed estimates.
-        report: function that returns arrays ``(..., N)`` by name.
-        length: number of measurements of each episode.
     """
     start, none, first = lanes.state.filter, numpy.zeros(lanes.width), 0
     state = Checked(None, start.mean, start.covariance, none, none)

@@ -50,8 +50,8 @@ class Decider:
     Args:
         model: model that defines the observations.
         act: function that computes the actions.
-        memory: a memory of the policy for one track, as template. The batch is the first axis of each array or else the
-            last. If one has neither, the filter is for one track: N is 1, or the arrays are traced.
+        memory: a memory of the policy for one track, as template. The batch is the first axis of each array
+            or else the last.
         interval: number of measurements for which an action holds; default: the task's decision interval.
     """
 
@@ -164,13 +164,7 @@ class SteeredFilter(AroundBank[PolicyFilterState]):
 
 
 def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Decider:
-    """Make the :class:`Decider` of a policy in a model.
-
-    Args:
-        model: model on NumPy or traced arrays.
-        policy: policy made for the same task on NumPy arrays, whose ``act`` is arithmetic of NumPy.
-        interval: number of measurements for which an action holds; default: the task's decision interval.
-    """
+    """Make the :class:`Decider` of a policy in a model."""
     blank = numpy.zeros((1, len(model.fields)))
     with numpy.errstate(all="ignore"):
         _, memory = policy.act(blank, None, numpy.ones(1, dtype=bool))
@@ -194,8 +188,7 @@ def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = No
     Args:
         model: compiled model of the policy.
         policy: policy made for that model.
-        interval: number of measurements for which an action holds; 1 where the policy is called only when a decision is
-            due.
+        interval: number of measurements for which an action holds.
 
     Raises:
         NotTraceable: if its arithmetic cannot be traced.

@@ -101,9 +101,6 @@ class SteppingPolicy(Policy):
             episode_start: mask of new episodes, ``(N,)`` booleans, or one; all are new at the first call.
             deterministic: as in Stable-Baselines3.
 
-        Returns:
-            Actions, with the batch axis where the observation has it, and the state for the next call.
-
         Raises:
             ValueError: for a state of another number of episodes, or if the policy returns no actions.
         """
@@ -165,15 +162,8 @@ class SteppingPolicy(Policy):
 
 
 class MeasurementMemory:
-    """Preallocated arrays into which the measurements of all tracks are written.
-
-    Args:
-        like: a measurement, as template of shapes and types.
-        tracks: number of parallel tracks; the last one is repeated up to a multiple of eight, since rounding in
-            matrix products must not depend on their number.
-
-    Attributes:
-        parts: the arrays, ``(..., width)``, of floats.
+    """Preallocated arrays ``(..., width)`` for a measurement of all tracks, padded to a multiple of eight
+    lanes.
     """
 
     def __init__(self, like: Any, tracks: int) -> None:

@@ -36,7 +36,7 @@ def episode_frames(
 
     Args:
         task: task class of the environment.
-        name: name of the competitor, for the title.
+        name: name of the competitor.
         competitor: policy, estimator, smoother or reference, or its maker.
         scenario: name of a scenario, or a trajectory.
         seed: seed of the episode, as in ``reset``.
@@ -130,13 +130,7 @@ def _palette() -> Image.Image:
 
 
 def write_animation(frames: list[Image.Image], path: Path, frames_per_second: float = 6.0) -> None:
-    """Write frames as an endless GIF, whose last frame lasts two seconds.
-
-    Args:
-        frames: images of equal size, at least one.
-        path: path of the file, which is written atomically.
-        frames_per_second: number of frames per second.
-    """
+    """Write frames as an endless GIF, whose last frame lasts two seconds."""
     palette = _palette()
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [round(1000.0 / frames_per_second)] * (len(drawn) - 1) + [2000]

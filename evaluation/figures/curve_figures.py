@@ -435,8 +435,7 @@ def evaluation_figures(
         highlight: names of the coloured lines; default: :func:`choose_highlights`.
         learned: names of learned competitors.
         own: names of the user's competitors.
-        points: points of cost and time, see :func:`.times.points_of_records`; without points there is no such
-            figure.
+        points: points of cost and time, see :func:`.times.points_of_records`.
 
     Raises:
         ValueError: for another number of columns, unknown names, or too many.

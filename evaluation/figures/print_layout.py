@@ -223,9 +223,6 @@ def save(figure: Any, path: Path) -> None:
     """Write a figure to a file atomically, in the format of its suffix.
 
     Formats are ``.png``, ``.svg`` and ``.pdf``. Equal figures give equal files.
-
-    Raises:
-        ValueError: for another suffix, or if it cannot be written.
     """
     from matplotlib import rc_context
 

@@ -54,13 +54,7 @@ def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
 def run_episodes(
     experiment: Experiment, competitors: Mapping[str, Any], numbers: list[int]
 ) -> xarray.Dataset:
-    """Run some episodes of an experiment again, with the data for figures; return their dataset.
-
-    Args:
-        experiment: experiment of the episodes.
-        competitors: competitors by name, as for :func:`.evaluate.run_experiment`.
-        numbers: numbers of the episodes.
-    """
+    """Run some episodes of an experiment again, with the data for figures; return their dataset."""
     drawn = replace(experiment, tracks=False, drawn_episodes=len(numbers))
     plan = _with_episodes(plan_of(drawn, competitors), numbers)
     kept = plan.arrays(len(numbers), len(numbers))
@@ -78,14 +72,7 @@ def _with_episodes(plan: Plan, numbers: list[int]) -> Plan:
 def describe_worst(
     dataset: xarray.Dataset, numbers: list[int], name: str, opponent: str = ""
 ) -> list[WorstEpisode]:
-    """Return costs, seed and main causes of some episodes of a competitor.
-
-    Args:
-        dataset: evaluation from :func:`run_episodes`.
-        numbers: numbers of its episodes.
-        name: name of the competitor.
-        opponent: competitor with which it is compared; empty: none.
-    """
+    """Return costs, seed and main causes of some episodes of a competitor."""
     own = mean_cost(dataset, name)
     other = mean_cost(dataset, opponent) if opponent else numpy.full(len(numbers), numpy.nan)
     causes = main_causes(dataset.sel(policy=name))

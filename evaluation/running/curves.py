@@ -133,13 +133,7 @@ def select_quantities(dataset: xarray.Dataset) -> list[str]:
 def curve_statistics(
     run: xarray.Dataset, episodes: int, resamples: int = BAND_RESAMPLES
 ) -> Iterator[Statistic]:
-    """Yield the statistics of one competitor's curves as declarations, for some of its episodes.
-
-    Args:
-        run: some episodes of one competitor.
-        episodes: number of episodes of the whole evaluation.
-        resamples: number of resamples for the bands.
-    """
+    """Yield the statistics of one competitor's curves as declarations, for some of its episodes."""
     times = run.sizes["time"]
     resamples = resamples if episodes > 1 else 0  # one episode has no variation over episodes
     distributed = max(block_of(times), DISTRIBUTION_LIMIT // times)
@@ -191,13 +185,7 @@ DIMENSIONS: dict[str, tuple[str, ...]] = {
 def stack_curves(
     competitors: Sequence[CompetitorCurves], dataset: xarray.Dataset, episodes: int
 ) -> xarray.Dataset:
-    """Combine the curves of several competitors into one dataset, see :func:`curves_of`.
-
-    Args:
-        competitors: curves in the order of the policies of the evaluation.
-        dataset: the evaluation, of which only coordinates and attributes are needed.
-        episodes: number of episodes of the curves.
-    """
+    """Combine the curves of several competitors into one dataset, see :func:`curves_of`."""
     units, shown = components_and_groups(dataset), select_quantities(dataset)
     names = {
         "action_name": list(dict.fromkeys(name for each in competitors for name in each.actions)),
@@ -336,7 +324,8 @@ def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
     """Return the size of error that each share :data:`SHARES` of the errors reaches or exceeds, ``(shares,)``.
 
     Args:
-        errors: non-negative errors of any shape, without NaN; a share of less than one error gives NaN.
+        errors: non-negative errors of any shape; NaN is left out, and the result for a share of less than one
+            error.
     """
     descending = -numpy.sort(-errors, axis=None)  # NaN comes last
     count = int(numpy.isfinite(descending).sum())

@@ -47,7 +47,7 @@ def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> s
     model.
 
     Args:
-        maker: maker of the competitor, or the competitor itself.
+        maker: maker of the competitor.
         control: required control; None: any.
         cls: task class of the environment.
         name: name of the competitor, for error messages.
@@ -400,7 +400,7 @@ def plan_of(
     """Check the arguments of an evaluation; return its episodes, and each competitor's model and kind.
 
     Args:
-        experiment: the episodes and options.
+        experiment: the experiment.
         competitors: competitors by name.
         first: number of the first planned episode; for flights and recordings all episodes are planned.
         end: number after the last planned episode; None with ``first=0``: all.

@@ -90,10 +90,8 @@ def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
 
 
 def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the sum and number of the values that are not NaN in every episode, ``(episodes, 2)``.
-
-    Args:
-        values: ``(episodes, time)``; NaN stands for no measurement, or no event.
+    """Return the sum and number of the values ``(episodes, time)`` that are not NaN in every episode,
+    ``(episodes, 2)``.
     """
     present = ~numpy.isnan(values)
     return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
@@ -183,13 +181,7 @@ def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset
 def records_of_reduced(
     reduced: Sequence[Reduced], evaluation: "xarray.Dataset", metrics: OwnMetrics | None = None
 ) -> list[Record]:
-    """Return all records of an evaluation from the sums and samples of its competitors.
-
-    Args:
-        reduced: all competitors, from :func:`reduce_competitor`.
-        evaluation: dataset with the coordinates and attributes.
-        metrics: metrics of the environment; not used for recordings.
-    """
+    """Return all records of an evaluation from the sums and samples of its competitors."""
     own = None if evaluation.attrs.get("recorded") else metrics
     bootstrap = bootstrap_of_reduced(reduced, evaluation)
     blocks = bootstrap if isinstance(bootstrap, BlockBootstrap) else None
@@ -215,13 +207,7 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
 def record_statistics(
     run: "xarray.Dataset", episodes: int, metrics: OwnMetrics | None = None
 ) -> Iterator[Statistic]:
-    """Yield the statistics of one competitor's records as declarations, for some of its episodes.
-
-    Args:
-        run: some episodes of one competitor.
-        episodes: number of episodes of the whole evaluation.
-        metrics: metrics of the environment.
-    """
+    """Yield the statistics of one competitor's records as declarations, for some of its episodes."""
     groups, slices = groups_of(run), slices_of(run)
     is_bound = str(run["kind"].values) == "bound"
     judged = run.attrs.get("truth", True)

@@ -55,13 +55,7 @@ def _attributes(key: str, cost: str) -> dict[str, str]:
 def recording_coords(
     recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
 ) -> dict[str, Any]:
-    """Return dataset coordinates that relate the evaluation of a recording to its log, such as ``log_time``.
-
-    Args:
-        recording: the replayed recording.
-        episodes: index of the replayed episode for each episode of the evaluation, ``(M,)``.
-        dataset: the evaluation.
-    """
+    """Return dataset coordinates that relate the evaluation of a recording to its log, such as ``log_time``."""
     length = dataset.sizes["time"]
     coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}
     if recording.log_time is not None:

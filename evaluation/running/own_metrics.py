@@ -65,13 +65,7 @@ class OwnMetrics:
     def measures_of(
         self, results: Mapping[Key, Any], bootstrap: Bootstrap, evaluation: "xarray.Dataset"
     ) -> list[Measure]:
-        """Return the environment's metrics of one competitor.
-
-        Args:
-            results: results of :meth:`statistics` of all episodes.
-            bootstrap: bootstrap over the episodes.
-            evaluation: the competitor's part of the evaluation, of which only coordinates and attributes are needed.
-        """
+        """Return the environment's metrics of one competitor."""
         gathered = MetricInputs(
             *({key[1]: results[key] for key in results if key[0] == f} for f in MetricInputs._fields)
         )

@@ -15,11 +15,6 @@ DRAWN_PREFIX = "drawn_"
 def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
     """Return ``nees`` of the components with known truth, ``(N,)``, in a dictionary, and their number if it
     varies.
-
-    Args:
-        model: task with a filter.
-        error: estimate minus truth, ``(C, N)``; NaN where the truth or the estimate is unknown.
-        covariance: reported covariance, ``(C, C, N)``.
     """
     if model.task.has_whole_truth and model.filter.stated is None:
         return {"nees": log_density(error, covariance)[1]}

@@ -166,11 +166,7 @@ class Part(NamedTuple):
 
 
 def summarise(request: EvaluationRequest, tick: Progress) -> Summary | Part:
-    """Run a request; return its summary, or sums and samples if it contains only some of the episodes.
-
-    Raises:
-        ValueError: as :func:`reduce_episodes`.
-    """
+    """Run a request; return its summary, or sums and samples if it contains only some of the episodes."""
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield from record_statistics(run, request.episodes, request.metrics)
@@ -187,11 +183,6 @@ def reduce_episodes(
     request: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
     """Run a request block by block of episodes; return the sums and samples of declared statistics.
-
-    Args:
-        request: request of one competitor over episodes.
-        declare: function from some of its episodes to their statistics.
-        tick: called with the number of measurements done.
 
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
@@ -233,9 +224,6 @@ def summaries(
         workers: processes that do the work.
         progress: called with the number of measurements done.
         store: stores each summary, so that a second call reads it.
-
-    Yields:
-        Number of a request and its summary.
 
     Raises:
         ValueError: if a competitor cannot be sent to another process, or a file not be written; and as
@@ -424,9 +412,6 @@ def run_requests(
         progress: called with the number of measurements done.
         store: stores each summary, so that a second call reads it.
         whole: whether to store every number of every episode.
-
-    Raises:
-        ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
     """
     first, names = requests[0], [one.name for one in requests]
     if whole:

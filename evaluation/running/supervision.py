@@ -75,11 +75,6 @@ def is_supervised() -> bool:
 def report_running(name: str, progress: Progress | None = None, timed: bool = True) -> Iterator[Progress]:
     """Report to the parent process that a competitor's code runs inside the context; yield a progress
     function.
-
-    Args:
-        name: name of the competitor.
-        progress: a progress function to call as well.
-        timed: whether the competitor is ended if the progress is not called in time.
     """
     tick = progress or (lambda measurements: None)
     if name not in _supervised:

@@ -41,7 +41,7 @@ def transitions_of(
         id: environment id.
         policy: policy made for the environment; its ``keywords`` make the environment.
         seeds: seeds of the episodes.
-        tick: called with the number of decisions done.
+        tick: function called with the number of decisions done.
         **keywords: further keywords of ``gymnasium.make_vec``, such as ``reward`` or ``dtype``.
 
     Returns:

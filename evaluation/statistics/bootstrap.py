@@ -57,11 +57,8 @@ def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
-    """Return value and 95 % percentile interval of a bootstrap, ``(3, ...)``; NaN ends if a resample is not
-    finite.
-
-    Args:
-        samples: value of the data and of every resample, ``(1 + resamples, ...)``.
+    """Return value and 95 % interval from ``samples``: the value in the data and every resample, ``(1 +
+    resamples, ...)``.
     """
     if len(samples) == 1:
         return numpy.concatenate([samples, numpy.full((2, *samples.shape[1:]), numpy.nan)])
@@ -99,11 +96,11 @@ class Bootstrap:
     """Bootstrap resamples of M episodes, the same for every statistic, so that differences are paired.
 
     Args:
-        episodes: number of episodes M.
+        episodes: number M.
         resamples: number of bootstrap samples.
         seed: seed of the resampling; fixed, so that a table can be reproduced.
-        clusters: cluster of each episode, ``(episodes,)``; whole clusters are resampled then, unless there is only one.
-            Values may then be NaN after the end of an episode, and means leave NaN out.
+        clusters: cluster of each episode, ``(episodes,)``; whole clusters are resampled then, unless there is
+            only one. Values may then be NaN after the end of an episode, and means leave NaN out.
     """
 
     def __init__(
@@ -168,8 +165,8 @@ class Bootstrap:
             resamples: number of first resamples, equal to those of a bootstrap with fewer; None: all.
 
         Returns:
-            Weighted sums of each array, ``(1 + resamples, 1, ...)``; for ragged episodes the sums of the values without
-            NaN and of their weights, ``(1 + resamples, 2, ...)``.
+            Weighted sums of each array, ``(1 + resamples, 1, ...)``; for ragged episodes of the values
+                without NaN and of their weights, ``(1 + resamples, 2, ...)``.
         """
         some = len(values[0])
         flat = numpy.concatenate([each.reshape(some, -1) for each in values], axis=1, dtype=float)
@@ -204,8 +201,6 @@ class Bootstrap:
         self, values: numpy.ndarray, share: float = 0.5, mask: numpy.ndarray | None = None
     ) -> numpy.ndarray:
         """Return a quantile over the episodes of the data and of every resample, ``(1 + resamples,)``.
-
-        NaN without chosen episodes.
 
         Args:
             values: one for each episode, ``(episodes,)``.

@@ -63,11 +63,7 @@ def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
 
 
 def active_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
-    """Yield the name of each cause and the measurements at which it is active, booleans ``(episodes, time)``.
-
-    Args:
-        run: one competitor's part of an evaluation with causes.
-    """
+    """Yield the name of each cause and the measurements at which it is active, booleans ``(episodes, time)``."""
     numbers = numpy.nan_to_num(run[VARIABLE].values).astype(numpy.int64)
     yield EVERYTHING, numpy.ones(numbers.shape, dtype=bool)
     early = run["time"].values <= int(run["start_measurements"])
@@ -86,7 +82,7 @@ def cause_sums(
     Args:
         run: one competitor's part of some episodes.
         nees: NEES over its dimension, ``(episodes, time)``, NaN where there is none; None without NEES.
-        units: units of time of one episode, in place of episodes; None: episodes.
+        units: units of time of one episode, in place of episodes.
 
     Returns:
         ``(episodes, causes, 4)``, in the order of :func:`active_causes`.
@@ -139,10 +135,6 @@ def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -
     """Return weights that order causes: share of the cost times log of the relative mean cost.
 
     A large cost in few measurements has the largest weight.
-
-    Args:
-        cost_share: share of the whole cost, of any shape.
-        measurement_share: share of all measurements, of the same shape.
     """
     some = (cost_share > 0.0) & (measurement_share > 0.0)
     dearer = numpy.divide(cost_share, measurement_share, out=numpy.ones_like(cost_share), where=some)
@@ -150,13 +142,7 @@ def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -
 
 
 def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) -> str:
-    """Return the ranked competitor of lowest cost among the others, to compare with; empty if there is none.
-
-    Args:
-        name: name of the competitor.
-        costs: mean costs by name.
-        ranked: names of the ranked competitors; the opponent is an unranked one where there is no other ranked one.
-    """
+    """Return the ranked competitor of lowest cost among the others, to compare with; empty if there is none."""
     others = [other for other in costs if other != name]
     return min([other for other in others if other in ranked] or others, key=costs.__getitem__, default="")
 

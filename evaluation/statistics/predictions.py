@@ -22,12 +22,7 @@ UNKNOWN = IntervalEstimate(math.nan, math.nan, math.nan)
 
 
 def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
-    """Return the lag-one correlation of innovations with its 95 % interval; zero if they are white.
-
-    Args:
-        errors: innovations, ``(m, episodes, time)``.
-        mask: true for the measurements to use, ``(episodes, time)``.
-    """
+    """Return the lag-one correlation of innovations with its 95 % interval; zero if they are white."""
     before = numpy.roll(errors, 1, axis=2)
     before[:, :, 0] = math.nan
     values = numpy.stack([(errors * before).sum(axis=0), 0.5 * (errors**2 + before**2).sum(axis=0)], axis=-1)

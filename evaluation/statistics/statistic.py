@@ -100,14 +100,7 @@ def reduce_run(
     bootstrap: Bootstrap | TimeUnits,
     first: int = 0,
 ) -> Reduction:
-    """Reduce some episodes of one competitor to the sums and samples of declared statistics.
-
-    Args:
-        run: one competitor's part of an evaluation.
-        declare: function from a block of its episodes to their statistics.
-        bootstrap: bootstrap over the episodes of the whole evaluation; for one episode its units of time.
-        first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
-    """
+    """Reduce some episodes of one competitor to the sums and samples of declared statistics."""
     block = block_of(run.sizes["time"])
     parts = (
         _reduce_block(declare(run.isel(episode=slice(i, i + block))), bootstrap, first + i)

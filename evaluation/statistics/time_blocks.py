@@ -28,9 +28,6 @@ FEWEST, FEWEST_BLOCKS = 16, 50
 class TimeUnits:
     """Division of an episode into units of successive measurements.
 
-    Args:
-        times: number of measurements of the episode.
-
     Attributes:
         unit: number of measurements of a unit.
         units: number of units of the episode; the last one may be shorter.
@@ -86,12 +83,7 @@ class BlockBootstrap(Bootstrap):
         self.totals = self._counts.sum(axis=1)
 
     def resample(self, values: numpy.ndarray, of_units: numpy.ndarray) -> numpy.ndarray:
-        """Return the mean over the episode and over every resample of blocks, ``(1 + resamples, ...)``.
-
-        Args:
-            values: values of the episode, ``(1, ...)``.
-            of_units: contribution of each unit, see :attr:`.statistic.Statistic.of_units`.
-        """
+        """Return the mean over the episode and over every resample of blocks, ``(1 + resamples, ...)``."""
         (means,) = self.sums([of_units])
         found = means[:, 0] if values.ndim > 1 else ratio(means[:, 0])
         found[0] = values[0]

@@ -80,10 +80,8 @@ def count_losses(losses: numpy.ndarray) -> Losses | None:
 
 
 def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
-    """Write the dataset of an evaluation to a NetCDF file, in the classic format with 64-bit offsets.
-
-    Raises:
-        ValueError: if a variable is too large for it, or the file cannot be written.
+    """Write an evaluation's dataset to a NetCDF file in the classic format with 64-bit offsets, if it is not too
+    large.
     """
     if any(variable.nbytes > MOST_BYTES for variable in dataset.variables.values()):
         raise ValueError(

@@ -62,7 +62,8 @@ def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
         path: path of the file; a folder contains ``NAME.TRACK.tum``, a file for each track.
         components: names of the estimated components.
 
-    Raises: ValueError: if it cannot be read, has no estimates, or those of several competitors.
+    Raises:
+        ValueError: if it cannot be read, has no estimates, or those of several competitors.
     """
     try:
         if path.suffix not in SUFFIXES:

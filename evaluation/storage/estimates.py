@@ -55,9 +55,6 @@ def write_estimates(path: Path, dataset: xarray.Dataset) -> None:
     Args:
         path: path that ends in ``.csv`` or ``.nc``; or a folder that ends in ``.tum``, see :func:`write_trajectories`.
         dataset: evaluation with ``tracks=True``.
-
-    Raises:
-        ValueError: if it cannot be written.
     """
     check_estimates(path)
     if path.suffix == ".tum":

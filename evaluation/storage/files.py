@@ -261,11 +261,7 @@ def find_folder(folder: Path) -> Path:
 
 
 def settle_folder(folder: Path) -> None:
-    """Finish replacing a folder if a crash interrupted it, and remove the leftover copies.
-
-    Raises:
-        ValueError: if it cannot be moved into its place.
-    """
+    """Finish replacing a folder if a crash interrupted it, and remove the leftover copies."""
     found = find_folder(folder)
     if found != folder:
         with _explain_refusals(f"folder {folder}"):
@@ -297,10 +293,6 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text to a file, in UTF-8, atomically.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
+    """Write a text to a file, in UTF-8, atomically."""
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")

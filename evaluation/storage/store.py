@@ -56,12 +56,7 @@ class Store:
         return self.folder / f"{name}.{digest[:DIGITS]}{SUFFIX}"
 
     def read(self, work: Work | None, kind: type[Result]) -> Result | None:
-        """Read the stored result of a unit of work; None if it is not stored.
-
-        Args:
-            work: unit of work; None for one that is never stored.
-            kind: type of its result.
-        """
+        """Read the stored result of a unit of work; None if it is not stored."""
         path = self._path(work)
         if path is None or not path.is_file():
             return None

@@ -189,11 +189,7 @@ class CrashTest:
         return record_streams(model, seeds, length, chunk)
 
     def filter_of(self, name: str, maker: Any, tracks: int) -> StreamFilter:
-        """Make an online filter of a competitor, without checks of its input.
-
-        Raises:
-            ValueError: for a competitor that needs the truth or later measurements, or cannot be made.
-        """
+        """Make an online filter of a competitor, without checks of its input."""
         experiment = self.experiment
         keywords = {**getattr(maker, "task_keywords", {}), **experiment.keywords}
         chosen = dataclasses.replace(
@@ -256,11 +252,6 @@ class CrashTest:
     ) -> Iterator[Finding]:
         """Run a competitor under all alterations, save and restore it, and run it long; yield a verdict on
         each.
-
-        Args:
-            name: name of the competitor.
-            maker: its maker, or the competitor itself.
-            tick: called with the number of alterations done.
 
         Raises:
             ValueError: for a competitor that needs the truth or later measurements, or cannot be made.

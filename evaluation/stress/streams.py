@@ -142,14 +142,7 @@ def _since_received(seconds: numpy.ndarray, received: numpy.ndarray) -> numpy.nd
 
 
 def record_streams(model: Model, seeds: Sequence[int], length: int, chunk: int) -> Iterator[Stream]:
-    """Simulate episodes with the paper's algorithm in the loop; yield streams that continue each other.
-
-    Args:
-        model: model of the control of the paper's algorithm, with a horizon of at least ``length``.
-        seeds: seeds of the episodes.
-        length: number of measurements.
-        chunk: number of measurements of a stream.
-    """
+    """Simulate episodes with the paper's algorithm in the loop; yield streams that continue each other."""
     task, count = model.on_numpy().task, len(seeds)
     began: list[Episode] = []
     lanes = start_lanes(model, seeds, began.append)
