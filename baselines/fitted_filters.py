@@ -207,7 +207,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         or not {*log["columns"], *log["deviations"]} <= names
         or not all(0.0 < value < math.inf for value in log["deviations"].values())
         or not 0 <= log["horizon"] <= MOST_MEASUREMENTS
-        or not (not log["origin"] or _is_place(log["origin"]))
+        or not (not log["origin"] or _is_valid_origin(log["origin"]))
     ):
         raise ValueError(f"{path}: its entry on the log is invalid: write it again with filtergym advise")
     try:
@@ -217,7 +217,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
     return LogSetup(**{key: log[key] for key in kinds})
 
 
-def _is_place(origin: Mapping[str, float]) -> bool:
+def _is_valid_origin(origin: Mapping[str, float]) -> bool:
     largest = {"latitude": 90.0, "longitude": 360.0, "altitude": 1e6}
     return origin.keys() == largest.keys() and all(abs(origin[key]) <= most for key, most in largest.items())
 

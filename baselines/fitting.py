@@ -304,7 +304,7 @@ def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarra
     return H
 
 
-class _Way(NamedTuple):
+class _ProfileSide(NamedTuple):
     """One side of a profile: values of a parameter from the best one towards a limit."""
 
     distances: list[float]
@@ -368,7 +368,7 @@ def _search_profiles(
     return profiles, None
 
 
-def _profile(best: float, below: _Way, above: _Way) -> Profile:
+def _profile(best: float, below: _ProfileSide, above: _ProfileSide) -> Profile:
     """Combine two sides and the best value to a sorted profile with its 95 % interval."""
     (low, open_low), (high, open_high) = _profile_end(below), _profile_end(above)
     values = numpy.array([*(best - d for d in below.distances), *(best + d for d in above.distances), best])
@@ -390,7 +390,7 @@ class _Maximum(NamedTuple):
 
 def _walk_profile(
     likelihood: WindowLikelihood, maximum: _Maximum, first: tuple[int, float], stop: bool
-) -> tuple[_Way, numpy.ndarray]:
+) -> tuple[_ProfileSide, numpy.ndarray]:
     """Compute one side of a profile, up to where the likelihood has fallen enough; return it and its last
     point.
 
@@ -404,7 +404,7 @@ def _walk_profile(
     # Where the likelihood is quadratic, the others follow this one on a straight line.
     inside = maximum.information[numpy.ix_(others, others)]
     slope = -sign * numpy.linalg.solve(inside, maximum.information[others, parameter])
-    way, point, reached = _Way([], []), best.copy(), 0.0
+    way, point, reached = _ProfileSide([], []), best.copy(), 0.0
     for distance in [*(d for d in numpy.array(STEPS) * abs(deviation) if d < room), room]:
         before = point.copy()
         before[parameter] = best[parameter] + sign * distance
@@ -492,7 +492,7 @@ def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: nump
     return information
 
 
-def _profile_end(way: _Way) -> tuple[float, bool]:
+def _profile_end(way: _ProfileSide) -> tuple[float, bool]:
     """Interpolate the distance at which a profile has fallen by ``DROP``, and whether the limit comes first."""
     distances = [0.0, *way.distances]
     # A drop grows with the square of the distance: it is interpolated in its root.

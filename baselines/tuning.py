@@ -58,8 +58,10 @@ class Candidate(NamedTuple):
     backend: str = "auto"
 
 
-def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
-    """Run a candidate; return the cost of every episode for the search, ``(episodes,)``: mean cost, or (1)."""
+def _run_candidate(candidate: Candidate, tick: Progress) -> numpy.ndarray:
+    """Return the cost of every episode for the search, ``(episodes,)``: its mean cost, or (1) with
+    likelihood.
+    """
     keywords, make = candidate.tunable.apply(candidate.values)
     cls, control = candidate.problem.task, candidate.tunable.control
     model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
@@ -78,7 +80,7 @@ def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy
     workers, seeds = check_workers(workers), candidate.seeds
     share = max(FEWEST, -(-len(seeds) // workers.width))
     pieces = [candidate._replace(seeds=seeds[i : i + share]) for i in range(0, len(seeds), share)]
-    found: numpy.ndarray = numpy.concatenate(workers.results(_costs, pieces))
+    found: numpy.ndarray = numpy.concatenate(workers.results(_run_candidate, pieces))
     return found
 
 
@@ -155,8 +157,8 @@ class _Generations:
         return self.best[1]
 
 
-def _scenario(problem: Problem, name: str | None) -> Scenario:
-    """Return the scenario of a search by its name; raise ValueError for a held-out one."""
+def _training_scenario(problem: Problem, name: str | None) -> Scenario:
+    """Return the scenario of this name, the default one for None; raise ValueError for a held-out one."""
     chosen = find_scenario(problem.task, name)
     if not chosen.training:
         allowed = [s.name for s in problem.task.scenarios.values() if s.training]
@@ -192,7 +194,7 @@ def tune(
     if policy not in problem.baselines.tunable:
         raise nearest("tunable policy", policy, problem.baselines.tunable)
     tunable = problem.baselines.tunable[policy]
-    chosen = _scenario(problem, search.scenario)
+    chosen = _training_scenario(problem, search.scenario)
     task = make_task(problem.task, chosen.name)
     steps = search.episodes * (task.horizon // task.decision_interval)
     evaluations = search.budget // steps

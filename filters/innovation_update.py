@@ -47,10 +47,10 @@ def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Re
         available: 1 for entries received, 0 for others, ``(m, N)``.
     """
     H, R = (part[..., None] if part.ndim == 2 else part for part in (H, R))
-    return Received(available * innovation, available[:, None] * H, _independent(R, available), available)
+    return Received(available * innovation, available[:, None] * H, _isolate_missing(R, available), available)
 
 
-def _independent(S: Array, available: Array) -> Array:
+def _isolate_missing(S: Array, available: Array) -> Array:
     """Return a covariance ``(m, m, N)`` with rows and columns of the identity for entries not received."""
     xp = namespace(available)
     m = available.shape[0]
@@ -81,10 +81,10 @@ def update_with_gain(mean: Array, covariance: Array, received: Received, K: Arra
     joseph = product(product(rest, covariance), transpose(rest)) + product(product(K, R), transpose(K))
     joseph = 0.5 * (joseph + transpose(joseph))
     density, nis = log_density(nu, product(product(H, covariance), transpose(H)) + R)
-    return Update(mean + apply(K, nu), joseph, density + _of_missing(available), nis)
+    return Update(mean + apply(K, nu), joseph, density + _density_of_missing(available), nis)
 
 
-def _of_missing(available: Array) -> Array:
+def _density_of_missing(available: Array) -> Array:
     """Return the term ``m_missing log(2 pi) / 2`` by which a log-density exceeds that of m received entries,
     ``(N,)``.
     """
@@ -124,17 +124,17 @@ def unscented_update(
     R = R[..., None] if R.ndim == 2 else R
     joint, spread_out = transform(mean, covariance, lambda x: xp.concat([x, h(x)]), spread)
     nu = available * subtract(z, joint[n:])
-    S = _independent(spread_out[n:, n:] + R, available)
+    S = _isolate_missing(spread_out[n:, n:] + R, available)
     cross = available[:, None] * spread_out[n:, :n]
     gated, taken = S, nu
     if within_gates is not None:
         kept = within_gates(nu, S)
-        gated, taken, cross = _independent(S, kept), kept * nu, kept[:, None] * cross
+        gated, taken, cross = _isolate_missing(S, kept), kept * nu, kept[:, None] * cross
     K = transpose(solve_definite(gated, cross))
     density, nis = log_density(nu, S)
     return Update(
         mean + apply(K, taken),
         mirror_lower(covariance - product(K, cross)),
-        density + _of_missing(available),
+        density + _density_of_missing(available),
         nis,
     )

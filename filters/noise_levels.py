@@ -56,7 +56,7 @@ class LevelHypotheses(NamedTuple):
         )
 
 
-def squares(deviation: Array) -> Array:
+def outer_products(deviation: Array) -> Array:
     """Return the outer products ``d d^T`` of vectors ``(n, ...)`` as packed lower triangles."""
     xp = namespace(deviation)
     return xp.concat([deviation[j:] * deviation[j] for j in range(deviation.shape[0])], axis=0)
@@ -85,7 +85,7 @@ def merge(mean: Array, covariance: Array, weights: Array) -> Moments:
     shares = weights / total
     many = range(weights.shape[0])
     centre = ordered_sum(shares[i] * mean[:, i] for i in many)
-    spread = ordered_sum(shares[i] * (covariance[:, i] + squares(mean[:, i] - centre)) for i in many)
+    spread = ordered_sum(shares[i] * (covariance[:, i] + outer_products(mean[:, i] - centre)) for i in many)
     return Moments(centre, spread, total, shares)
 
 
@@ -117,7 +117,7 @@ def switch(
         sensors.append((1.0 - sensor_change) * mixed + sensor_change * levels)
     return LevelHypotheses(
         mean - other * deviation,
-        own * covariance + other * pool.covariance[:, None] + (own * other) * squares(deviation),
+        own * covariance + other * pool.covariance[:, None] + (own * other) * outer_products(deviation),
         after,
         tuple(sensors),
     )

@@ -148,7 +148,7 @@ def backward(
         raise ValueError(f"a lag is a number of later scans, at least 0, got {lag}")
     last, N, _ = track
     end = nothing_later(slice(last, last + 1))
-    compiled = _compiled(step, end) if last >= LEAST else None
+    compiled = _compile_step(step, end) if last >= LEAST else None
     carried, found = _scan(end, 0), [keep(end)]
     whole = lag is None or lag >= last
     length = max(1, TOGETHER // round_up_lanes(N)) if whole else max(lag or 1, TOGETHER // N)
@@ -156,7 +156,11 @@ def backward(
         beyond = min(first + length, last)
         if whole:
             given = track.given(slice(first, beyond))
-            some = _run(step, given, carried) if compiled is None else _run_compiled(compiled, given, carried)
+            some = (
+                _run_in_python(step, given, carried)
+                if compiled is None
+                else _run_compiled(compiled, given, carried)
+            )
             carried = _scan(some, 0)
         else:
             some = _run_lagged(compiled or step, track, nothing_later, lag or 0, slice(first, beyond))
@@ -182,8 +186,7 @@ def _run_lagged(
     return take_scans(carried, slice(0, scans.stop - scans.start))
 
 
-def _run(step: Step, given: Sequence[Any], carried: Carried) -> Carried:
-    """Return the carried values of some scans, from a loop in Python."""
+def _run_in_python(step: Step, given: Sequence[Any], carried: Carried) -> Carried:
     found = []
     for k in reversed(range(leaves(tuple(given))[0].shape[-2])):
         carried = step(*(_scan(part, k) for part in given), carried)
@@ -195,7 +198,7 @@ def _run(step: Step, given: Sequence[Any], carried: Carried) -> Carried:
 _traced = functools.lru_cache(16)(lambda step: CompiledFunction(step, Graph(), unchanged=0))
 
 
-def _compiled(step: Step, carried: Any) -> CompiledFunction | None:
+def _compile_step(step: Step, carried: Any) -> CompiledFunction | None:
     """Return the compiled form of a step on NumPy arrays; None for other arrays."""
     if not AVAILABLE or any(type(values) is not numpy.ndarray for values in leaves(carried)):
         return None

@@ -115,7 +115,7 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
             clocks = dict(reversed(clocks.items()))
     elif log_clock != table.clock:
         raise ValueError(f"the times of {name} are {table.clock}, and those of the log {log_clock}")
-    tolerance = _tolerance(task)
+    tolerance = _time_tolerance(task)
     shares = {which: _share_found(table, times, tolerance) for which, times in clocks.items()}
     best = max(shares, key=lambda which: shares[which])
     if shares[best] < LEAST_SHARE:
@@ -128,7 +128,7 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
     return clocks[best]
 
 
-def _tolerance(task: Task) -> float:
+def _time_tolerance(task: Task) -> float:
     return min(SAME_TIME, 0.25 * _usual_interval(task))
 
 
@@ -205,7 +205,7 @@ class FileTrack(Filter[Task, Any, FileState]):
             self._last.append(table.time[rows[-1]] if len(rows) else -numpy.inf)
         self._order, self._keys = numpy.concatenate(order), numpy.concatenate(keys)
         self._first = numpy.cumsum([0, *map(len, order)])[:-1]
-        self._interval, self._tolerance = _usual_interval(task), _tolerance(task)
+        self._interval, self._tolerance = _usual_interval(task), _time_tolerance(task)
 
     def start(self, initial: Any) -> FileState:
         """Return the state before the first row of the file."""

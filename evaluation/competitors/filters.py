@@ -290,8 +290,10 @@ class CheckedFilter(Filter[Task, Any, Checked]):
             missing = self.own.extra.get("missing")
         fault = find_fault(*self._stated(mean, covariance), before, missed, self.xp)
         lost = fault > 0.0
-        mean = self._held(lost, state.mean, mean)
-        return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed, missing)
+        mean = self._repeat_last_valid(lost, state.mean, mean)
+        return Checked(
+            own, mean, self._repeat_last_valid(lost, state.covariance, covariance), fault, missed, missing
+        )
 
     def _stated(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Fill components that the filter never reports: mean 0, covariance of the identity."""
@@ -302,7 +304,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         apart = numpy.eye(len(known))[:, :, None]
         return numpy.where(known[:, None], mean, 0.0), numpy.where(both, covariance, apart)
 
-    def _held(self, lost: Array, last: Array, estimate: Array) -> Array:
+    def _repeat_last_valid(self, lost: Array, last: Array, estimate: Array) -> Array:
         """Replace an estimate by the last valid one where the episode is lost; in place for filters in
         Python.
         """

@@ -348,13 +348,13 @@ class OnlineFilter:
         if self._policy is not None:
             after = self._decide(after, update.observation)
         elif self.watch is not None and before.measurements % self._interval == 0:
-            after = self._look(after, update.observed[: self.tracks])
+            after = self._compare_inputs(after, update.observed[: self.tracks])
         if self._is_in_python:
             update.act(self._no_action if self._policy is None else after.action[self._pad])
         self._state = after
         return update.report()
 
-    def _look(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
+    def _compare_inputs(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
         """Compare a network's inputs ``(N, fields)`` with those of its training."""
         if self.watch is not None and state.fresh is not None:
             self.watch.look(observation, state.fresh)
@@ -406,7 +406,7 @@ class OnlineFilter:
         state = state if self._lag else state._replace(history=History())
         kept = None if self._state is None else self._snapshot()
         try:
-            self._try(state)
+            self._check_state(state)
             self._resume(state)
         except Exception as error:  # a changed part can raise any error
             self._state = None
@@ -418,7 +418,7 @@ class OnlineFilter:
                 f"{quote_shortened(reason)}"
             ) from None
 
-    def _try(self, state: OnlineState) -> None:
+    def _check_state(self, state: OnlineState) -> None:
         """Check a state by an update with an example measurement; any error may be raised."""
         taken = state.history.taken
         first_track = lambda array: array[..., [0] * self.tracks]  # noqa: E731
@@ -479,7 +479,7 @@ class OnlineFilter:
         if number % self._interval == 0:
             inputs = numpy.ascontiguousarray(observation[:, : self.tracks].T)
             action, memory = self._policy.predict(inputs, state.policy, state.fresh)
-            state = self._look(state._replace(policy=memory, action=action), inputs)
+            state = self._compare_inputs(state._replace(policy=memory, action=action), inputs)
         return state
 
     def _estimate(self, time: Any, found: dict[str, Any]) -> Estimate:

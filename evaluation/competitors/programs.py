@@ -287,11 +287,15 @@ class ProgramEstimator:
         Keys for programs in plain C come first.
         """
         C, measured = len(self.task.components), list(fields_of(measurement))
-        numbers = {"initial": _count(self._fields), "measurement": _count(measured), "answer": C + C * C}
+        numbers = {
+            "initial": _count_entries(self._fields),
+            "measurement": _count_entries(measured),
+            "answer": C + C * C,
+        }
         offered = {}
         if self._feedback_field is not None:
             offered = {"feedback": [self._feedback_field._asdict()]}
-            numbers["feedback"] = _count([self._feedback_field])
+            numbers["feedback"] = _count_entries([self._feedback_field])
         return {
             "filtergym": VERSION,
             "tracks": self.count,
@@ -311,7 +315,7 @@ class ProgramEstimator:
     @property
     def _response_size(self) -> int:
         C = len(self.task.components)
-        return C + C * C + (0 if self._feedback_field is None else _count([self._feedback_field]))
+        return C + C * C + (0 if self._feedback_field is None else _count_entries([self._feedback_field]))
 
     def _greet(self, measurement: Any) -> None:
         """Exchange the first messages with the program: hello, format of messages, initial estimate."""
@@ -343,7 +347,7 @@ class ProgramEstimator:
         for own in fields:
             if own.shape is None:
                 continue
-            size = _count([own])
+            size = _count_entries([own])
             values = rows[:, place : place + size].reshape(-1, *own.shape)
             content[own.name] = as_lists(values if own.type == "float64" else values.astype(own.type))
             place += size
@@ -378,8 +382,7 @@ class ProgramEstimator:
         return numpy.concatenate(found, axis=1)
 
 
-def _count(fields: Sequence[ArrayField]) -> int:
-    """Return the number of entries of these fields for one track."""
+def _count_entries(fields: Sequence[ArrayField]) -> int:
     return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 
 

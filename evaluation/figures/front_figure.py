@@ -149,10 +149,10 @@ def name_points(figure: Any, panels: Mapping[Any, FrontPanel]) -> None:
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # names must not move the axes
     for axis, panel in panels.items():
-        _Names(figure, axis).place(panel)
+        _NamePlacement(figure, axis).place(panel)
 
 
-class _Names:
+class _NamePlacement:
     """Placement of competitors' names in one pair of axes, in pixels, in free places."""
 
     def __init__(self, figure: Any, axis: Any) -> None:

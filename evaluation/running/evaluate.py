@@ -28,7 +28,7 @@ from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
-from .metrics import bootstrap_of, units_of
+from .metrics import bootstrap_of, time_units_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import ProcessorTime, Progress, measure_time, run_episodes
@@ -204,7 +204,9 @@ def run_experiment(
             the control.
     """
     dataset = run_competitors(experiment, competitors, progress, workers)
-    if units_of(dataset) is not None and isinstance(bootstrap := bootstrap_of(dataset, 0), BlockBootstrap):
+    if time_units_of(dataset) is not None and isinstance(
+        bootstrap := bootstrap_of(dataset, 0), BlockBootstrap
+    ):
         dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
     return dataset
 

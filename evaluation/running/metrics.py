@@ -111,7 +111,7 @@ def cached_bootstrap(
     return Bootstrap(episodes, resamples, clusters=clusters)
 
 
-def units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
+def time_units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
     """Return the division of a single long episode into units of successive measurements; else None."""
     if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST:
         return TimeUnits(dataset.sizes["time"])
@@ -134,7 +134,7 @@ def bootstrap_over_time(
 
 def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
     """Return the bootstrap over the episodes of an evaluation, or of a single episode over blocks of time."""
-    if (units := units_of(dataset)) is None:
+    if (units := time_units_of(dataset)) is None:
         return bootstrap_of_episodes(dataset, resamples)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
     return bootstrap_over_time(units, [sums_over_time(run, units) for run in runs], resamples)
@@ -163,7 +163,7 @@ def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) 
     # An environment's own metrics need more of the truth than a recording contains.
     own = None if run.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)
-    units = units_of(run)
+    units = time_units_of(run)
     series = None if units is None else sums_over_time(run, units)
     reduction = reduce_run(run, declare, units or bootstrap_of_episodes(run))
     return Reduced(reduction, units, series, list(prediction_measures(run)), run)
@@ -392,7 +392,7 @@ def mean_cost(dataset: "xarray.Dataset", name: str) -> numpy.ndarray:
     return mean_over_time(dataset, dataset["cost"].sel(policy=name).values)
 
 
-class _Against:
+class _Comparisons:
     """Comparisons of every competitor's costs with the paper's algorithm, the reference and the best competitor.
 
     Ratios are geometric means over episodes.
@@ -432,7 +432,7 @@ class _Against:
                 columns += [_wins(own / self.costs[self.paper][part]) for own in costs]
         return numpy.stack(columns, axis=1)
 
-    def behind_best(self, name: str) -> Iterator[Measure]:
+    def with_best(self, name: str) -> Iterator[Measure]:
         """Yield the cost relative to the best competitor's, minus one, and the share of resamples that this one
         wins.
         """
@@ -447,7 +447,7 @@ class _Against:
         with numpy.errstate(invalid="ignore", over="ignore"):
             return self.bootstrap.interval(numpy.expm1(self.logs[name] - self.logs[other]))
 
-    def own(self, name: str) -> Iterator[Measure]:
+    def alone(self, name: str) -> Iterator[Measure]:
         """Yield the geometric mean cost, and the share of lost tracks if the environment defines them."""
         if name in self.logs:
             with numpy.errstate(over="ignore"):
@@ -460,7 +460,7 @@ class _Against:
                 share = bootstrap.interval(lost) if bootstrap.ragged else of_episodes
                 yield Measure("lost_tracks", "", "all", share, "1")
 
-    def others(self, name: str) -> Iterator[Measure]:
+    def with_paper(self, name: str) -> Iterator[Measure]:
         """Yield the score, the win rate and the paired cost differences to the paper's algorithm."""
         if name not in self.wins:
             return
@@ -618,14 +618,14 @@ def records_of(
 ) -> list[Record]:
     """Return all records of an evaluation, from its competitors' statistics and comparisons between them."""
     attrs = evaluation.attrs
-    against = _Against(contenders, attrs, bootstrap)
+    against = _Comparisons(contenders, attrs, bootstrap)
 
     def finite(value: float) -> float | None:
         return float(value) if math.isfinite(value) else None
 
     records = []
     for c in contenders:
-        compared = *against.own(c.name), *against.others(c.name), *against.behind_best(c.name)
+        compared = *against.alone(c.name), *against.with_paper(c.name), *against.with_best(c.name)
         measures = [*c.measures, *compared, *c.further]
         measures += _compare_causes(c, contenders, bootstrap)
         for m in measures:
