@@ -106,11 +106,11 @@ class FittedLog:
         return float(numpy.nanmedian(numpy.diff(self.recording.seconds, axis=1)))
 
     def with_noise(self, family: Tunable, is_own: bool = False, robust: bool = False) -> Tunable:
-        """Return a family of filters with the measurement noise's scale as one more parameter, if ``noise``
-        is set.
+        """Return a filter family with the measurement noise's scale, and with ``robust`` outliers, as more
+        parameters.
 
-        A family with a second sensor is returned unchanged. With ``robust`` the share of outliers is added,
-        except to a user's family (``is_own``).
+        A family with a second sensor is returned unchanged; the scale is added if ``noise`` is set, the share
+        of outliers not to a user's family (``is_own``).
         """
         log_format = find_companion(self.problem.task, LogFormat)
         if family.anchored or log_format is None or log_format.scale_noise is None:

@@ -77,7 +77,7 @@ class Profile(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A filter fitted to a recording."""
+    """Fitted parameters of a filter, with the log-likelihood of the recording."""
 
     values: dict[str, float]
     """Values of the parameters in the units of the search."""
@@ -147,7 +147,7 @@ def with_noise_scale(tunable: Tunable, scale: Callable[[Any, Any], Any]) -> Tuna
 
 
 class RobustState(NamedTuple):
-    """State of a filter that models outliers."""
+    """State of a filter that models outliers, with the likelihood of the mixture."""
 
     own: Any
     """State of the inner filter."""
@@ -246,8 +246,8 @@ def fit_stretches(
 
 
 def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[float]) -> Fit:
-    """Make the fit at ``best`` from ``count`` measurements, with maximum and spread of all searches'
-    ``values``.
+    """Make the :class:`Fit` at the parameters ``best``; ``values`` are the log-likelihoods that all searches
+    found.
     """
     low, high = numpy.array(list(tunable.limits.values())).T
     edge = 1e-3 * (high - low)

@@ -57,7 +57,7 @@ class CovarianceMatching(Policy):
 
 
 class StateSpaceInteractingMultipleModel(ConstantPolicy):
-    """The interacting multiple model of the hypotheses."""
+    """The interacting multiple model of the user's hypotheses, without added evidence."""
 
     control = "evidence"
 
@@ -390,7 +390,7 @@ class KnownModel:
         return truth._replace(state=None, inputs=None, sensors=None, waiting=None)
 
     def take(self, state: EstimateState, one: Past) -> EstimateState:
-        """Return the state predicted to a measurement and updated with it."""
+        """Predict to a measurement by the true model and update with it; return the state."""
         (measurement, truth, _), xp, chosen = one, self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.is_switching else world.equations[:1]):

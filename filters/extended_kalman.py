@@ -50,7 +50,7 @@ class JacobianRow(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """Result of a measurement update by scalar observations."""
+    """Updated mean and covariance, log-likelihood and squared residuals of scalar observations."""
 
     mean: Array
     """Updated mean, ``(n, ...)``."""

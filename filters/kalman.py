@@ -16,7 +16,7 @@ from .small_matrices import apply, product, solve_definite, transpose
 
 
 class Update(NamedTuple):
-    """Result of a measurement update."""
+    """Result of a measurement update: mean, covariance, log-likelihood and NIS."""
 
     mean: Array
     """Updated mean, ``(n, N)``."""

@@ -291,7 +291,7 @@ def _check_regulator(F: Matrix, B: Matrix, weight: Matrix, R: Matrix) -> None:
 
 
 class Regulator(NamedTuple):
-    """Linear-quadratic regulator of a plant whose state is known."""
+    """Gain of a linear-quadratic regulator, and the cost of deviations from its control."""
 
     feedback: Matrix
     """Gain L of ``u = -L x``, ``(r, n)``."""

@@ -137,7 +137,7 @@ class SensorUpdate(NamedTuple):
 
 
 class SensorNoise(NamedTuple):
-    """Distribution of the noise level of a sensor."""
+    """Levels of a sensor's noise, their probabilities, and the share and variance of outliers."""
 
     variances: Array
     """Variances of the levels, ascending, ``(L, H, 1)``."""

@@ -68,7 +68,7 @@ def propagator(F: numpy.ndarray) -> numpy.ndarray:
 
 
 class PackedUpdate(NamedTuple):
-    """Result of an update with measurements of single coordinates."""
+    """Updated mean and packed covariance, log-likelihood and NIS of measurements of coordinates."""
 
     mean: Array
     """Updated mean, ``(n, N)``."""

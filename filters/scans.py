@@ -110,7 +110,7 @@ def repeat(part: Any, last: tuple[int, int]) -> Any:
 
 
 class Track(NamedTuple):
-    """Input of a backward recursion, made for a slice of the scans at a time."""
+    """Input of a backward recursion over the scans of a track, given by a function of slices of the scans."""
 
     scans: int
     """Number of scans K."""

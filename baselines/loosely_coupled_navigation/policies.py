@@ -78,7 +78,7 @@ class BestConstant(FixedGain):
 
 
 class _Variances(NamedTuple):
-    """Memory of the gain schedules."""
+    """Variances of estimate and innovations that a gain schedule carries from sample to sample."""
 
     P: numpy.ndarray
     """Variance of the estimate after the last sample, ``(N, axes)``, m^2."""
@@ -176,7 +176,9 @@ class InnovationAdaptive(TimeVarying):
 
 
 class _Offset(NamedTuple):
-    """Memory of :class:`AugmentedGain`."""
+    """Memory of :class:`AugmentedGain`: its augmented filter, and that filter's distance from the steered
+    estimate.
+    """
 
     offset: numpy.ndarray
     """Estimate of the augmented filter less the steered one, ``(axes, N)``, m."""

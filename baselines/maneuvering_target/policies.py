@@ -45,7 +45,7 @@ class InteractingMultipleModel(Policy):
         return imm.mode_posterior(log_predicted.T, log_likelihood.T).T
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the posterior mode probabilities as action: the weights of the filters."""
+        """Return the posterior mode probabilities as action (weights of the filters), and no memory."""
         return self.probabilities(observation), None
 
 

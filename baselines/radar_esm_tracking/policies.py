@@ -29,7 +29,7 @@ class QuasiOptimal(PaperAction):
 
 
 class FixedWeights(ConstantPolicy):
-    """The uniform combination of the filters, constant."""
+    """Policy of equal, constant weights of all filters."""
 
     control = "weights"
 

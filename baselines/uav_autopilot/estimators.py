@@ -192,7 +192,7 @@ class AdaptiveGusts(AdaptiveKalman):
 
 
 class GustModels(NamedTuple):
-    """Filters for several levels of the gusts."""
+    """Filters for several levels of the gusts, and the probabilities of the levels."""
 
     filters: tuple[SensorAware, ...]
     probabilities: Array

@@ -9,7 +9,7 @@ from ...filters import linear_systems
 
 
 class Stationary(NamedTuple):
-    """Second moments of a steady-state linear loop without command."""
+    """Variances of output and control, and mean cost, of a steady-state loop without command."""
 
     output_variance: float
     control_variance: float

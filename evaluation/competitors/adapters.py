@@ -119,10 +119,11 @@ class SingleTrackEstimator(ABC):
         """Return mean ``(n,)`` and covariance ``(n, n)`` of a track, in the order of ``state``."""
 
     def reading(self, measurement: Any) -> tuple[Array, Array]:
-        """Return the measured vector, ``(m,)`` or None, and its noise covariance, ``(m, m)``.
+        """Return the measured vector, ``(m,)``, or None if it was not received, and its noise covariance,
+        ``(m, m)``.
 
-        It must be a linear function of the state. By default it is the position, for tasks whose measurement has
-        ``position`` and ``variance``; None where it is not ``available``.
+        It must be a linear function of the state. By default it is the position, for tasks whose measurement
+        has ``position`` and ``variance``.
         """
         if not hasattr(measurement, "position") or not hasattr(measurement, "variance"):
             raise ValueError(

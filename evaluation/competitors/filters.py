@@ -235,7 +235,7 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
 
 
 class Checked(NamedTuple):
-    """State of a :class:`CheckedFilter`."""
+    """State of a :class:`CheckedFilter`: state of the wrapped filter, last valid estimate, and fault."""
 
     own: Any
     """State of the filter."""

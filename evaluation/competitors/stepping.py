@@ -316,7 +316,7 @@ class ModelUpdate:
         """State of the filter, in arrays that are never changed."""
 
     def receive(self, measurement: Any) -> None:
-        """Predict to a measurement."""
+        """Store a measurement and predict the filter to its time."""
         self._received.put(measurement)
         measured = self._received.copy()
         self._episode = Episode((), measured, self._model.predict_filter(self.state, measured))

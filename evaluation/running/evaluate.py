@@ -349,7 +349,9 @@ class Plan(NamedTuple):
         )
 
     def time(self, name: str) -> ProcessorTime | None:
-        """Measure the processor time of a competitor for a measurement, see :func:`.rollout.measure_time`."""
+        """Measure a competitor's processor time for a measurement; None where :func:`.rollout.measure_time`
+        gives none.
+        """
         with report_running(name, timed=False):
             return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 

@@ -119,7 +119,9 @@ def time_units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
 
 
 def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | None:
-    """Return sums and numbers of a competitor's costs, or log-likelihoods, in units of time, ``(units, 2)``."""
+    """Return sums and numbers of costs, or else log-likelihoods, in units of time, ``(units, 2)``; None
+    without both.
+    """
     known = [name for name in ("cost", "log_likelihood") if name in run]
     return units.sums_of_present(run[known[0]].values) if known else None
 

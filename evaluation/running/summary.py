@@ -109,7 +109,7 @@ def file_stem(experiment: Experiment) -> str:
 
 
 class Evaluation(NamedTuple):
-    """Results of an evaluation."""
+    """Results of an evaluation: dataset, records, curves and costs."""
 
     dataset: xarray.Dataset
     """Values of every episode (:func:`.evaluate.run_experiment`); for summaries only coordinates, attributes and
@@ -334,7 +334,7 @@ class SeparateResults(NamedTuple):
 
 
 def reduce_alone(run: xarray.Dataset, request: EvaluationRequest) -> SeparateResults:
-    """Reduce one competitor's part of an evaluation over flights, a recording or one episode."""
+    """Reduce one competitor's evaluation over flights, a recording or one episode to sums, costs and curves."""
     episodes, times = run.sizes["episode"], run.sizes["time"]
     flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
     if not run.attrs["truth"] or (recorded and episodes > MOST_RECORDINGS):

@@ -77,7 +77,7 @@ def active_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
 def cause_sums(
     run: "xarray.Dataset", nees: numpy.ndarray | None, units: TimeUnits | None = None
 ) -> numpy.ndarray:
-    """Sum number, cost and NEES of the measurements under each cause over every episode, or unit of time.
+    """Sum costs and NEES, and count them, under each cause over every episode or unit of time.
 
     Args:
         run: one competitor's part of some episodes.
@@ -142,7 +142,9 @@ def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -
 
 
 def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) -> str:
-    """Return the ranked competitor of lowest cost among the others, to compare with; empty if there is none."""
+    """Return the competitor of lowest cost among the others, a ranked one if there is any; empty without
+    others.
+    """
     others = [other for other in costs if other != name]
     return min([other for other in others if other in ranked] or others, key=costs.__getitem__, default="")
 
