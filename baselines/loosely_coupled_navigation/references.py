@@ -129,6 +129,8 @@ class MatchedCovariance(_Matched):
     kind = "bound"
 
     def update(self, memory: ErrorState, measurement: Measurement, truth: Truth) -> tuple[Array, ErrorState]:
-        """Return the variance of the error of every axis, m^2, ``(A, N)``, and the memory."""
+        """Predict and update with the true noise levels; return each axis's error variance, m^2, ``(A, N)``, and
+        the memory.
+        """
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

@@ -142,7 +142,8 @@ class _KnownMode:
 
 
 class KnownMode(_KnownMode):
-    """One extended Kalman filter that knows the draw of the episode: legs, faults, and all noise levels.
+    """One extended Kalman filter that knows the draw of the episode: manoeuvres, faults, and all noise
+    levels.
 
     At rest, and in straight flight on the fixed courses, which has steady increments and no noise, the bank's small
     regularising noise remains, so that the reported covariance stays invertible.
