@@ -7,9 +7,8 @@ observation j with variance r_j:
     x += g nu' / sqrt(s),  P -= g g^T
 
 This is step 6 of Moroz's paper on an adaptive multi-hypothesis measurer, ``P = (P'^-1 + H^T R^-1 H)^-1``, ``x
-= x' + P H^T R^-1 nu``, for a diagonal R. It inverts nothing, keeps P exactly symmetric, uses the zeros of h,
-leaves out unavailable observations, and its terms nu'^2 / s are independent contributions to the normalised
-innovation squared, in the order in which the observations are taken.
+= x' + P H^T R^-1 nu``, for a diagonal R. It keeps P exactly symmetric, and its terms nu'^2 / s are
+independent contributions to the normalised innovation squared.
 
 Reading: steps 5 and 6 of the paper write the Jacobian once through the picked parameters v = c x and once
 directly; one Jacobian with respect to the state is used.
@@ -22,10 +21,9 @@ fixed point is
 
     s' = h P h^T + r' = max(s, sqrt(r) |nu'| / k),
 
-and s' takes the place of s. The prediction has its usual weight: an innovation that h P h^T explains is no
-outlier. Sources: P. J. Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 35,
-1964; in the update of a Kalman filter, by reweighting: Z. M. Durovic and B. D. Kovacevic, Robust estimation with
-unknown noise statistics, IEEE Transactions on Automatic Control 44, 1999.
+and s' takes the place of s. Sources: P. J. Huber, Robust estimation of a location parameter, Annals of
+Mathematical Statistics 35, 1964; in the update of a Kalman filter, by reweighting: Z. M. Durovic and B. D.
+Kovacevic, Robust estimation with unknown noise statistics, IEEE Transactions on Automatic Control 44, 1999.
 
 Gain of another variance. With a caution c the gain is ``k = P h^T / (h P h^T + c r)``, of the noise c r in place of r;
 the covariance that it leaves is that of Joseph's form, ``P -= k u^T + u k^T`` with ``u = P h^T - s k / 2``.

@@ -14,7 +14,7 @@ Reading: the paper's ``+I Q`` in the first line of (12) is ``+ R``; with samplin
 Reading: the correcting term of (5) bounds P only when the model is detectable *and* noise reaches every
 integrating or unstable mode; :func:`steady_kalman` refuses the rest, with the mode that is to blame.
 
-One model at a time, plain NumPy and SciPy: this is work done once, before a filter runs.
+One model at a time, in plain NumPy and SciPy.
 """
 
 import math

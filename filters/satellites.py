@@ -16,7 +16,7 @@ With the unit vectors u_j from the user to the satellites and the design matrix 
 covariance of a single-epoch fix is ``(G^T G)^-1`` in units of the pseudorange variance; the roots of its
 diagonal are the dilutions of precision (Kaplan and Hegarty, Understanding GPS/GNSS, 2017, section 11.2.1).
 
-Plain NumPy: ephemerides are constants of an experiment, tabulated once.
+Plain NumPy.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,6 @@
 """Backward recursions over the scans of a track, compiled for NumPy arrays.
 
-A long recursion on NumPy arrays is compiled: one native call processes many scans. Apart from the track and the result
-memory does not grow with the number of scans.
+A long recursion on NumPy arrays is compiled: one native call processes many scans.
 
 Shapes: a time axis of K scans stands before the batch, ``(..., K, N)``.
 """

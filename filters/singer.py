@@ -15,7 +15,7 @@ R. A. Singer, Estimating Optimal Tracking Filter Performance for Manned Maneuver
 Reading: that paper names its process noise without giving it; Q is Singer's exact one.
 
 The closed forms subtract numbers that agree to (alpha T)^2 (Phi) and (alpha T)^5 (Q); below alpha T = 1 a
-series and a quadrature take their place. These are design functions of one model: scalars in, NumPy out.
+series and a quadrature take their place.
 """
 
 import math

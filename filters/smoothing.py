@@ -22,12 +22,11 @@ and mu_i the smoothed estimate is the mixture of all N(x_i, P_i) B_j with the we
 needs no further approximation.
 
 Approximations: the forward filter is an IMM, and the sum of B_j is replaced by one quadratic form. Reading:
-that one gives the same mean and covariance as the sum where it meets the filtered N(x_i, P_i). A sum may
-leave an estimate less certain than the filter was, in some direction, because the modes disagree about the
-future; no likelihood of this form does that, and in this direction later measurements add nothing. With one
-model nothing is approximated. Rauch-Tung-Striebel recursions mode by mode (Kim, Journal of Econometrics 60,
-1994; Nadarajah, Tharmarasa, McDonald and Kirubarajan, IEEE Trans. AES 48, 2012, 2673-2678) are shorter, but
-correct a mode without noise by a smoothed state that it could never have reached.
+that one gives the same mean and covariance as the sum where it meets the filtered N(x_i, P_i). Where the sum
+would leave an estimate less certain than the filter's, in some direction, later measurements add nothing.
+Rauch-Tung-Striebel recursions mode by mode (Kim, Journal of Econometrics 60, 1994; Nadarajah, Tharmarasa,
+McDonald and Kirubarajan, IEEE Trans. AES 48, 2012, 2673-2678) are shorter, but correct a mode without noise
+by a smoothed state that it could never have reached.
 
 **A fixed lag** is the same recursion begun anew L scans after each: all scans take one step together, L times over.
 

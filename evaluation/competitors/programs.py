@@ -1,20 +1,6 @@
 """Programs in any language as competitors: separate processes that use standard input and output.
 
-This is version 1 of the protocol; docs/programs.md describes it for authors of programs.
-
-1. This package writes a line of JSON, the **hello**: the estimated components, the fields of the messages, and the
-    number of tracks.
-2. The program writes a line: the version, and the format of all further messages, ``json`` or ``float64``; or an
-    ``error``, one sentence, and then takes no part.
-3. This package writes the initial estimate, which has no response, and then one measurement after another. For each the
-    program writes means and covariances before the next one is sent.
-4. At the end this package closes the program's standard input, and the program ends.
-
-As ``json`` a message is a line, as ``float64`` a frame of little-endian numbers without a head: for every
-track its fields, or mean and covariance, row by row.
-
-Where the task defines feedback (:class:`.ArrayMeanings`), the hello offers it. A program that responds with
-``"feedback": true`` writes its feedback after mean and covariance.
+docs/programs.md describes version 1 of the protocol: a hello, the format of the messages, measurements and responses.
 """
 
 import json

@@ -8,8 +8,8 @@ columns are those that ``filtergym evaluate --estimates`` and the programs of ``
     seconds (or time, t), log_time     time of the log, or s since the start of the track; see below
     estimate_X (or mean_X, X)          mean of the component X, in its unit
     sigma_X                            its standard deviation; or
-    covariance_X_Y                     of two components, in either order; zero where a pair is left out log_likelihood,
-    nis, nis_degrees   statistics of the predicted measurement
+    covariance_X_Y                     of two components, in either order; zero where a pair is left out
+    log_likelihood, nis, nis_degrees   statistics of the predicted measurement
 
 Times are read as in a log: seconds, a smaller unit since 1970, dates, or times of day.
 """
