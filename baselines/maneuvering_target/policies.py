@@ -81,14 +81,14 @@ class FixedGain(ConstantPolicy):
 
 
 class FixedLow(FixedGain):
-    """The smallest of the bank's gains, constant."""
+    """The smallest of the bank's gains, as constant action."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, min(model.task.parameters.gains))
 
 
 class FixedHigh(FixedGain):
-    """The largest of the bank's gains, constant."""
+    """The largest of the bank's gains, as constant action."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, max(model.task.parameters.gains))

@@ -79,7 +79,7 @@ class _Posterior(Policy):
 
 
 class RadarOnly(_Posterior):
-    """Class probabilities from the radar's innovations alone."""
+    """Policy of class probabilities from the radar's innovations alone."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Return the log-probability of each class by prior and radar, up to a constant, ``(M, N)``."""
@@ -87,7 +87,7 @@ class RadarOnly(_Posterior):
 
 
 class EsmOnly(_Posterior):
-    """Class probabilities from the ESM decisions alone, each taken as new evidence, as in (8)."""
+    """Policy of class probabilities from the ESM decisions alone, each taken as new evidence, as in (8)."""
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Return the log-probability of each class by prior and ESM decisions, up to a constant, ``(M, N)``."""

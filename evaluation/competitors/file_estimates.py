@@ -137,9 +137,7 @@ def _usual_interval(task: Task) -> float:
 
 
 def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
-    """Raise ValueError if most rows are outside a simulated episode, with intervals at most twice the usual
-    one.
-    """
+    """Raise ValueError if most times of the file are not within twice the length of a simulated episode."""
     end = (task.horizon + 1) * _usual_interval(task)
     if numpy.mean((table.time >= 0.0) & (table.time <= 2.0 * end)) < LEAST_SHARE:
         raise ValueError(

@@ -214,7 +214,7 @@ class PythonFilter(Filter[Task, Any, AdaptedState]):
         return own.feedback if is_program(own) else None
 
     def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
-        """Return an entry of the estimate as float64 array; raise ValueError for another shape or type."""
+        """Return mean or covariance (``word``) as float64 array; raise ValueError for another shape or type."""
         where = f"{self.name}: the {word} at measurement {self.step_number}"
         try:
             given = numpy.asanyarray(values)

@@ -66,7 +66,9 @@ class Decider:
         self.means: DecisionMeans = DecisionMeans(model.fields, self.interval)
 
     def start(self, zero: Array) -> Decisions:
-        """Return the policy's state before the first decision, with N as in the zeros ``zero`` ``(N,)``."""
+        """Return the policy's state before the first decision, for as many tracks as there are zeros in
+        ``zero``.
+        """
         memory = map_arrays(
             lambda array: self.xp.stack([zero] * max(int(numpy.size(array)), 1)), self._template
         )

@@ -51,7 +51,8 @@ Series = tuple[tuple[str, ...], numpy.ndarray]
 
 @one_thread()
 def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarray.Dataset:
-    """Return the data of an evaluation's figures: errors, consistency and actions over time, costs by stretch.
+    """Return the data of an evaluation's figures, such as errors and consistency over time, and costs by
+    stretch.
 
     Args:
         dataset: evaluation, in memory or read from a file; also with some of its policies only.

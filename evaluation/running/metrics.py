@@ -463,7 +463,7 @@ class _Comparisons:
                 yield Measure("lost_tracks", "", "all", share, "1")
 
     def with_paper(self, name: str) -> Iterator[Measure]:
-        """Yield the score, the win rate and the paired cost differences to the paper's algorithm."""
+        """Yield comparisons with the paper's algorithm, such as score, win rate and paired cost differences."""
         if name not in self.wins:
             return
         bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
@@ -515,7 +515,8 @@ def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
 
 @one_thread()
 def flight_records(dataset: "xarray.Dataset") -> list[Record]:
-    """Return the records of every flight: cost, errors and differences to the paper's algorithm.
+    """Return the records of every flight of an evaluation, such as cost, errors, and differences to the
+    paper's algorithm.
 
     Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
     """

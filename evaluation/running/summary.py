@@ -217,7 +217,8 @@ def summaries(
     progress: Progress | None = None,
     store: Store | None = None,
 ) -> Iterator[tuple[int, Summary]]:
-    """Evaluate requests for competitors of any environments; yield each one's summary when it is finished.
+    """Evaluate requests for competitors, or read stored summaries; yield number and summary of each when
+    available.
 
     Args:
         requests: the requests, started in this order.

@@ -102,7 +102,7 @@ def cause_sums(
 def split_by_cause(
     sums: numpy.ndarray, run: "xarray.Dataset", bootstrap: Bootstrap
 ) -> tuple[list[CauseMeasure], CauseCosts]:
-    """Compute share of cost, mean cost and ANEES under each cause that occurs.
+    """Compute statistics such as share of the cost, mean cost and ANEES under each cause that occurs.
 
     Args:
         sums: means over the episodes of :func:`cause_sums`, ``(1 + resamples, causes, 4)``.

@@ -103,7 +103,7 @@ def slices_of(dataset: "xarray.Dataset") -> dict[str, slice]:
 
 
 def with_windows(dataset: "xarray.Dataset", windows: Mapping[str, tuple[int, int]]) -> "xarray.Dataset":
-    """Replace the windows of a dataset."""
+    """Return a dataset with these windows in place of its own."""
     dataset = dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore")
     return dataset.assign_coords(window_coords(windows))
 

@@ -77,7 +77,7 @@ class Stream:
         return map_arrays(lambda values: values[number], self.measurements)
 
     def select(self, numbers: Sequence[int] | numpy.ndarray) -> "Stream":
-        """Select measurements by their numbers, in this order; intervals do not change."""
+        """Return a stream of the measurements with these numbers, in this order; intervals do not change."""
         index = numpy.asarray(numbers)
         return replace(
             self,
@@ -87,11 +87,11 @@ class Stream:
         )
 
     def with_fields(self, **fields: Any) -> "Stream":
-        """Replace fields of the measurements."""
+        """Return a stream with some fields of its measurements replaced."""
         return replace(self, measurements=self.measurements._replace(**fields))
 
     def with_readings(self, readings: numpy.ndarray) -> "Stream":
-        """Replace the readings, where readings were received."""
+        """Return a stream with other readings where readings were received."""
         return self.with_fields(**{self.reading_field: numpy.where(self.received, readings, self.readings)})
 
     @property
@@ -105,7 +105,7 @@ class Stream:
         return numpy.broadcast_to(available > 0.0, self.readings.shape)
 
     def with_times(self, seconds: numpy.ndarray) -> "Stream":
-        """Replace the times of a timed stream's measurements, s, ``(K, N)``."""
+        """Return a timed stream with other times of its measurements, s, ``(K, N)``."""
         interval = numpy.diff(seconds, axis=0, prepend=0.0 * seconds[:1])
         fields = {"interval": interval}
         elapsed = type(self.task.world).elapsed_field
@@ -114,7 +114,7 @@ class Stream:
         return self.with_fields(**fields)
 
     def mark_missing(self) -> "Stream":
-        """Mark readings of NaN as not received, as the input of an online filter does."""
+        """Return a stream with readings of NaN marked as not received, as the input of an online filter does."""
         field, missing = type(self.task.world).received_field, numpy.isnan(self.readings)
         if not field or not missing.any():
             return self
@@ -123,7 +123,7 @@ class Stream:
         return self.with_fields(**{field: numpy.where(missing, 0.0, self.readings), "available": available})
 
     def renumber(self) -> "Stream":
-        """Count scan numbers from 1 on again, if measurements have them."""
+        """Return a stream with scan numbers from 1 on, if measurements have such numbers."""
         counter = LiveReader.of(self.task).input.counter
         values = getattr(self.measurements, counter, None)
         if values is None:
