@@ -62,7 +62,7 @@ def own_family(name: str, cls: Any) -> Tunable:
 
 
 class Artefact(NamedTuple):
-    """Content of an advised filter's file."""
+    """Content of an advised filter's file: name of the family, maker of the filter, and options for its log."""
 
     filter: str
     """Name of the family, or of the shipped filter."""

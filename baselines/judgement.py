@@ -210,8 +210,8 @@ class Judgement:
         return squares.relative_root(self._numbers[name], self._numbers[other])
 
     def difference(self, name: str, other: str) -> IntervalEstimate:
-        """Return the difference of two filters' log-likelihoods in the choice, less one nat for each fitted
-        parameter.
+        """Return the difference of two filters' mean log-likelihoods in the choice, less one nat in all for
+        each parameter.
         """
         found = self._chosen.difference(self._numbers[name], self._numbers[other])
         penalty = self._penalty(name) - self._penalty(other)

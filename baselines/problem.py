@@ -73,7 +73,8 @@ class Problem:
         return self.baselines.score_paper
 
     def paper_among(self, competitors: Mapping[str, Any]) -> str:
-        """Return which competitor is the paper's algorithm, to which costs are relative; empty if none is.
+        """Return the name of the paper's algorithm among competitors, or else its usual one; empty without
+        such baselines.
 
         Args:
             competitors: makers by name; a stronger reading of the paper among them comes first.

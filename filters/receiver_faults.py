@@ -168,7 +168,7 @@ def update_fault(P: FaultCovariance, along: Direction, weight: Array) -> FaultCo
 
 
 class NoiseMixture(NamedTuple):
-    """Statistics of an innovation whose noise is a Gaussian sum."""
+    """Log-density, weights of the noise levels, and score of an innovation whose noise is a Gaussian sum."""
 
     log_density: Array
     """Log-density of the innovation on all axes, ``(...)``."""

@@ -128,7 +128,7 @@ def backward(
     lag: int | None = None,
     keep: Callable[[Carried], Any] = lambda carried: carried,
 ) -> Any:
-    """Run a recursion from the last scan of a track to the first; return the carried values of all K scans.
+    """Run a recursion from the last scan of a track to the first; return its values at all K scans.
 
     Args:
         step: step of the recursion; the same object in every call, since its compiled form is cached.

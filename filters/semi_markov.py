@@ -93,7 +93,7 @@ def merge(hypotheses: AgedHypotheses) -> AgedHypotheses:
 
 
 def grow_older(table: AgedHypotheses, new: AgedHypotheses) -> AgedHypotheses:
-    """Return the table one step later: every age increases by one, and the last two are merged.
+    """Return the table a step later: ages increase by one, ``new`` is the first, and the last two are merged.
 
     Args:
         table: table before.

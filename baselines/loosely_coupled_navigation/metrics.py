@@ -118,7 +118,9 @@ def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray)
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics by name, as sums and numbers of terms; empty for a bound."""
+    """Return each episode's sums, and numbers of terms, from which the metrics follow, by name; empty for a
+    bound.
+    """
     if "available" not in run or numpy.isnan(run["available"].values).all():
         return MetricInputs()
     task = make_task(LooselyCoupledNavigation, run.attrs["scenario"], **keywords_of(run))
@@ -151,7 +153,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics of recovery, detection and integrity from the episodes' sums, with intervals.
+    """Return the metrics of recovery, detection and integrity with intervals.
 
     ``recovery_time`` after an outage and the share of runs that do not recover within a second (``not_recovered``).
     ``detection_time`` of spoofing that is detected, the share that is not while it lasts (``missed_spoofing``), and

@@ -51,7 +51,9 @@ def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics in clutter, by name; empty without clutter and for a bound."""
+    """Return each episode's numbers from which the metrics in clutter follow, by name; empty without clutter and
+    for a bound.
+    """
     if "false_association" not in run or str(run["kind"].values) == "bound":
         return MetricInputs()
     distance = numpy.sqrt(squared_errors(run, "position", groups_of(run)))
@@ -65,7 +67,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics of tracks in clutter from the episodes' terms, with intervals.
+    """Return the metrics in clutter with intervals: GOSPA, lost tracks and false associations.
 
     ``gospa``: mean over scans and episodes, m. ``track_loss_rate``: share of episodes with ``LASTING`` scans in a row
     whose error exceeds ``CUTOFF``; ``track_loss_scan``: median of the first of them, over the tracks lost.

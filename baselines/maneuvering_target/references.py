@@ -17,7 +17,7 @@ uses.
 
 
 class TurnMemory(NamedTuple):
-    """State of :class:`KnownTurn`."""
+    """State of :class:`KnownTurn`: its estimate, and the truth at the last scan."""
 
     mean: Array
     covariance: Array

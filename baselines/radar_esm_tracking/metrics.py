@@ -82,7 +82,7 @@ def _group_masks(true_class: numpy.ndarray) -> numpy.ndarray:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics, by name; none for a bound, no probabilities for a
+    """Return each episode's numbers from which the metrics follow, by name; none for a bound, fewer for a
     reference.
     """
     if _missing(run, "true_class"):
@@ -156,7 +156,7 @@ def _last(seconds: numpy.ndarray) -> int:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics from the episodes' terms: errors by true class, recognition, and calibration.
+    """Return the metrics of all episodes with intervals: errors by true class, recognition, and calibration.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
     ``time_to_recognise_median``, ``_90_quantile`` (first P(true class) >= 0.9) and ``_censored``, the share of

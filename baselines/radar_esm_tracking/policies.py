@@ -109,7 +109,7 @@ class Ungated(_Posterior):
 
 
 class JointType(_Posterior):
-    """Posterior over type and class together: right where a target has one type.
+    """Policy of the joint posterior of type and class: right where a target has one type.
 
     Args:
         refused: weight of a decision that the gate rejects, 0 to 1.
@@ -131,7 +131,7 @@ class JointType(_Posterior):
 
 
 class ForgettingJointType(JointType):
-    """Posterior over type and class together where the class may change, and the type with it: old evidence fades.
+    """Policy of the joint posterior of type and class where both may change: old evidence fades.
 
     Args:
         change: probability that the class changes from one decision to the next; by default once in 500

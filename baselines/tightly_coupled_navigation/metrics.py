@@ -74,7 +74,7 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics, by name; empty for a bound."""
+    """Return each episode's numbers from which the metrics follow, by name; empty for a bound."""
     if str(run["kind"].values) == "bound":
         return MetricInputs()
     true_mode = run["true_mode"].values.astype(int)
@@ -105,7 +105,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 
 def _integrity(run: "xarray.Dataset") -> Arrays:
-    """Return each episode's terms of integrity, innovation correlation and fault detection, by name."""
+    """Return each episode's numbers for integrity, innovation correlation and fault detection, by name."""
     limit = chi_square_quantile(1.0 - RISK, run.sizes["component"])
     found: dict[str, numpy.ndarray] = {"misleading": (run["nees"].values > limit).mean(axis=1)}
     if "nis" not in run or numpy.isnan(run["nis"].values).all() or "sensor_fails" not in run:
@@ -136,7 +136,9 @@ def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarra
 
 
 def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Arrays:
-    """Return each episode's share of false alarms, and whether and when its first fault is detected, by name."""
+    """Return each episode's number of false alarms, and whether and when its first fault is detected, by
+    name.
+    """
     fault, first = numpy.logical_or.reduce(fails, axis=1), fails.argmax(axis=1)
     steps, length = numpy.arange(alarm.shape[1]), alarm.shape[1]
     # A fault has effects after its end: only alarms before the first fault are false.
@@ -164,7 +166,8 @@ def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> num
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics from the episodes' terms: errors by hypothesis, adaptation, loss of track, integrity.
+    """Return the metrics of all episodes with intervals, such as errors by hypothesis, adaptation and loss of
+    track.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,
     whose mean a few lost tracks dominate; ``adaptation_time`` (mean) from the first step that carries a new motion to

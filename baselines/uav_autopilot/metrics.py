@@ -30,7 +30,9 @@ def _task(evaluation: "xarray.Dataset") -> UavAutopilot:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's terms of the metrics, by name; none for a bound, no innovations for a reference."""
+    """Return each episode's numbers from which the metrics follow, by name; none for a bound, fewer for a
+    reference.
+    """
     if "output" not in run or numpy.isnan(run["output"].values).all():
         return MetricInputs()
     task, slices = _task(run), slices_of(run)
@@ -104,7 +106,7 @@ def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
 
 
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
-    """Return the metrics of the control loop from the episodes' terms, with intervals.
+    """Return the metrics of the control loop with intervals, such as variances of output and control.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
     measurement, mean over the window. ``tracking_rmse``: root mean square of output minus command.

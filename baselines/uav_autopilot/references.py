@@ -36,7 +36,7 @@ class TrueState:
 
 
 class _KnownNoise:
-    """The covariance (12) of the true plant with the present noise and the coloured errors of the sensors.
+    """Base of reference and bound: covariance (12) with the present noise and the sensors' coloured errors.
 
     A coloured error is a further coordinate of the state, which its sensor reads together with its own; its decay and
     its noise are known (A. E. Bryson and L. J. Henrikson, "Estimation using sampled data containing sequentially

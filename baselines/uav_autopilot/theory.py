@@ -18,7 +18,8 @@ class Stationary(NamedTuple):
 
 
 def stationary(task: UavAutopilot, name: str) -> Stationary | None:
-    """Return cost and variances of a policy's or reference's steady-state loop, by the Lyapunov equation.
+    """Return cost and variances of a policy's or reference's steady-state loop; None where they have no
+    closed form.
 
     Returns:
         None where the loop is not linear with constant coefficients (levels that change, dropouts, actions
