@@ -45,11 +45,7 @@ class Share(NamedTuple):
 
 
 def split_recording(recording: Recording) -> Share:
-    """Cut a recording into spans for fit (half), choice (a quarter) and judgement (a quarter) of filters.
-
-    Raises:
-        ValueError: if it has fewer than ``LEAST`` measurements.
-    """
+    """Cut a recording into spans for fit (half), choice (a quarter) and judgement (a quarter) of filters."""
     total = int(recording.rows.sum())
     if total < LEAST:
         raise ValueError(

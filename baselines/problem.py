@@ -60,11 +60,7 @@ class Problem:
 
     @property
     def paper(self) -> str:
-        """Name of the policy that is the paper's algorithm.
-
-        Raises:
-            ValueError: if the baselines name none.
-        """
+        """Name of the policy that is the paper's algorithm; raise ValueError without one."""
         if not self.baselines.score_paper:
             raise ValueError(
                 f"{self.id} has no paper's algorithm to compare with: register it with baselines whose "
@@ -120,11 +116,7 @@ class Problem:
         return None
 
     def competitor(self, name: str) -> Any:
-        """Return the maker of a competitor of this name.
-
-        Raises:
-            ValueError: for an unknown name.
-        """
+        """Return the maker of a competitor of this name; raise ValueError for an unknown name."""
         found = self.find(name)
         if found is None and name.endswith("-tuned"):
             return self.tuned_values.competitor(name.removesuffix("-tuned"))  # raises with the reason

@@ -127,11 +127,7 @@ class TunedValues:
             ) from error
 
     def competitor(self, policy: str) -> TunedPolicy:
-        """Return the maker of a policy or estimator with its stored values.
-
-        Raises:
-            ValueError: if it cannot be tuned, or never was.
-        """
+        """Return the maker of a policy or estimator with its stored values; raise ValueError without any."""
         if policy not in self.tunable:
             raise nearest("tunable policy", policy, self.tunable)
         tunable = self.tunable[policy]
@@ -172,11 +168,7 @@ def round_value(value: float) -> float:
 
 
 def read_table(place: Any) -> dict[str, dict[str, Any]]:
-    """Read a file of tuned values; return its entries by policy, empty if there is no file.
-
-    Raises:
-        ValueError: if it is not such a file.
-    """
+    """Read a file of tuned values; return its entries by policy, empty if there is no file."""
     try:
         table = read_json(place)
     except FileNotFoundError:

@@ -82,7 +82,7 @@ class _KnownNoise:
         self.size: int = size
 
     def start_covariance(self, truth: Truth) -> Array:
-        """Return the packed initial covariance, with the true level of the gust."""
+        """Return the packed initial covariance, with the true levels of the gust and of the coloured errors."""
         covariance = self.initial_covariance * (1.0 + self.gust * (truth.level**2 - 1.0))
         if self.size == self.n:
             return covariance

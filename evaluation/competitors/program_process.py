@@ -138,11 +138,7 @@ class ProgramProcess:
         self.exchange(message, 0)
 
     def finish(self) -> None:
-        """Close the program's input and wait ``END_SECONDS`` for its end; nothing more may be written.
-
-        Raises:
-            Failure: if it writes more, since earlier responses then belong to other requests.
-        """
+        """Close the program's input and wait ``END_SECONDS`` for its end; raise Failure if it writes more."""
         if self._process.stdin is not None:
             self._process.stdin.close()
         until, goes_on = time.monotonic() + END_SECONDS, True

@@ -174,11 +174,7 @@ def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Dec
 
 
 def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
-    """Return a filter that combines the bank of a model with a policy; arguments as of :func:`decider_of`.
-
-    Raises:
-        NotTraceable: on traced arrays, where the policy's arithmetic cannot be traced.
-    """
+    """Return a filter that combines the bank of a model with a policy; arguments as of :func:`decider_of`."""
     return SteeredFilter(model, decider_of(model, policy, interval))
 
 

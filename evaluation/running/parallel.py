@@ -112,10 +112,8 @@ def _sendable(error: Exception) -> Exception:
 
 
 def check_workers(workers: Any) -> "Workers":
-    """Return the workers unchanged; None becomes workers that use only this process.
-
-    Raises:
-        ValueError: for any other type, such as a number.
+    """Return the workers unchanged, for None those that use only this process; raise ValueError for other
+    types.
     """
     if workers is not None and not isinstance(workers, Workers):
         raise ValueError(

@@ -79,11 +79,7 @@ _CLAIMED: dict[str, int] = {}
 
 
 def claim_folder(folder: Path) -> None:
-    """Lock a folder until this process ends, so that no other process writes there.
-
-    Raises:
-        ValueError: if another process has claimed it, or it cannot be made.
-    """
+    """Lock a folder until this process ends; raise ValueError if another process writes there."""
     name = os.path.realpath(folder)
     if name in _CLAIMED:
         return
@@ -223,11 +219,7 @@ def _hold(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder, whose files are moved into ``folder`` if the context ends without error.
-
-    Raises:
-        ValueError: if they cannot be written.
-    """
+    """Yield a temporary folder, whose files are moved into ``folder`` if the context ends without error."""
     writable_folder(folder)
     with (
         _explain_refusals(f"to folder {folder}"),
@@ -272,11 +264,7 @@ def settle_folder(folder: Path) -> None:
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """Yield the path of a temporary folder, which replaces ``folder`` if the context ends without error.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
+    """Yield the path of a temporary folder, which replaces ``folder`` if the context ends without error."""
     settle_folder(folder)
     partial, old = _beside(folder)
     with _explain_refusals(f"folder {folder}"), _make_folder(folder.parent):

@@ -26,10 +26,8 @@ def read_json(path: Path) -> Any:
 
 
 def restore(cls: type[Stored], values: Any) -> Stored:
-    """Make a dataclass or named tuple from a dictionary of its fields, whose types are checked.
-
-    Raises:
-        ValueError: if a field is missing, unknown, or not of its declared type.
+    """Make a dataclass or named tuple from a dictionary of its fields; raise ValueError for wrong fields or
+    types.
     """
     if not isinstance(values, dict):
         raise ValueError(f"expected the fields of a {cls.__name__}, got {quote_shortened(values)}")

@@ -42,11 +42,7 @@ def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwis
 
 
 def dataset_from_json(stored: Any) -> xarray.Dataset:
-    """Return the dataset stored in the JSON values of :func:`dataset_as_json`.
-
-    Raises:
-        ValueError: if it is no dataset.
-    """
+    """Return the dataset stored in the JSON values of :func:`dataset_as_json`; raise ValueError for others."""
     if not isinstance(stored, dict) or not all(isinstance(stored.get(part), dict) for part in PARTS):
         raise ValueError(f"expected {', '.join(PARTS)} of a dataset, got {quote_shortened(stored)}")
 
