@@ -111,7 +111,7 @@ class Search:
     confirming: int = 2048
     """Number of validation episodes on which the best candidate has to beat the untuned values."""
     backend: str = "auto"
-    """Backend of the steps, see :func:`~.envs.backend.task_on`."""
+    """Backend of the steps, see :func:`.engine.backend.make_model`."""
 
 
 class _Generations:

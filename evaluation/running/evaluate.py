@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 
 
 def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> str:
-    """Return the control in which a competitor runs: a policy's own, or the first whose spaces fit a learned
-    model.
+    """Return the control in which a competitor runs: its own, one whose spaces fit a learned model, or the
+    first.
 
     Args:
-        maker: maker of the competitor.
+        maker: maker of the competitor, or the competitor itself.
         control: required control; None: any.
         cls: task class of the environment.
         name: name of the competitor, for error messages.
@@ -122,9 +122,9 @@ class Experiment:
     control: str | None = None
     """Name of the control in which all policies run; None: every policy runs in its own."""
     tracks: bool = False
-    """Whether to store the data for plots of tracks, see :meth:`.Task.track`; they need memory."""
+    """Whether to store the data for plots of tracks, see :meth:`.Model.track`; they need memory."""
     drawn_episodes: int = 0
-    """Number of first episodes with data for pictures, :meth:`.Task.drawn`: variables ``drawn_estimate`` and so on,
+    """Number of first episodes with data for pictures, :meth:`.Model.picture_track`: variables ``drawn_estimate`` and so on,
     over policy, drawn_episode and time.
     """
     paper: str = ""
@@ -132,7 +132,7 @@ class Experiment:
     reference: str = ""
     """Name of the competitor whose score is 1; stored in the attributes of the evaluation."""
     backend: str = "auto"
-    """Backend of the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`."""
+    """Backend of the steps, "auto", "compiled" or "numpy"; see :func:`.engine.backend.make_model`."""
     threads: int = 1
     """Number of threads that share the episodes, with the compiled backend."""
     strict: bool = False

@@ -1,6 +1,6 @@
 """Cost and consistency of a competitor split by cause, such as turns, the start or outliers.
 
-Causes are those that the environment declares (:mod:`.envs.causes`), the start of the track, and ``other``
+Causes are those that the environment declares (:mod:`.contract.causes`), the start of the track, and ``other``
 for all other measurements. Several may hold together, so shares need not add up to one. Comparisons are
 paired.
 """
@@ -22,7 +22,7 @@ EVERYTHING, START, OTHER = RESERVED
 CAUSE_METRICS = "cause_"
 """Prefix of the names of metrics by cause."""
 VARIABLE = "causes"
-"""Name of the dataset variable with the active causes as a bit field, see :func:`.envs.causes.cause_number`."""
+"""Name of the dataset variable with the active causes as a bit field, see :func:`.contract.causes.cause_number`."""
 COUNT, COST, NEES, JUDGED = range(4)
 """Columns of the sums over the measurements under a cause: their number, cost, NEES over its dimension, number with a
 NEES.

@@ -15,7 +15,7 @@ def read_json(path: Path) -> Any:
 
     Raises:
         FileNotFoundError: if the file does not exist.
-        ValueError: if it cannot be read, or breaks a limit of :mod:`~filtergym.envs.foreign_files`.
+        ValueError: if it cannot be read, or breaks a limit of :mod:`~filtergym.envs.data.foreign_files`.
     """
     try:
         return foreign_files.read_json(path)
