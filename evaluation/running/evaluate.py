@@ -124,8 +124,8 @@ class Experiment:
     tracks: bool = False
     """Whether to store the data for plots of tracks, see :meth:`.Model.track`; they need memory."""
     drawn_episodes: int = 0
-    """Number of first episodes with data for pictures, :meth:`.Model.picture_track`: variables ``drawn_estimate`` and so on,
-    over policy, drawn_episode and time.
+    """Number of first episodes with data for pictures, :meth:`.Model.picture_track`: variables ``drawn_estimate``
+    and so on, over policy, drawn_episode and time.
     """
     paper: str = ""
     """Name of the paper's algorithm, whose score is 0; stored in the attributes of the evaluation."""
