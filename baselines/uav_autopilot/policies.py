@@ -33,9 +33,8 @@ class InnovationAdaptive(Policy):
 
     The logarithm of the factor is ``memory`` times the last one, plus ``weights`` times the logarithm of the
     innovations' mean square of each sensor over an exponential window; the mean square of a consistent filter
-    is one. By default all sensors have the same positive weight, the textbook's rule: innovations larger than
-    predicted mean that the process noise is too small. Only tuned weights can distinguish gusts from a
-    noisier sensor.
+    is one. By default all sensors have the same positive weight, the textbook's rule. Only tuned weights can
+    distinguish gusts from a noisier sensor.
 
     Args:
         window: effective length of the window, measurements.

@@ -544,23 +544,23 @@ def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent),
-    ``median_anees`` (median over the episodes, which a few lost tracks do not determine), ``nees_inside`` and
-    ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (95 % interval of the mean of a consistent
-    filter); ``log_likelihood`` (mean log-density of a measurement under its prediction); ``mean_mode_probability``;
-    ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards); ``lost_episodes`` of estimators (share), and of
-    estimates from a file ``missing``, the share of measurements without a row. Where the evaluation was timed
-    ``nanoseconds``, processor time of a measurement, whose component is ``compiled`` or ``python``. Without truth the
-    metrics that need it are left out. For a recording with tracks ``prediction_error`` and ``innovation_correlation``,
-    whose intervals are over stretches of measurements.
+    ``median_anees`` (median over episodes), ``nees_inside`` and ``nis_inside`` (share inside the 95 %
+    chi-square interval), ``anis_band`` (95 % interval of the mean of a consistent filter); ``log_likelihood``
+    (mean log-density of a measurement under its prediction); ``mean_mode_probability``; ``cost`` (uncapped
+    mean), ``return`` (sum of the ``cost`` rewards); ``lost_episodes`` of estimators (share), and of estimates
+    from a file ``missing``, the share of measurements without a row. Where the evaluation was timed
+    ``nanoseconds``, processor time of a measurement, whose component is ``compiled`` or ``python``. Without
+    truth the metrics that need it are left out. For a recording with tracks ``prediction_error`` and
+    ``innovation_correlation``, whose intervals are over stretches of measurements.
 
-    ``geometric_cost`` is the geometric mean over episodes, by which competitors are ranked, ``lost_tracks`` the share
-    of episodes whose mean cost is above the environment's bound. Against the paper's algorithm, paired,
-    ``geometric_cost_difference`` (geometric mean of the ratios of the episodes' costs, less one), ``cost_difference``
-    and ``relative_cost_difference`` of the means, ``median_cost_ratio`` and ``win_rate`` over episodes, ``score`` =
-    (L_paper - L) / (L_paper - L_reference), L mean logarithms of the cost. Against the best ranked competitor
-    ``behind_best`` (as the geometric difference; the component names the best) and ``best_share``, the share of
-    resamples of the episodes in which this one is the best (the first of those with equal costs). And the environment's
-    own metrics.
+    ``geometric_cost`` is the geometric mean over episodes, by which competitors are ranked, ``lost_tracks``
+    the share of episodes whose mean cost is above the environment's bound. Against the paper's algorithm,
+    paired, ``geometric_cost_difference`` (geometric mean of the ratios of the episodes' costs, less one),
+    ``cost_difference`` and ``relative_cost_difference`` of the means, ``median_cost_ratio`` and ``win_rate``
+    over episodes, ``score`` = (L_paper - L) / (L_paper - L_reference), L mean logarithms of the cost. Against
+    the best ranked competitor ``behind_best`` (as the geometric difference; the component names the best) and
+    ``best_share``, the share of resamples of the episodes in which this one is the best. And the
+    environment's own metrics.
 
     Args:
         dataset: from an evaluation.
