@@ -34,9 +34,7 @@ class StateSpaceKalman(ConstantPolicy):
 
 
 class CovarianceMatching(Policy):
-    """Process noise raised while the normalised innovation squared is above its mean, and lowered while it is
-    below.
-    """
+    """Policy that raises the process noise while the NIS is above its mean, and lowers it while it is below."""
 
     control = "noise"
     traceable = True

@@ -127,7 +127,7 @@ class ConstantMode(Policy):
         self.mode: int = mode if mode >= 0 else len(model.task.modes) + mode
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Return the constant mode as action of every episode, ``(N,)``."""
+        """Return the constant mode as action of every episode, ``(N,)``, and no memory."""
         return numpy.full(len(observation), self.mode), None
 
 

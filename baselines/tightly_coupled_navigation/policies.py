@@ -73,7 +73,7 @@ class FixedRobust(ConstantPolicy):
 
 
 class NisAdaptive(Policy):
-    """Innovation-based adaptation of the noise, under the paper's probabilities.
+    """Policy of innovation-based adaptation of the sensors' noise, under the paper's probabilities.
 
     Where the short average of the normalised innovation squared exceeds ``threshold`` under every hypothesis,
     an excess of the pseudoranges raises their noise. One of the rates raises theirs, or that of the

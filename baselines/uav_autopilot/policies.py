@@ -29,7 +29,7 @@ class Kalman(PaperAction):
 
 
 class InnovationAdaptive(Policy):
-    """Process noise scaled by a window of normalised innovations squared (NIS).
+    """Policy that scales the process noise by a window of normalised innovations squared (NIS).
 
     The logarithm of the factor is ``memory`` times the last one, plus ``weights`` times the logarithm of the
     innovations' mean square of each sensor over an exponential window; the mean square of a consistent filter
