@@ -47,8 +47,8 @@ def shift_ratio(normalised: Any, mean: float) -> Any:
 
 
 def innovation_evidence(normalised: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
-    """Return log-likelihood ratios of too large, too small and shifted innovations to expected ones, ``(N, 4
-    C)``.
+    """Return log-likelihood ratios of too large, too small and shifted innovations to expected ones,
+    ``(N, 4 C)``.
     """
     ratios = [scale_ratio(normalised**2, 1.0, factor) for factor in (LARGER, SMALLER)]
     ratios += [shift_ratio(normalised, mean) for mean in (SHIFT, -SHIFT)]

@@ -299,8 +299,8 @@ def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_compo
 
 
 def change_class_and_type(log_joint: Array, log_composition: Array, change: float) -> Array:
-    """Return log-probabilities of class and type after a possible class change, with a new type, ``(M, J,
-    N)``.
+    """Return log-probabilities of class and type after a possible class change, with a new type,
+    ``(M, J, N)``.
 
     ``P(s, j) <- (1 - c) P(s, j) + c P(type j | s) sum_{s' != s} P(s') / (M - 1)``: the transition q of (8),
     for a type that changes only together with the class.

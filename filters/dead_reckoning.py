@@ -54,8 +54,8 @@ def _both_axes(block: list[list[Array]]) -> Array:
 
 
 def start(mean: Array, covariance: Array, deviation: float | Array) -> tuple[Array, Array]:
-    """Return mean ``(6, N)`` and covariance of the state at a first measured position, where ``p = z - e -
-    n``.
+    """Return mean ``(6, N)`` and covariance of the state at a first measured position, where
+    ``p = z - e - n``.
 
     Args:
         mean: position and velocity, the position as it was measured, ``(4, N)``, m and m/s.

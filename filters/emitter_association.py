@@ -42,8 +42,8 @@ FARTHEST = 300.0
 
 
 class Surroundings(NamedTuple):
-    """Grid of V points over the unknown second emitter and the target's silences; its probabilities are ``(V,
-    1)``.
+    """Grid of V points over the unknown second emitter and the target's silences; its probabilities are
+    ``(V, 1)``.
     """
 
     other_type: Array

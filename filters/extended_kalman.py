@@ -6,18 +6,18 @@ observation j with variance r_j:
     s = h P h^T + r_j,  g = P h^T / sqrt(s),  nu' = nu_j - h (x - x')
     x += g nu' / sqrt(s),  P -= g g^T
 
-This is step 6 of Moroz's paper on an adaptive multi-hypothesis measurer, ``P = (P'^-1 + H^T R^-1 H)^-1``, ``x
-= x' + P H^T R^-1 nu``, for a diagonal R. It keeps P exactly symmetric, and its terms nu'^2 / s are
+This is step 6 of Moroz's paper on an adaptive multi-hypothesis measurer, ``P = (P'^-1 + H^T R^-1 H)^-1``,
+``x = x' + P H^T R^-1 nu``, for a diagonal R. It keeps P exactly symmetric, and its terms nu'^2 / s are
 independent contributions to the normalised innovation squared.
 
 Reading: steps 5 and 6 of the paper write the Jacobian once through the picked parameters v = c x and once
 directly; one Jacobian with respect to the state is used.
 
 Robust update. Where the noise is Gaussian but for outliers, Huber's M-estimate minimises, for each
-observation in its turn, ``(x - x')^T P^-1 (x - x') / 2 + rho(u)`` with the residual after the update ``u =
-(nu' - h (x - x')) / sqrt(r)``, ``rho(u) = u^2 / 2`` up to a threshold k and ``k |u| - k^2 / 2`` beyond it.
-Reweighting, ``r' = r |u| / k`` beyond the threshold, is the usual way to it. For one scalar observation its
-fixed point is
+observation in its turn, ``(x - x')^T P^-1 (x - x') / 2 + rho(u)`` with the residual after the update
+``u = (nu' - h (x - x')) / sqrt(r)``, ``rho(u) = u^2 / 2`` up to a threshold k and ``k |u| - k^2 / 2`` beyond
+it. Reweighting, ``r' = r |u| / k`` beyond the threshold, is the usual way to it. For one scalar observation
+its fixed point is
 
     s' = h P h^T + r' = max(s, sqrt(r) |nu'| / k),
 

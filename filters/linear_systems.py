@@ -85,9 +85,9 @@ def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
 def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matrix]:
     """Return transition matrix F and process noise covariance Q of a continuous model over an interval.
 
-    ``Q = integral over [0, T] of exp(A s) W exp(A^T s) ds`` from one exponential of ``[[-A, W], [0, A^T]]
-    T``: Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404. A long interval is halved until ``|A| T``
-    is at most one, then doubled: ``Q(2 T) = F Q F^T + Q``, ``F(2 T) = F F``.
+    ``Q = integral over [0, T] of exp(A s) W exp(A^T s) ds`` from one exponential of
+    ``[[-A, W], [0, A^T]] T``: Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404. A long interval is
+    halved until ``|A| T`` is at most one, then doubled: ``Q(2 T) = F Q F^T + Q``, ``F(2 T) = F F``.
 
     Args:
         A: matrix of the continuous model, ``(n, n)``, 1/s.
@@ -403,8 +403,8 @@ def separation_defect(F: Matrix, B: Matrix, H: Matrix, L: Matrix, K: Matrix) -> 
     """Return the largest distance between closed-loop poles and those of the separate regulator and filter
     designs.
 
-    The loop is written in state and *estimate*; its poles are matched one to one with those of ``eig(F - B
-    L)`` and ``eig((I - K H) F)``: rounding, if the principle holds.
+    The loop is written in state and *estimate*; its poles are matched one to one with those of
+    ``eig(F - B L)`` and ``eig((I - K H) F)``: rounding, if the principle holds.
     """
     from scipy.optimize import linear_sum_assignment
 

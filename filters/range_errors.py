@@ -146,8 +146,8 @@ def begin(mean: Array, covariance: Array) -> SequentialUpdate:
 
 
 def innovation_of(state: SequentialUpdate, residual: Array, row: JacobianRow) -> tuple[Array, Array, Array]:
-    """Return the innovation of an observation given those before, ``P h^T`` of shape ``(n, ...)``, and ``h P
-    h^T``.
+    """Return the innovation of an observation given those before, ``P h^T`` of shape ``(n, ...)``, and
+    ``h P h^T``.
 
     Args:
         state: state before the observation.

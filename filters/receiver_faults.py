@@ -88,8 +88,8 @@ def add_fault(P: FaultCovariance, variance: Array) -> FaultCovariance:
 
 
 def matrix(P: FaultCovariance) -> Array:
-    """Return the covariance of INS and receiver errors (delta, beta, eta, e) as one array, ``(3 + E, 3 + E,
-    ...)``.
+    """Return the covariance of INS and receiver errors (delta, beta, eta, e) as one array,
+    ``(3 + E, 3 + E, ...)``.
     """
     xp, ins = namespace(P.faults), P.ins
     first = [

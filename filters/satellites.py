@@ -43,8 +43,8 @@ def orbit_radius() -> float:
 
 
 def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]:
-    """Return the Earth-fixed positions, m, and Earth-relative velocities, m/s, of satellites over time, ``(3,
-    S, K)`` each.
+    """Return the Earth-fixed positions, m, and Earth-relative velocities, m/s, of satellites over time,
+    ``(3, S, K)`` each.
 
     Args:
         slots: S slot numbers from 1 to 24.
@@ -76,8 +76,8 @@ def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]
 def local_orbits(
     slots: Sequence[int], time: Array, latitude: float, longitude: float, height: float
 ) -> tuple[Array, Array]:
-    """Return east-north-up positions, m, and velocities, m/s, of satellites at a site over time, ``(3, S,
-    K)`` each.
+    """Return east-north-up positions, m, and velocities, m/s, of satellites at a site over time,
+    ``(3, S, K)`` each.
 
     Args:
         slots: S slot numbers from 1 to 24.

@@ -7,8 +7,8 @@ that of the next one,
     G = P F^T P'^-1,  x^s = x + G (x^s_next - x'),  P^s = P + G (P^s_next - P') G^T
 
 The covariance is computed as ``(I - G F) P (I - G F)^T + G (P^s_next + Q) G^T``, the same sum of what cannot
-become negative. Where P' is singular (no process noise, a component that is known) any solution of ``P' G^T =
-F P`` gives the same result; the one of the Cholesky factor without its zero columns is taken.
+become negative. Where P' is singular (no process noise, a component that is known) any solution of
+``P' G^T = F P`` gives the same result; the one of the Cholesky factor without its zero columns is taken.
 
 **Several models.** Two filters, one forward and one backward in time, as Helmick, Blair and Hoffman, Fixed-interval
 smoothing for Markovian switching systems, IEEE Trans. Information Theory 41 (1995), 1845-1855. The backward one

@@ -135,8 +135,8 @@ class TimeVarying(Policy):
         available: numpy.ndarray,
         observation: numpy.ndarray,
     ) -> tuple[_Variances, numpy.ndarray]:
-        """Return the memory, and the variance R of the measurement noise as reported, ``(N, axes)`` or ``(N,
-        1)``.
+        """Return the memory, and the variance R of the measurement noise as reported, ``(N, axes)`` or
+        ``(N, 1)``.
         """
         return memory, reported
 

@@ -60,8 +60,8 @@ class _Posterior(Policy):
         )
 
     def radar(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-likelihood of each class by all radar measurements so far, up to a constant, ``(M,
-        N)``.
+        """Return the log-likelihood of each class by all radar measurements so far, up to a constant,
+        ``(M, N)``.
         """
         return self.accumulated(observation).T
 
@@ -185,8 +185,8 @@ class Leaky(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log of last weights after radar, class transition and ESM decision, up to a constant, ``(M,
-        N)``.
+        """Return the log of last weights after radar, class transition and ESM decision, up to a constant,
+        ``(M, N)``.
         """
         last = imm.log_probabilities(self.last_weight(observation).T)
         this_scan = self.log_likelihood(observation).T

@@ -341,9 +341,9 @@ class Estimator(Protocol):
 class Smoother(Estimator, Protocol):
     """Protocol of an estimator that estimates each time with later measurements, too.
 
-    It runs forward like any estimator, and :meth:`smooth` then receives all its memories. It declares ``kind
-    = "smoother"``; without it an estimator with a method ``smooth`` is evaluated by its causal estimates. It
-    cannot run in a closed loop.
+    It runs forward like any estimator, and :meth:`smooth` then receives all its memories. It declares
+    ``kind = "smoother"``; without it an estimator with a method ``smooth`` is evaluated by its causal
+    estimates. It cannot run in a closed loop.
     """
 
     kind: ClassVar[Kind] = "smoother"

@@ -153,8 +153,8 @@ def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
 def _update(
     task: Task, names: tuple[str, ...], apply: Apply, values: Array, measurement: Any, memory: Any
 ) -> tuple[Any, Array]:
-    """Return an estimator's memory after a measurement, and its log-likelihood ``(N,)``, for parameters ``(P,
-    N)``.
+    """Return an estimator's memory after a measurement, and its log-likelihood ``(N,)``, for parameters
+    ``(P, N)``.
     """
     own = apply({name: values[i] for i, name in enumerate(names)})[1](task)
     return _step(as_filter(task, own), measurement, memory)

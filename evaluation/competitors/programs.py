@@ -152,8 +152,8 @@ def parameters_of(task: Task) -> dict[str, Any]:
 
 
 def rows_of(part: Any, count: int) -> numpy.ndarray:
-    """Flatten nested tuples of arrays ``(..., N)`` to one row of numbers for each track, ``(count,
-    numbers)``.
+    """Flatten nested tuples of arrays ``(..., N)`` to one row of numbers for each track,
+    ``(count, numbers)``.
     """
     flat = [numpy.asarray(a, dtype="<f8").reshape(-1, numpy.shape(a)[-1])[:, :count] for a in leaves(part)]
     return numpy.ascontiguousarray(numpy.concatenate(flat).T)

@@ -59,8 +59,8 @@ def check_open_loop(model: Model, name: str) -> None:
 
 
 def run_forward(model: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Run a smoother over episodes of one length; return means ``(C, K, N)`` and covariances ``(C, C, K,
-    N)``.
+    """Run a smoother over episodes of one length; return means ``(C, K, N)`` and covariances
+    ``(C, C, K, N)``.
 
     Raises:
         ValueError: if its estimates have other shapes.

@@ -278,8 +278,8 @@ LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 
 
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
-    """Run some episodes of one competitor; return the values at all measurements by name, ``(episodes, time,
-    ...)``.
+    """Run some episodes of one competitor; return the values at all measurements by name,
+    ``(episodes, time, ...)``.
     """
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)

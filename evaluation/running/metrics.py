@@ -308,8 +308,8 @@ def _over_dimension(run: "xarray.Dataset", metric: str) -> tuple[numpy.ndarray, 
 def _band(means: numpy.ndarray, episodes: int) -> IntervalEstimate:
     """Return the 95 % interval of ANIS (mean NIS over its dimension) for a consistent filter.
 
-    By the chi-square distribution of the same variance, exact for equal degrees. ``means`` ``(1 + resamples,
-    2)`` are those of the count of measurements and of the sum of inverse degrees.
+    By the chi-square distribution of the same variance, exact for equal degrees. ``means``
+    ``(1 + resamples, 2)`` are those of the count of measurements and of the sum of inverse degrees.
     """
     count, inverse = episodes * means[0]
     if count == 0.0:

@@ -108,8 +108,8 @@ def _check_size(task: Task, episodes: int) -> None:
 def _record(
     model: Model, seeds: Sequence[int], tick: Progress
 ) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
-    """Simulate episodes; return measurements and truth by name, ``(E, T, ...)``, and initial values ``(E,
-    ...)``.
+    """Simulate episodes; return measurements and truth by name, ``(E, T, ...)``, and initial values
+    ``(E, ...)``.
     """
     initial: dict[str, numpy.ndarray] = {}
     series: dict[str, list[numpy.ndarray]] = {}

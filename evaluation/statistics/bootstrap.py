@@ -57,8 +57,8 @@ def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
-    """Return value and 95 % interval from ``samples``: the value in the data and every resample, ``(1 +
-    resamples, ...)``.
+    """Return value and 95 % interval from ``samples``: the value in the data and every resample,
+    ``(1 + resamples, ...)``.
     """
     if len(samples) == 1:
         return numpy.concatenate([samples, numpy.full((2, *samples.shape[1:]), numpy.nan)])
@@ -134,8 +134,8 @@ class Bootstrap:
         return episodes // self._group if self._clusters is None else self._clusters[episodes]
 
     def _weigh(self, numbers: numpy.ndarray) -> numpy.ndarray:
-        """Return sums of integers ``(clusters, ...)`` weighted by the counts of each resample, ``(1 + resamples,
-        ...)``.
+        """Return sums of integers ``(clusters, ...)`` weighted by the counts of each resample,
+        ``(1 + resamples, ...)``.
         """
         numbers = numbers.astype(float)
         parts = (self._counts[i : i + AT_ONCE] for i in range(0, len(self._counts), AT_ONCE))
@@ -233,8 +233,8 @@ class Bootstrap:
         return found
 
     def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
-        """Return a statistic with its percentile interval, from its values in data and resamples, ``(1 +
-        resamples,)``.
+        """Return a statistic with its percentile interval, from its values in data and resamples,
+        ``(1 + resamples,)``.
         """
         if self._counts.shape[1] == 1:
             statistics = statistics[:1]
