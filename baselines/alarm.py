@@ -30,8 +30,7 @@ CERTAIN = math.inf
 
 
 def scale_ratio(squares: Any, degrees: Any, factor: float) -> Any:
-    """Return the log-likelihood ratio of innovations with ``factor`` times the expected variance to the
-    expected one.
+    """Return the log-likelihood ratio of ``factor`` times the expected variance to the expected one.
 
     Args:
         squares: normalised innovation squared, chi-square without a fault.
@@ -98,9 +97,7 @@ class Alarm:
     def update(
         self, observation: numpy.ndarray, memory: Sums | None, start: numpy.ndarray
     ) -> tuple[numpy.ndarray, Sums]:
-        """Update the cumulative sums with an observation; return a mask ``(N,)`` of episodes with a fault,
-        and the memory.
-        """
+        """Update the cumulative sums; return a mask ``(N,)`` of episodes with a fault, and the memory."""
         before = numpy.full_like(observation, math.nan) if memory is None else memory.observation
         evidence = self.evidence(observation, numpy.where(start[:, None], math.nan, before))
         sums = numpy.zeros_like(evidence) if memory is None else memory.sums

@@ -173,9 +173,7 @@ class Judgement:
         return min(as_good, key=lambda name: (operations(name), -means[name]))
 
     def simplest(self, fitted: Sequence[JudgedFilter]) -> JudgedFilter:
-        """Return the simplest fitted filter that the likeliest does not beat beyond chance; they are sorted
-        simplest first.
-        """
+        """Return the first, simplest fitted filter that the likeliest does not beat beyond chance."""
         likeliest = likeliest_of(fitted)
         as_good = (c for c in fitted if self.difference(likeliest.name, c.name).low <= 0.0)
         return next(as_good, likeliest)
@@ -206,9 +204,7 @@ class Judgement:
         return squares.relative_root(self._numbers[name], self._numbers[other])
 
     def difference(self, name: str, other: str) -> IntervalEstimate:
-        """Return the difference of two filters' mean log-likelihoods in the choice, less one nat in all for
-        each parameter.
-        """
+        """Return the difference of two filters' mean log-likelihoods, less one nat in all per parameter."""
         found = self._chosen.difference(self._numbers[name], self._numbers[other])
         penalty = self._penalty(name) - self._penalty(other)
         return IntervalEstimate(*(value - penalty for value in found))

@@ -44,7 +44,7 @@ def report_picture(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 class PairSums:
-    """Sums of competitors' values over stretches of a log, for each pair over the measurements where both are finite.
+    """Sums over stretches of a log, for each pair over the measurements where both are finite.
 
     Args:
         competitors: number of competitors, n.

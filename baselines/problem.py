@@ -69,8 +69,7 @@ class Problem:
         return self.baselines.score_paper
 
     def paper_among(self, competitors: Mapping[str, Any]) -> str:
-        """Return the name of the paper's algorithm among competitors, or else its usual one; empty without
-        such baselines.
+        """Return the paper's algorithm among competitors, or else its usual name; empty if there is none.
 
         Args:
             competitors: makers by name; a stronger reading of the paper among them comes first.

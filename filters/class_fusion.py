@@ -140,9 +140,7 @@ def _solve_upper(L: list[list[Array]], B: Array) -> Array:
 
 
 class Channels(NamedTuple):
-    """Data-independent gains, covariances and innovation statistics of Kalman filters of constant classes, scans
-    0 to K.
-    """
+    """Gains, covariances and innovation statistics of filters of constant classes, for every scan."""
 
     gain: Array
     """Kalman gains, ``(n, m, M, K + 1)``; zero at scan 0, where the track starts."""

@@ -329,9 +329,7 @@ def observe(
 
 
 def sensor_groups(satellites: int) -> Sequence[slice]:
-    """Return the slices of pseudoranges, their rates, accelerometers and attitude errors in :func:`observe`'s
-    result.
-    """
+    """Return the slices of the sensors' kinds in the result of :func:`observe`."""
     return (
         slice(0, satellites),
         slice(satellites, 2 * satellites),

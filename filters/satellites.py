@@ -43,8 +43,7 @@ def orbit_radius() -> float:
 
 
 def earth_fixed_orbits(slots: Sequence[int], time: Array) -> tuple[Array, Array]:
-    """Return the Earth-fixed positions, m, and Earth-relative velocities, m/s, of satellites over time,
-    ``(3, S, K)`` each.
+    """Return Earth-fixed positions, m, and velocities, m/s, of satellites, ``(3, S, K)`` each.
 
     Args:
         slots: S slot numbers from 1 to 24.

@@ -36,8 +36,7 @@ def _check(alpha: float, T: float) -> None:
 
 
 def acceleration_response(alpha: float, T: float) -> numpy.ndarray:
-    """Return position, velocity and acceleration a time T after a unit acceleration, ``(3,)``: the last
-    column of Phi.
+    """Return the last column of Phi, ``(3,)``: the state a time T after a unit acceleration.
 
     Args:
         alpha: inverse correlation time of the acceleration, 1/s; 0 is a constant acceleration.

@@ -26,9 +26,7 @@ LIMITS = {"mehra": {"window": (5.0, WINDOW, 150.0)}, "sage-husa": _FADING, "vari
 def with_rules(
     host: type, name: str, description: str, rules: Iterable[str] = RULES
 ) -> tuple[dict[str, Variant], dict[str, Tunable]]:
-    """Return variants of a policy or estimator with each rule for the receiver's noise, and what can be tuned
-    of them.
-    """
+    """Return a policy's or estimator's variants with each rule for the receiver's noise, and their tuning."""
     variants, tunables = {}, {}
     for rule in rules:
         cls, words = RULES[rule]

@@ -129,8 +129,6 @@ class MatchedCovariance(_Matched):
     kind = "bound"
 
     def update(self, memory: ErrorState, measurement: Measurement, truth: Truth) -> tuple[Array, ErrorState]:
-        """Predict and update with the true noise levels; return each axis's error variance, m^2, ``(A, N)``, and
-        the memory.
-        """
+        """Predict and update with the true noise levels; return error variances, m^2, ``(A, N)``."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

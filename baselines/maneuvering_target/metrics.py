@@ -51,9 +51,7 @@ def scan_of_loss(distance: numpy.ndarray) -> numpy.ndarray:
 
 
 def gather(run: "xarray.Dataset") -> MetricInputs:
-    """Return each episode's numbers from which the metrics in clutter follow, by name; empty without clutter and
-    for a bound.
-    """
+    """Return what the metrics in clutter need of each episode; empty without clutter and for a bound."""
     if "false_association" not in run or str(run["kind"].values) == "bound":
         return MetricInputs()
     distance = numpy.sqrt(squared_errors(run, "position", groups_of(run)))

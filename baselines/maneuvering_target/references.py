@@ -117,9 +117,7 @@ class KnownInputBound(ConstantVelocityModel):
         return initial.covariance
 
     def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
-        """Return the bound on the variances after this scan, and the covariance as memory, by recursion at
-        the true position.
-        """
+        """Predict and update at the true position; return the bound on variances, and the covariance."""
         world = self.task.world
         assert isinstance(world, RadarWorld)
         predicted = bounds.predict_bound(memory, self.motion(measurement.interval)[0])

@@ -122,9 +122,7 @@ class JointType(_Posterior):
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Return the log-probability of each class by prior, radar and decisions on one type, up to a constant,
-        ``(M, N)``.
-        """
+        """Return each class's log-probability by prior, radar and one type's decisions, ``(M, N)``."""
         counts = self.esm * self.counts(observation, self.refused)
         esm = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         return self.log_prior + self.radar(observation) + esm
@@ -163,8 +161,7 @@ class ForgettingJointType(JointType):
 
 
 class Leaky(_Posterior):
-    """The paper's rule (8) with class transitions: probabilities stay away from zero, so that a change of class is
-    detected.
+    """The paper's rule (8) with class transitions, so that a change of class is detected.
 
     Only the weights leak; the filters stay as they are (``class_transition`` would mix them too).
 

@@ -1,4 +1,4 @@
-"""Estimators of UavAutopilot: the settled filter, and some that estimate the noise of sensors and gusts in flight.
+"""Estimators of UavAutopilot: the settled filter, and some that estimate noise in flight.
 
 Each closes the loop around its own truth. Equation numbers are those of ``filters/noise_adaptation.py``, for
 the settled filter those of the task's paper.

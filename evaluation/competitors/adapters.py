@@ -32,9 +32,7 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
 
 
 def takes_problem(maker: Any) -> bool:
-    """Return whether a competitor's maker takes the task or model: a first argument without default, or of that
-    name.
-    """
+    """Return whether a maker takes the task or model: a first argument without default, or so named."""
     try:
         first = next(iter(inspect.signature(maker).parameters.values()), None)
     except ValueError:  # for a compiled class

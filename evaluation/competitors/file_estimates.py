@@ -83,9 +83,7 @@ class TrackEstimates(NamedTuple):
 
 
 def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, numpy.ndarray] | None:
-    """Return the times of a recording's measurements by track, s by the clock of the estimates; None in a
-    simulation.
-    """
+    """Return a recording's measurement times by track, s by the estimates' clock; None in a simulation."""
     import pandas
 
     recording = task.recording

@@ -395,9 +395,7 @@ def main(memory: str, *words: str) -> None:
 
 
 def serve_estimator(apart: bool) -> None:
-    """Serve one estimator in this restricted process: measurements from standard input, estimates to standard
-    output.
-    """
+    """Serve one estimator in this restricted process over standard input and output."""
     import json
 
     questions, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")

@@ -130,9 +130,7 @@ def check_competitor(name: str, competitor: Any, kind: Kind | None = None) -> An
 
 
 def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
-    """Copy the spaces of an inner model, and ``further`` attributes that it has, to the policy ``outer`` that
-    wraps it.
-    """
+    """Copy the inner model's spaces, and its attributes named in ``further``, to ``outer``."""
     for name in ("observation_space", "action_space", *further):
         if hasattr(inner, name):
             setattr(outer, name, getattr(inner, name))

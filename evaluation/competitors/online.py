@@ -466,9 +466,7 @@ class OnlineFilter:
     # --- one measurement
 
     def _decide(self, state: OnlineState, inputs: numpy.ndarray) -> OnlineState:
-        """Let the policy choose an action from the observation ``(width, fields)`` if a decision is due; return
-        the state.
-        """
+        """Let the policy choose an action if a decision is due; return the state."""
         assert self._policy is not None
         number, observation = state.measurements - 1, inputs.T
         if number:

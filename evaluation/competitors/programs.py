@@ -340,9 +340,7 @@ class ProgramEstimator:
         return json.dumps({name: content}).encode() + b"\n"
 
     def _exchange(self, rows: numpy.ndarray, C: int) -> numpy.ndarray:
-        """Send a measurement; return the program's means and covariances as rows, ``(tracks, C + C * C)`` or
-        with feedback.
-        """
+        """Send a measurement; return the program's means and covariances as rows of numbers."""
         assert self._process is not None
         question = self._message("measurement", self._fields, rows)
         size = self.count * self._response_size

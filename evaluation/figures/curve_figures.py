@@ -53,9 +53,7 @@ def _bound_abscissa(axis: Any, x: numpy.ndarray) -> None:
 
 
 def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
-    """Label the time axes: seconds below and measurement numbers above, or only the latter without constant
-    interval.
-    """
+    """Label the time axes: seconds below and measurement numbers above, where the interval is constant."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
     if "elapsed" not in curves.coords:
@@ -235,7 +233,7 @@ def draw_error_over_time(
 def draw_cost_difference(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
-    """Return a figure of mean costs over time minus those of the paper's algorithm and of the best; bands are paired.
+    """Return a figure of mean costs minus those of the paper's algorithm and of the best; bands are paired.
 
     Arguments as of :func:`draw_error_over_time`.
     """

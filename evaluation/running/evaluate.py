@@ -153,9 +153,7 @@ class Experiment:
         return make_task(self.task, self.scenario, **self.keywords)
 
     def make_model(self, maker: Any, control: str) -> Model:
-        """Make the model (task, bank and control) in which a competitor runs, with its own and the
-        experiment's keywords.
-        """
+        """Make the model (task, bank and control) in which a competitor runs."""
         keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
         return make_model(
             self.task, control, self.scenario, backend=self.backend, threads=self.threads, **keywords

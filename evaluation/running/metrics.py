@@ -90,9 +90,7 @@ def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
 
 
 def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
-    """Return the sum and number of the values ``(episodes, time)`` that are not NaN in every episode,
-    ``(episodes, 2)``.
-    """
+    """Return sum and number of each episode's values that are not NaN, ``(episodes, 2)``."""
     present = ~numpy.isnan(values)
     return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
 
@@ -515,8 +513,7 @@ def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
 
 @one_thread()
 def flight_records(dataset: "xarray.Dataset") -> list[Record]:
-    """Return the records of every flight of an evaluation, such as cost, errors, and differences to the
-    paper's algorithm.
+    """Return a record of cost, errors and differences to the paper's algorithm for every flight.
 
     Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
     """

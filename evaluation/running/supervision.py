@@ -102,8 +102,8 @@ def _report(line: str) -> None:
 
 
 def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
-    """Wait for a child, or kill it where a competitor is late; return that competitor and the reason, or exit
-    with its status.
+    """Wait for a child and exit with its status; if a competitor is late, kill it and return its name and
+    why.
     """
     running, unread, heard, status, limit = "", b"", time.monotonic(), 0, seconds
     # Ctrl-C and a termination request are for the child.

@@ -20,9 +20,7 @@ _INSIDE = ContextVar("inside", default=False)
 
 @functools.lru_cache(1)
 def _controller(modules: int) -> ThreadpoolController:
-    """Return the controller of loaded libraries with threads, cached by the number of modules: a search takes
-    1.5 ms.
-    """
+    """Return the controller of libraries' threads, cached by the number of modules: a search takes 1.5 ms."""
     return ThreadpoolController()
 
 

@@ -51,9 +51,7 @@ def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
 
 
 def measured_quantities(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
-    """Return the measured quantities that a log format can predict, ``(m, episodes, time)``; None without
-    predictions.
-    """
+    """Return the quantities that a log format can predict, ``(m, episodes, time)``, or None."""
     log_format = find_companion(task, LogFormat)
     if log_format is None or log_format.predict is None or "estimate" not in run:
         return None

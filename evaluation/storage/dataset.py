@@ -80,9 +80,7 @@ def count_losses(losses: numpy.ndarray) -> Losses | None:
 
 
 def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
-    """Write an evaluation's dataset to a NetCDF file in the classic format with 64-bit offsets, if it is not too
-    large.
-    """
+    """Write an evaluation's dataset to a classic NetCDF file, if it is not too large."""
     if any(variable.nbytes > MOST_BYTES for variable in dataset.variables.values()):
         raise ValueError(
             f"a variable is larger than {MOST_BYTES:,} bytes, the limit of NetCDF's classic format"

@@ -1,5 +1,4 @@
-"""Estimates of another program, read from a file: CSV, NetCDF, or trajectories in the format of the TUM RGB-D
-benchmark.
+"""Estimates of another program, read from CSV, NetCDF or a trajectory file (TUM RGB-D).
 
 A row is an estimate: its track, its time in seconds, the mean of each component, and optionally its covariance. The
 columns are those that ``filtergym evaluate --estimates`` and the programs of ``filtergym export`` write:

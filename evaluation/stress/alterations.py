@@ -131,8 +131,8 @@ def _outlier(sigmas: float) -> Function:
 
 def _wrong_noise(factor: float) -> Function:
     def alter(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
-        """Scale the noise covariance that measurements state, or else enlarge their errors; None where neither
-        is possible.
+        """Scale the noise covariance that measurements state, or else their errors; None where neither can
+        be.
         """
         field = type(stream.task.world).stated_field
         if field:
