@@ -24,8 +24,8 @@ ESTIMATORS = ("kalman-net", "student")
 """Algorithms that train a learned estimator: a network that acts in a filter of its own (:class:`.TrainedBanks`)."""
 THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", "bptt-strongest", "ma-ukf", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
-RIVALS = {"ma-ukf": "sigma-points", "rl-ukf": "unscented"}
-"""Algorithms of one control, of papers that train policies for it."""
+RIVALS = ("ma-ukf", "rl-ukf")
+"""Algorithms of one control, that of their hyperparameters: of papers that train policies for it."""
 RUN_ARGUMENTS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 """Arguments of an algorithm that a run sets itself."""
 

@@ -302,12 +302,12 @@ def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
     Raises:
         ValueError: if the environment has no such filter.
     """
-    if algorithm in RIVALS and RIVALS[algorithm] in cls.controls:
-        return (RIVALS[algorithm],)
     if algorithm not in ESTIMATORS and algorithm not in RIVALS:
         return cls.controls
+    own = read_hyperparameters(cls.id, algorithm)["env_kwargs"]["control"] if algorithm in RIVALS else None
+    if own in cls.controls:
+        return (own,)
     if algorithm not in trained_banks(cls):
-        own = RIVALS.get(algorithm)
         having = [c.id for c in catalogue().values() if algorithm in trained_banks(c) or own in c.controls]
         raise ValueError(
             f"{cls.id} has no filter for algorithm {algorithm!r}: choose another algorithm, or {', '.join(having)}"

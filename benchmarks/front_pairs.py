@@ -17,7 +17,7 @@ import xarray
 
 import filtergym
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.evaluation.running.times import FRONT_MARK, Point, front, longest_equal, time_of, time_text
+from filtergym.evaluation.running.times import FRONT_MARK, Point, front, is_quicker, time_of, time_text
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from filtergym.papers.grid import markdown_table
 
@@ -85,7 +85,7 @@ def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str])
         others = [
             other
             for other in names
-            if (other in learned) != (name in learned) and times[other].nanoseconds <= longest_equal(own)
+            if (other in learned) != (name in learned) and not is_quicker(times[name], times[other])
         ]
         opponent = min(others, key=lambda other: against[other].value, default="")
         rows.append(

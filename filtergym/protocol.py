@@ -27,9 +27,9 @@ from .envs.engine.catalogue import bare_name, nearest
 from .evaluation.competitors.kinds import RANKED, kind_of
 from .evaluation.running.metrics import Record
 from .evaluation.running.parallel import Workers
-from .evaluation.running.rollout import ProcessorTime, Progress
+from .evaluation.running.rollout import Progress
 from .evaluation.running.summary import EvaluationRequest, Summary, combine_summaries, summaries
-from .evaluation.running.times import times_of_records
+from .evaluation.running.times import ProcessorTime, times_of_records
 from .evaluation.statistics.bootstrap import RESAMPLES, Bootstrap, IntervalEstimate, share_interval
 from .names import find_competitor
 

@@ -559,29 +559,43 @@ def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any
     }
 
 
-def merge_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record's data with algorithms added or replaced that were scored later over the same episodes.
+def opponents_of_record(data: Mapping[str, Any]) -> list[str]:
+    """Return the opponents in a record's data, for further runs that are compared with the same ones.
 
     Raises:
-        ValueError: if environment, episodes or scenarios differ.
+        ValueError: if one is no longer a competitor of the environment.
     """
-    for key in ("environment", "split", "seed", "episodes"):
-        if data[key] != added[key]:
-            raise ValueError(f"the record has {key} {data[key]}, what is added {added[key]}")
-    if list(data["scenarios"]) != list(added["scenarios"]):
-        raise ValueError(f"the record is of {', '.join(data['scenarios'])}")
+    problem = problem_of(data["environment"])
+    names = [row[0] for rows in data["scenarios"].values() for row in rows if row[1] == "opponent"]
+    if gone := [name for name in names if problem.find(name) is None]:
+        raise ValueError(
+            f"the record has the opponent {gone[0]!r}, which {problem.id} no longer has: make it anew from all runs, "
+            f"by python docs/make seeds runs/{bare_name(problem.id)}/*-? --scenario {next(iter(data['scenarios']))} "
+            f"--episodes {data['episodes']} --into docs/records"
+        )
+    return list(dict.fromkeys(names))
+
+
+def merge_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's data with algorithms added or replaced that were scored later over the same episodes, against
+    the same opponents; of the added errors those of the record's components.
+
+    Raises:
+        ValueError: if the environment differs.
+    """
+    if data["environment"] != added["environment"]:
+        raise ValueError(f"the record is of {data['environment']}, the runs are of {added['environment']}")
     fresh = {algorithm for _, algorithm, *_ in added["runs"]}
     kept = [run for run in data["runs"] if run[1] not in fresh]
     gone = {run[0] for run in data["runs"]} - {run[0] for run in kept}
     scenarios = {}
     for name, rows in data["scenarios"].items():
-        new = added["scenarios"][name]
+        new = [row for row in added["scenarios"][name] if row[4] in ("", *data["units"])]
         measured = {row[0] for row in new} | fresh | gone
         scenarios[name] = [row for row in rows if row[0] not in measured] + new
     curves = {name: curve for name, curve in data.get("curves", {}).items() if name not in gone}
     return {
         **data,
-        "units": {**data["units"], **added["units"]},
         "runs": sorted([*kept, *added["runs"]], key=lambda run: (run[1], run[2])),
         "curves": {**curves, **added["curves"]},
         "scenarios": scenarios,

@@ -31,12 +31,12 @@ from ..storage.dataset import FAULTS, keywords_as_text, whole_number
 from .metrics import bootstrap_of, time_units_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
-from .rollout import ProcessorTime, Progress, measure_time, run_episodes
+from .rollout import Progress, measure_time, run_episodes
 from .seeds import episode_seeds
 from .stored_values import StoredValues, bound_values
 from .supervision import report_running
 from .threads import one_thread
-from .times import with_times
+from .times import ProcessorTime, with_times
 
 if TYPE_CHECKING:
     import xarray

@@ -589,7 +589,7 @@ def contender_of(
         found, causes = split_by_cause(results["causes",], run, bootstrap)
         further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
     if (time := time_of(run)) is not None:
-        estimate = IntervalEstimate(time.nanoseconds, math.nan, math.nan)
+        estimate = IntervalEstimate(time.nanoseconds, time.low, time.high)
         measures.append(Measure(METRIC, way_of(time), "all", estimate, "ns"))
     costs, over_time = results.get(("cost",)), None
     if costs is not None and isinstance(bootstrap, BlockBootstrap):
