@@ -80,7 +80,7 @@ def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[
 
     Returns:
         One for the nearest plot and zero for the others, ``(K, N)``, and whether one is in the gate,
-            ``(N,)``. Of plots equally near it is the first.
+        ``(N,)``. Of plots equally near it is the first.
     """
     xp = namespace(distances)
     least, chosen = gate + 0.0 * distances[0], -1.0 + 0.0 * distances[0]

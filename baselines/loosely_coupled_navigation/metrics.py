@@ -64,7 +64,7 @@ def recovery_times(
 
     Returns:
         ``(episodes,)``; zero where the error was small at once; NaN without an outage, or fewer than
-            ``longest + hold`` samples after it.
+        ``longest + hold`` samples after it.
     """
     episodes, steps = error.shape
     ends = (available[:, :-1] < 0.5) & (available[:, 1:] > 0.5)

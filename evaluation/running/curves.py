@@ -74,7 +74,7 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
           gains that a bank records, with the same percentiles;
         * ``mean_cost`` (policy): mean over episodes;
         * ``cost_minus_paper`` and ``cost_minus_best`` (policy, stretch): mean cost over stretches of the episode less
-            that of the paper's algorithm and of the best ranked competitor, paired, with ``_low`` and ``_high``.
+          that of the paper's algorithm and of the best ranked competitor, paired, with ``_low`` and ``_high``.
 
         Exceeded errors, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
         256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``nanoseconds`` and

@@ -183,28 +183,17 @@ def run_experiment(
 
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
-        truth), ``cost``, ``compressed_cost`` (minus the ``cost`` reward), ``nees``, everything that the task
-            records
-        (``nis``, ``mode_probability``), ``mean_square`` of bounds, ``action`` (also over action_name) of
-            policies whose
-        action is a box, and ``lost`` of estimators, zero, or once an episode is lost the number of the
-            reason, see
-        :data:`.dataset.FAULTS`. Coordinates: ``unit`` and ``group`` of every component, ``kind`` and
-            ``control`` of
-        every policy, ``episode_seed`` (as text: some file formats have no such large numbers),
-            ``nanoseconds`` and
-        ``compiled`` of every policy where the experiment is timed, ``window_first`` and ``window_last`` of
-            every
-        window, and ``elapsed``, seconds since the start of the track, where measurements come regularly. For
-            a set of
-        flights ``flight`` and ``length`` give the flight of each episode and its number of measurements;
-            later values
-        are NaN. The attribute ``notes`` lists omissions. For a recording ``flight`` names the episode of the
-            recording.
-        Without truth there are neither ``error``, ``cost``, ``compressed_cost`` nor ``nees``. Where the truth
-            of some
-        components is unknown, their errors are NaN, ``nees`` and ``nees_degrees`` are those of the other
-            components,
+        truth), ``cost``, ``compressed_cost`` (minus the ``cost`` reward), ``nees``, everything that the task records
+        (``nis``, ``mode_probability``), ``mean_square`` of bounds, ``action`` (also over action_name) of policies whose
+        action is a box, and ``lost`` of estimators, zero, or once an episode is lost the number of the reason, see
+        :data:`.dataset.FAULTS`. Coordinates: ``unit`` and ``group`` of every component, ``kind`` and ``control`` of
+        every policy, ``episode_seed`` (as text: some file formats have no such large numbers), ``nanoseconds`` and
+        ``compiled`` of every policy where the experiment is timed, ``window_first`` and ``window_last`` of every
+        window, and ``elapsed``, seconds since the start of the track, where measurements come regularly. For a set of
+        flights ``flight`` and ``length`` give the flight of each episode and its number of measurements; later values
+        are NaN. The attribute ``notes`` lists omissions. For a recording ``flight`` names the episode of the recording.
+        Without truth there are neither ``error``, ``cost``, ``compressed_cost`` nor ``nees``. Where the truth of some
+        components is unknown, their errors are NaN, ``nees`` and ``nees_degrees`` are those of the other components,
         and ``truth_known`` marks these.
 
     Raises:

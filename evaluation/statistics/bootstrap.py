@@ -166,7 +166,7 @@ class Bootstrap:
 
         Returns:
             Weighted sums of each array, ``(1 + resamples, 1, ...)``; for ragged episodes of the values
-                without NaN and of their weights, ``(1 + resamples, 2, ...)``.
+            without NaN and of their weights, ``(1 + resamples, 2, ...)``.
         """
         some = len(values[0])
         flat = numpy.concatenate([each.reshape(some, -1) for each in values], axis=1, dtype=float)
