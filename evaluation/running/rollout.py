@@ -93,7 +93,7 @@ def rollout(
 def _step(
     looped: Model, maker: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
-    """Step a bank with a policy, or a filter without one if ``maker`` is None."""
+    """Yield report and action at every measurement, of a policy's bank, or of a filter if ``maker`` is None."""
     lanes, action, policy, memory = start_lanes(looped, seeds, report=report), None, None, None
     if maker is None:
         action = numpy.zeros(len(seeds), dtype=numpy.int64)
@@ -246,13 +246,13 @@ def _without_padding(report: Mapping[str, numpy.ndarray], count: int) -> dict[st
 def _run_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
 ) -> EpisodeReports:
-    """Run compiled episodes in native code, ``AT_ONCE`` measurements in each call."""
+    """Run compiled episodes in native code, ``AT_ONCE`` measurements in each call; return their reports."""
     lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
     interval = looped.task.decision_interval
     decisions, most = lanes.decisions_per_episode, max(1, AT_ONCE // (lanes.width * interval))
 
     def run(decisions: int, whole: bool) -> EpisodeReports:
-        """Run a number of decisions; for whole episodes return a view."""
+        """Return the reports on a number of decisions; on whole episodes as views."""
         reports, actions = lanes.run(report, compiled_policy, decisions * interval)
         tick(count * decisions * interval)
         found = {name: _episodes_first(values, count) for name, values in reports.items()}
@@ -297,7 +297,7 @@ def _join_stretches(
 def _step_episodes(
     steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, drawn: int
 ) -> EpisodeReports:
-    """Run episodes step by step and collect the reports."""
+    """Run episodes step by step and return the reports."""
     series: dict[str, list[numpy.ndarray]] = {}
     actions = []
     for found, action in steps:
@@ -334,11 +334,7 @@ def _episodes_first(values: numpy.ndarray, count: int) -> numpy.ndarray:
 
 
 def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.ndarray:
-    """Return actions ``(time, ..., N)``, episodes first.
-
-    Raises:
-        ValueError: for the first action outside the action space, apart from the limits of a box.
-    """
+    """Return actions, episodes first; raise ValueError if one is outside the action space (but for a box's limits)."""
     space, kept = model.action_space, _episodes_first(actions, count)
     if isinstance(space, gymnasium.spaces.Discrete):
         kept = kept.astype(numpy.int64)

@@ -100,7 +100,7 @@ def with_times(dataset: "xarray.Dataset", times: Sequence[ProcessorTime | None])
 
 
 def way_of(time: ProcessorTime) -> str:
-    """Return which of :data:`WAYS` a time belongs to."""
+    """Return in which of the :data:`WAYS` a competitor ran."""
     return OWN if time.own else COMPILED if time.compiled else IN_PYTHON
 
 
