@@ -110,7 +110,7 @@ class _ProgramText:
         return f"v{step}"
 
     def as_number(self, step: int) -> str:
-        """Return the C expression of a step's value as a number, one for true and zero for false."""
+        """Return the C expression of a value as a number: one for true, zero for false."""
         value = self.value(step)
         if not self.steps[step].logical:
             return value
@@ -140,7 +140,7 @@ def write_program(
     results: int = 0,
     arrays: Arrays | None = None,
 ) -> ProgramSource:
-    """Return the C text of a program for one lane, with loops where they are shorter.
+    """Return the C text of a program for one lane, with loops where they make the text shorter.
 
     A result is written as soon as it is computed, so results must not overwrite inputs.
 
@@ -203,7 +203,7 @@ def write_program(
 
 
 def _merge_blocks(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
-    """Return the blocks of statements merged up to the length of a function, and their number before a pause."""
+    """Return the statements joined into blocks of a function's length, and the number of blocks before a pause."""
     packed: list[list[str]] = []
     before = 0
     for i, block in enumerate(blocks):

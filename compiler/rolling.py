@@ -31,7 +31,7 @@ turn of the same loop, and any computed value.
 
 
 class Operand(NamedTuple):
-    """Locations that the members of a statement read or write."""
+    """Array elements that the members of a statement read or write, one for each turn of the loop."""
 
     array: int
     """Number of an argument, or one of ``SCRATCH``, ``CONSTANTS``, ``TURN``."""
@@ -87,7 +87,7 @@ class _Read(NamedTuple):
 
 
 class _Draft:
-    """A statement before its locations are assigned: members and operands are steps."""
+    """Statement of a loop before its array elements are assigned; members and operands are steps."""
 
     def __init__(
         self,
@@ -192,7 +192,7 @@ class _Roller:
                 yield steps[start:end]
 
     def _levels(self) -> numpy.ndarray:
-        """Return the depth of each step in the dependencies among those of its array operation."""
+        """Return the depth of each step in the dependencies within its array operation."""
         inside = (self.parts >= 0) & (self.group[self.parts] == self.group[:, None])
         inside &= self.source[self.parts] == COMPUTED
         levels = numpy.zeros(len(self.steps), dtype=numpy.int64)
@@ -201,7 +201,6 @@ class _Roller:
         return levels
 
     def _compute(self, groups: Sequence[numpy.ndarray]) -> None:
-        """Add the statements of groups of steps that have one form."""
         heads = numpy.array([members[0] for members in groups], dtype=numpy.int64)
         kinds, logical, number = (
             column[heads].tolist() for column in (self.steps.kinds, self.logical, self.group)
@@ -218,7 +217,7 @@ class _Roller:
             self._add(draft)
 
     def _write(self, argument: int, nodes: dict[int, int], late: bool) -> None:
-        """Add the statements that write results: one for the results of a whole statement, one for all others."""
+        """Add statements that write results: one for the results of a whole statement, one for all others."""
         by_draft: dict[int, list[tuple[int, int]]] = {}
         rest = []
         for row, step in sorted(nodes.items()):
@@ -242,7 +241,7 @@ class _Roller:
         self._add(draft)
 
     def _sources(self, columns: Sequence[numpy.ndarray]) -> list[int | None]:
-        """Return for each operand the argument or constants that contain all of it; None: the scratch array."""
+        """Return for each operand the argument, or constants, that hold all of it; None: the scratch array."""
         steps, starts, lengths = _join_columns(columns)
         sources = self.source[steps]
         own = sources[starts]
@@ -269,7 +268,6 @@ class _Roller:
     # --- order
 
     def _find_sources(self) -> Iterator[_Read]:
-        """Yield the sources of all operands of all statements."""
         columns = [column for draft in self.drafts for column in draft.columns]
         counts = numpy.array([draft.count for draft in self.drafts])
         steps, starts, lengths = _join_columns(columns)
@@ -288,7 +286,7 @@ class _Roller:
                 yield _Read(None, number[i] if of_all[i] else None, statements)
 
     def _needs(self, draft: _Draft) -> dict[int, bool]:
-        """Return the statements whose members a draft reads, and whether the same turn of a loop suffices for each."""
+        """Return the statements that a draft reads, and whether the same turn of a loop suffices for each."""
         needs: dict[int, bool] = {}
         for _, turn, statements in draft.reads:
             for number in statements:
@@ -296,7 +294,7 @@ class _Roller:
         return needs
 
     def schedule(self) -> list[list[int]]:
-        """Return the statements of each loop; loops have statements of equal count, as early as operands allow."""
+        """Return the statements of each loop, all with the same number of turns, as early as operands allow."""
         drafts = self.drafts
         waits = [0] * len(drafts)
         users: list[list[tuple[int, bool]]] = [[] for _ in drafts]
@@ -337,7 +335,7 @@ class _Roller:
     # --- places
 
     def finish(self) -> Rolled:
-        """Return the loops, with the locations of all values that pass between them."""
+        """Return the loops, with the array elements of all values that pass between them."""
         loops = self.schedule()
         drafts = self.drafts
         turns: dict[tuple[int, int], int] = {}
@@ -380,9 +378,9 @@ class _Roller:
         return Rolled(made, before, scratch)
 
     def _slots(self, kept: Iterable[int], last: dict[int, int]) -> tuple[dict[int, int], int]:
-        """Return the first index in the scratch array of every stored statement, and the array's length.
+        """Return the first scratch index of every stored statement, and the length of the scratch array.
 
-        Results of one array operation are adjacent, and are stored as long as any of them is needed.
+        Results of one array operation are adjacent, stored as long as any is needed.
         """
         inside: dict[int, int] = {}
         sizes: dict[int, int] = {}
@@ -416,7 +414,7 @@ def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, nump
 
 @without_collection()
 def roll(program: StraightLineProgram, results: int = 0) -> Rolled:
-    """Return a program as loops over the members of its array operations.
+    """Convert a straight-line program to loops over the elements of its array operations.
 
     Args:
         program: program with origins, and without products that are loops.
@@ -426,7 +424,7 @@ def roll(program: StraightLineProgram, results: int = 0) -> Rolled:
 
 
 def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled | None:
-    """Return a program as loops if that makes less code; None if a straight line is shorter.
+    """Convert a program to loops if that makes less code; return None if a straight line is shorter.
 
     Args:
         program: program with origins.
@@ -441,7 +439,7 @@ def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled
 
 
 def common_difference(places: Sequence[int]) -> int | None:
-    """Return the difference between successive numbers if it is constant, else None."""
+    """Return the difference between successive integers if it is constant, else None."""
     count, first = len(places), places[0]
     step = places[1] - first if count > 1 else 0
     regular = range(first, first + step * count, step) if step else (first,) * count

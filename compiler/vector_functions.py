@@ -30,7 +30,7 @@ _NAMES = {"absolute": "abs", "rint": "round"}
 
 
 class VectorFunction:
-    """A function of a vector, and its Jacobian by reverse-mode differentiation.
+    """A function of a vector, traced, with its Jacobian by reverse-mode differentiation.
 
     Args:
         function: function from an array ``(n + g,)`` to a sequence or an array of m numbers; or a matrix ``(m, n)``.
@@ -79,7 +79,7 @@ class VectorFunction:
 
     @functools.cached_property
     def linear(self) -> numpy.ndarray:
-        """Mask of the constant entries of the Jacobian, ``(m, n)``, from random states of four magnitudes."""
+        """Mask ``(m, n)`` of the entries of the Jacobian that are constant, judged at random states."""
         rng, count = numpy.random.default_rng(0), 8
         x = rng.normal(size=(self.inputs, 4 * count)) * numpy.repeat(10.0 ** numpy.arange(4), count)
         given = numpy.repeat(rng.uniform(0.1, 1.0, (self.given, 1)), 4 * count, axis=1)
@@ -90,7 +90,7 @@ class VectorFunction:
 
     @property
     def reads(self) -> tuple[frozenset[int], ...]:
-        """Indices of the inputs on which each output depends."""
+        """For each output the indices of the inputs on which it depends."""
         found: list[frozenset[int]] = []
         for name, arguments, _ in self._value.steps:
             if name == "input":
@@ -101,22 +101,20 @@ class VectorFunction:
         return tuple(found[result.node] for result in self._value.results)
 
     def value(self, x: Any, xp: Any) -> Any:
-        """Return the function's values at N vectors, ``(m, N)``.
+        """Return the function's values ``(m, N)`` at N vectors.
 
         Args:
             x: vectors, ``(n + g, N)``.
             xp: array namespace of x.
-
         """
         return xp.stack(_compute(self._value, x, xp))
 
     def jacobian(self, x: Any, xp: Any) -> Any:
-        """Return the Jacobians at N vectors with respect to the first n inputs, ``(m, n, N)``.
+        """Return the Jacobians ``(m, n, N)`` with respect to the first n inputs at N vectors.
 
         Args:
             x: vectors, ``(n + g, N)``.
             xp: array namespace of x.
-
         """
         entries, n = _compute(self._jacobian, x, xp), self.inputs
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
@@ -127,7 +125,7 @@ def _program(graph: Graph, nodes: Sequence[int]) -> StraightLineProgram:
 
 
 def _compute(program: StraightLineProgram, x: Any, xp: Any) -> list[Any]:
-    """Return the results of a program on an array of lanes ``(n, N)``, as a list of arrays ``(N,)``."""
+    """Return the results of a program on lanes ``(n, N)``, as a list of arrays ``(N,)``."""
     values: list[Any] = []
 
     def array(place: int) -> Any:
