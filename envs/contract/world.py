@@ -16,10 +16,7 @@ Measurement = TypeVar("Measurement")
 
 
 class World(ABC, Generic[TaskT, Truth, Measurement]):
-    """Base class of the truth and the sensors of a task.
-
-    Args:
-        task: the estimation problem, with the constants that world and filter share.
+    """Base class of a task's world: the simulated truth and the sensors.
 
     Attributes:
         initial_normals: standard normal numbers of the track's start.
@@ -58,8 +55,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """Return the true state at the start of the track, and the initial estimate given to every filter.
 
         Args:
-            draws: random numbers that fix the scenario of each episode.
-            normals: ``(initial_normals, N)``, the errors of the track's start.
+            draws: random quantities of each episode.
+            normals: ``(initial_normals, N)``, for the errors of the start.
 
         Returns:
             The truth, and an :class:`Initial` or a NamedTuple that has its fields.
@@ -81,14 +78,11 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return state
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
-        """Return the measurement with NaN in place of every value that was not received, for an estimator.
+        """Return the measurement with NaN for every value that was not received, as estimators get it.
 
         The filters of a bank weight a value by its availability, so its number does not matter to them. An estimator
         that ignores the availability must not use that number as a measurement. By default the values of
         ``received_field`` are replaced.
-
-        Args:
-            measurement: of :meth:`advance`.
         """
         if not self.received_field:
             return measurement
@@ -98,11 +92,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return replaced
 
     def add_recorded_fields(self, measurement: Measurement) -> Measurement:
-        """Return the measurement with zeros instead of None in fields that only recordings contain.
-
-        Args:
-            measurement: of :meth:`advance`.
-        """
+        """Return the measurement with zeros instead of None in fields that only recordings contain."""
         return measurement
 
     def component_readings(self, measurement: Measurement) -> Array | None:
@@ -120,9 +110,6 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """Return the standard deviations of the readings' errors, in the shape of the readings.
 
         By default the square roots of ``stated_field``; a subclass may return nominal ones.
-
-        Args:
-            measurement: of :meth:`advance`.
         """
         if not self.stated_field:
             raise NotImplementedError(
@@ -143,8 +130,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     def cost(self, truth: Truth, mean: Array) -> Array:
         """Return the uncapped cost of an estimate, ``(N,)`` (step 5 of the clock).
 
-        A squared error in units of the sensor's nominal variance (:meth:`error_cost`), or, where the estimate drives a
-        control loop, the quadratic cost of the loop in a fixed unit.
+        By default :meth:`error_cost`; where the estimate drives a control loop, the quadratic cost of the loop.
 
         Args:
             truth: at the measurement that the estimate is for.
@@ -153,18 +139,14 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.error_cost(self.task.subtract(mean, self.state(truth)))
 
     def counted_cost(self, truth: Truth, mean: Array) -> Array:
-        """Return the part of the cost of an estimate that enters the reward, not negative, ``(N,)``.
+        """Return the part of an estimate's cost that enters the reward, not negative, ``(N,)``.
 
-        That is all of it, except a part that the estimate is known not to cause.
-
-        Args:
-            truth: at the measurement that the estimate is for.
-            mean: of the estimate, ``(C, N)``.
+        By default all of it; a task may exclude a part that the estimate does not cause.
         """
         return self.cost(truth, mean)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return further values of the truth to record at each measurement, by name: arrays ``(N,)``."""
+        """Return further values of the truth to record at each measurement by name, ``(N,)``."""
         return {}
 
     def context(self, truth: Truth) -> dict[str, Array]:
