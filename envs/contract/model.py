@@ -228,9 +228,7 @@ class Model:
         return self.filter.covariance(episode.filter)
 
     def track(self, episode: Episode) -> dict[str, Array]:
-        """Return the arrays for a picture by name: ``truth`` if known, ``estimate``, ``covariance``,
-        ``measurement_NAME``.
-        """
+        """Return ``truth`` if known, ``estimate``, ``covariance`` and the arrays ``measurement_NAME``, by name."""
         measured = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
         return {**self._truth_and_estimate(episode), **measured}
 
