@@ -28,10 +28,7 @@ MOST_NODES = 100_000
 
 
 def check_column_names(names: Sequence[str]) -> list[str]:
-    """Return the names of a table's columns in lower case; raise ValueError for invalid ones.
-
-    They are too many, too long, or equal.
-    """
+    """Return a table's column names in lower case; raise ValueError for too many, too long or equal names."""
     if len(names) > MOST_COLUMNS:
         raise ValueError(
             f"it has {len(names):,} columns, and a table has at most {MOST_COLUMNS:,}: leave some out"
@@ -395,7 +392,7 @@ def _seconds(header: Any) -> float:
 
 
 def _fix_values(fix: Any) -> tuple[float, ...]:
-    """Return the time, status, latitude, longitude, altitude, variances east and north, and their type of a fix."""
+    """Return time, status, latitude, longitude, altitude, variances east and north, and covariance type of a fix."""
     variances = fix.position_covariance.reshape(3, 3).diagonal()
     place = fix.latitude, fix.longitude, fix.altitude
     known = fix.position_covariance_type

@@ -152,10 +152,7 @@ class Recording(ScenarioData):
 
     @functools.cached_property
     def truth_known(self) -> numpy.ndarray:
-        """Return whether the truth of each component is known somewhere in every episode, booleans ``(C,)``.
-
-        The truth must not be None.
-        """
+        """For each component whether every episode has a true value of it, ``(C,)``; ``truth`` must not be None."""
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         truth: Any = self.truth
         known: numpy.ndarray = numpy.logical_and(numpy.isfinite(truth), there[..., None]).any(axis=1)

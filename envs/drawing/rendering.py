@@ -125,7 +125,7 @@ class Picture:
         return {}
 
     def strips(self) -> Sequence[Strip]:
-        """Return the time series to draw: the error of every component with its reported band, and the action."""
+        """Return the time series of the picture: the error of each component with its reported band, and the action."""
         shown = self.model.task.components[:MOST_COMPONENTS]
         errors = [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
-    """Gymnasium environment of one episode of a task at a time.
+    """Gymnasium environment that runs one episode of a task at a time.
 
     Args:
         task: environment id.
@@ -86,7 +86,6 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         self._plain_action = self.action_space.shape if is_row else None
 
     def _picture_of(self, scenario: str) -> None:
-        """Create the picture of episodes of the current task, with the name of their scenario."""
         # Only here: matplotlib takes longer to import than an episode takes to run.
         from ..drawing.rendering import EpisodePicture
         from .late_picture import LatePicture
@@ -123,7 +122,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), self._with_context({})
 
     def _single_observation(self) -> Any:
-        """Return the observation of the only lane in the chosen type, with privileged values if wanted."""
+        """Return the observation of the only episode in the chosen type, with privileged values if wanted."""
         if not self.privileged:
             return self._to_dtype(self.fleet.observe()[0])
         return {name: values[0] for name, values in self._observations().items()}
@@ -164,7 +163,6 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), reward, False, bool(self.fleet.done[0]), info
 
     def _show(self) -> None:
-        """Draw the episode into the window of render mode "human"."""
         if self._late is not None and self.render_mode == "human":
             self._late.show()
 
@@ -174,11 +172,10 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return None if self._late is None else self._late.picture
 
     def render(self) -> numpy.ndarray | None:
-        """Return an image of the episode so far in mode "rgb_array"; None otherwise.
+        """Return an image of the episode so far in mode "rgb_array"; None in mode "human" or without a mode.
 
         Returns:
-            ``(height, width, 3)`` bytes in render mode "rgb_array"; None in "human", whose window is drawn by
-            every reset and step anyway.
+            ``(height, width, 3)`` bytes, or None: every reset and step draws the window of "human" anyway.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.

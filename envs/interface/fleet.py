@@ -28,7 +28,7 @@ ROOM = 8
 
 
 class EpisodeDistribution(NamedTuple):
-    """Distribution of the next episodes of a lane over scenarios."""
+    """Distribution of the next episodes of a lane over the tasks of its scenarios."""
 
     scenario: Any
     """Choice of the user."""
@@ -49,7 +49,7 @@ class EpisodeDistribution(NamedTuple):
         return alike and repr(plain(self.parameters)) == repr(plain(parameters))
 
     def draw_task(self, generator: numpy.random.Generator) -> int:
-        """Draw the index of the next episode's task by the weights; with one task, without a random number."""
+        """Draw the index of the next episode's task by the weights; a single task needs no random number."""
         if len(self.models) == 1:
             return 0
         chosen = int(numpy.searchsorted(numpy.cumsum(self.weights), generator.random(), side="right"))
@@ -57,13 +57,7 @@ class EpisodeDistribution(NamedTuple):
 
 
 def check_alike(model: Model, other: Model, name: str) -> None:
-    """Raise ValueError if two tasks have different observation or action spaces.
-
-    Args:
-        model: model with the spaces of the environment.
-        other: model of the other task.
-        name: name of its scenario, for errors.
-    """
+    """Raise ValueError if two tasks have different observation or action spaces; ``name`` is the other's scenario."""
     properties: dict[str, Callable[[Model], Any]] = {
         "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
         "the action space": lambda t: t.action_space,
@@ -79,13 +73,13 @@ def check_alike(model: Model, other: Model, name: str) -> None:
 
 
 class Fleet:
-    """``count`` lanes (parallel episodes), each with its own :class:`EpisodeDistribution`.
+    """``count`` lanes (parallel episodes) of one task or of several, as their distributions draw them.
 
     Args:
         count: number of lanes.
         distribution: of the episodes of all lanes, until :meth:`set_distribution` sets another.
         kind: kind of reward, which may need a baseline beside every episode.
-        longest: decisions after which an episode ends at the latest; default: its task's horizon.
+        longest: most decisions of an episode; default: its task's horizon.
     """
 
     def __init__(
@@ -113,11 +107,7 @@ class Fleet:
 
     @property
     def only(self) -> Lanes:
-        """The :class:`.Lanes` of the only task.
-
-        Raises:
-            ValueError: for several tasks.
-        """
+        """The :class:`.Lanes` of the only task; ValueError if there are several tasks."""
         if self.whole is not None:
             return self.whole
         if self.count > 1:
@@ -181,7 +171,7 @@ class Fleet:
         return part
 
     def _arrange(self) -> None:
-        """Delete the lanes of tasks no longer in use, and update the index of every environment's lane."""
+        """Delete the lanes of tasks no longer in use, and number the others anew."""
         needed = [
             model.task.parameters for distribution in self._distributions for model in distribution.models
         ]
@@ -209,7 +199,7 @@ class Fleet:
         self.whole = self._parts[0] if own_places and alone else None
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
-        """Set the generator from which a lane's next episodes are drawn."""
+        """Set the random generator that draws a lane's next episodes."""
         while len(self.generators) <= lane:
             self.generators.append(generator)
         self.generators[lane] = generator
@@ -248,7 +238,7 @@ class Fleet:
         self._arrange()
 
     def _leave(self, whole: Lanes) -> None:
-        """Switch from the lanes of a single task to lanes of several tasks, and keep running episodes."""
+        """Switch from the lanes of a single task to those of several tasks; running episodes continue."""
         self.whole = None
         if whole.has_episodes:
             whole.grow(whole.width)
@@ -258,14 +248,14 @@ class Fleet:
     # --- steps of the lanes
 
     def parts(self, *values: Array) -> list[tuple[Any, ...]]:
-        """Return a list of the :class:`.Lanes` of every task in use, with their entries of arrays ``(count, ...)``."""
+        """Return the :class:`.Lanes` of every task in use, each with its entries of arrays ``(count, ...)``."""
         return [
             (self._parts[i], *(v[source] for v in values))
             for i, source in zip(self._flying, self._sources, strict=True)
         ]
 
     def gather(self, values: Sequence[Array]) -> Array:
-        """Return a new array ``(count, ...)`` from results for the :meth:`parts`, ``(places, ...)`` each."""
+        """Return one array ``(count, ...)`` from results for each of the :meth:`parts`, ``(places, ...)``."""
         if isinstance(values[0], numpy.ndarray):
             return (
                 numpy.array(values[0]) if self.whole is not None else numpy.concatenate(values)[self._where]
@@ -275,7 +265,7 @@ class Fleet:
         return self._parts[0].model.task.xp.concat(list(values))[self._where]
 
     def step_reward(self, action: Array, kind: str) -> Array:
-        """Apply one action in all lanes and return the mean reward over its measurements, ``(count,)``."""
+        """Apply one action in each lane; return the mean rewards over its measurements, ``(count,)``."""
         if self.whole is not None:
             return self.whole.step_reward(action, kind)
         return self.gather([part.step_reward(own, kind) for part, own in self.parts(action)])
@@ -288,20 +278,18 @@ class Fleet:
 
     @property
     def decisions(self) -> numpy.ndarray:
-        """Number of decisions in each lane's current episode, ``(count,)``."""
+        """Number of decisions so far in each lane's episode, ``(count,)``."""
         return numpy.asarray(self.gather([part.decisions for (part,) in self.parts()]))
 
     @property
     def done(self) -> numpy.ndarray:
-        """Whether the episode of each lane is over, booleans ``(count,)``; episodes of different tasks may differ in
-        length.
-        """
+        """Whether the episode of each lane is over, booleans ``(count,)``."""
         if self.whole is not None:
             return self.whole.done
         return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
-        """Shorten the episodes that just began in some lanes by numbers of decisions, to at least one."""
+        """Shorten the episodes that just began in some lanes by some decisions each, to one at least."""
         for lane, by in zip(lanes, decisions, strict=True):
             self._parts[self._part[lane]].shorten([int(self._place[lane])], by)
 
@@ -311,21 +299,17 @@ class Fleet:
         return self.whole.has_episodes if self.whole is not None else bool((self._part >= 0).all())
 
     def detach(self) -> None:
-        """Detach the episodes from the autograd graph (torch only)."""
+        """Detach the running episodes from the autograd graph (torch only)."""
         for (part,) in self.parts():
             part.detach()
 
     def snapshot(self) -> dict[str, Any]:
-        """Return a copy of the complete state, random numbers included, for :meth:`restore`."""
+        """Return a copy of the complete state of all episodes, random numbers included."""
         kept = {name: copy.deepcopy(getattr(self, name)) for name in _STATE_ATTRIBUTES}
         return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Restore the state of a snapshot of lanes of the same tasks.
-
-        Raises:
-            ValueError: if their number differs.
-        """
+        """Restore the state of a :meth:`snapshot`; ValueError if its number of lanes differs."""
         if snapshot["count"] != self.count:
             raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
         for name in _STATE_ATTRIBUTES:

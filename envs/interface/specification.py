@@ -26,7 +26,7 @@ def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
 
 
 def plain(value: Any) -> Any:
-    """Return a keyword's value in a JSON-compatible form from which the same environment can be made."""
+    """Return a keyword's value in a form that JSON can store and that makes the same environment."""
     if isinstance(value, ScenarioData):
         return {name: plain(item) for name, item in value.fields().items()}
     if isinstance(value, enum.Enum):

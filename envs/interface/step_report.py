@@ -10,7 +10,7 @@ from ..engine.reward import REWARD_FUNCTIONS
 
 
 class StepReport(NamedTuple):
-    """Requested quantities, lanes last; the others are None."""
+    """Report on one measurement: requested quantities, lanes (parallel episodes) last; the others are None."""
 
     reward: Array
     """Reward, ``(N,)``; a relative one before that of the baseline is subtracted."""
@@ -26,7 +26,7 @@ class StepReport(NamedTuple):
 
 @functools.cache
 def step_report(kind: str, errors: bool = False, details: bool = False, episode: bool = False) -> Report:
-    """Return the function that computes a :class:`StepReport`; equal arguments return the same function.
+    """Return the function that computes a :class:`StepReport`, the same one for equal arguments.
 
     Args:
         kind: of reward, one of :data:`.reward.REWARD_FUNCTIONS`.

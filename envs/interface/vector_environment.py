@@ -24,10 +24,7 @@ if TYPE_CHECKING:
 
 
 class _OneThread:
-    """Context manager that admits one thread at a time.
-
-    It uses a list, since a lock can be neither copied nor pickled with an environment.
-    """
+    """Context manager that admits one thread at a time; unlike a lock it can be copied and pickled."""
 
     def __init__(self) -> None:
         self._free = [True]
@@ -46,7 +43,7 @@ class _OneThread:
 
 
 class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Gymnasium vector environment of many episodes of a task, natively vectorised.
+    """Gymnasium vector environment that runs many episodes of a task in parallel.
 
     Args:
         task: environment id.
@@ -316,8 +313,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return images of the first few sub-environments in mode "rgb_array"; None otherwise.
 
         Returns:
-            A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few: drawing takes
-            far longer than stepping. None without a render mode.
+            A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -337,7 +333,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.pictures.close()
 
     def _with_masks(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
-        """Return ``info`` in Gymnasium's form: beside every key the mask of the sub-environments that have it."""
+        """Return ``info`` in Gymnasium's form: beside every key the mask of the sub-environments with it."""
         if not mask.any():
             return {}
         masked = {}
@@ -352,11 +348,10 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return tensor_on(array, self.device)
 
     def _mask(self, lanes: numpy.ndarray) -> Array:
-        """Return a copy of booleans ``(num_envs,)`` on the device of the backend."""
         return lanes.copy() if self.backend != "torch" else tensor_on(lanes, self.device)
 
     def _final_observations(self, last: Any, done: numpy.ndarray) -> Array:
-        """Return last observations in Gymnasium's form: an object for each finished sub-environment, else None.
+        """Return last observations in Gymnasium's form: an object for each finished lane, else None.
 
         With the torch backend one tensor, the last observation of every lane: splitting it would need a
         transfer for each lane.

@@ -18,7 +18,7 @@ from ..contract.observation import Array
 
 @dataclass(frozen=True)
 class Input:
-    """A known input: its Gauss-Markov process in a simulation, and the noise of the value that filters receive.
+    """Known input of a state-space model: its Gauss-Markov process in a simulation, and its reported noise.
 
     Raises:
         ValueError: for a number that is not finite or out of range.
@@ -45,11 +45,7 @@ class Input:
 
 
 class InputProcesses:
-    """Gauss-Markov processes of the inputs of a simulation.
-
-    Args:
-        inputs: the p inputs.
-        xp: array namespace.
+    """Gauss-Markov processes of the p inputs of a simulation.
 
     Attributes:
         initial_normals: number of standard normal numbers at the start, p.
@@ -64,7 +60,7 @@ class InputProcesses:
         self.normals: int = len(inputs) + len(self.noisy)
 
     def begin(self, normals: Array) -> Array | None:
-        """Return the initial inputs, ``(p, N)``, drawn from their stationary distribution; None without inputs.
+        """Return the initial inputs, ``(p, N)``, drawn from their stationary distribution; None if p is 0.
 
         Args:
             normals: standard normal numbers, ``(p, N)``.

@@ -75,7 +75,7 @@ def check_speed(
     sigma: float = 0.0,
     moving: bool = True,
 ) -> None:
-    """Raise ValueError if positions in metres and times in seconds give an impossible speed.
+    """Raise ValueError if positions taken as metres and times as seconds give an impossible speed.
 
     Args:
         time: s, ``(n,)``, increasing.
@@ -151,7 +151,7 @@ def check_velocity(what: str, time: numpy.ndarray, position: numpy.ndarray, velo
 
 
 def check_degrees(name: str, values: numpy.ndarray, most: float) -> None:
-    """Raise ValueError for angles beyond ``most`` degrees."""
+    """Raise ValueError for angles beyond +-``most`` degrees."""
     largest = float(numpy.nanmax(numpy.abs(values), initial=0.0))
     if largest > most:
         cause = ": is it metres?" if largest > 1000.0 else ""
@@ -220,7 +220,7 @@ def check_interval(step: float, longest: float) -> None:
 def find_outliers(
     time: numpy.ndarray, position: numpy.ndarray, reach: Callable[[numpy.ndarray], Any]
 ) -> numpy.ndarray:
-    """Return the mask ``(n,)`` of positions too far from both neighbours, which are near each other.
+    """Return the mask ``(n,)`` of positions that are too far from both neighbours, which are near each other.
 
     Args:
         time: s, ``(n,)``.
@@ -239,9 +239,9 @@ def find_outliers(
 
 
 def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
-    """Return the deviations of values ``(n, k)`` from the line through their neighbours, ``(n - 2, k)``.
+    """Return the distance of values ``(n, k)`` from the line through their neighbours, ``(n - 2, k)``.
 
-    The deviations are scaled to the variance of the noise of the values.
+    It is scaled to the variance of the noise of the values.
     """
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, None]
     line = before * values[:-2] + (1.0 - before) * values[2:]
@@ -249,7 +249,7 @@ def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
 
 
 def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
-    """Return the standard deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3.
+    """Estimate the standard deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3.
 
     It is estimated from the median distance to the line through the neighbours, and not below the resolution of 64-bit
     numbers of that size.
@@ -259,7 +259,7 @@ def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
 
 
 def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint: str = "") -> list[str]:
-    """Return the notes on columns of a table that are not read, warnings first.
+    """Return notes on the columns of a table that are not read, warnings first.
 
     Args:
         names: names of the columns, in lower case.
@@ -306,7 +306,7 @@ def _is_noise(name: str) -> bool:
 
 
 def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, float]) -> list[str]:
-    """Return notes on every episode of a recording; raise ValueError for impossible values.
+    """Return notes on the plausibility of every episode of a recording; ValueError for impossible values.
 
     Args:
         recording: the recording.
@@ -359,7 +359,7 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
 
 
 def limit_notes(notes: list[str]) -> list[str]:
-    """Return the first ``MOST_NOTES`` notes and the number of the others."""
+    """Return the first ``MOST_NOTES`` notes, and one with the number of the others."""
     more = [f"and {len(notes) - MOST_NOTES:,} more notes"] * (len(notes) > MOST_NOTES)
     return [*notes[:MOST_NOTES], *more]
 
@@ -424,18 +424,7 @@ def _check_scale(
 def _notes(
     time: numpy.ndarray, position: numpy.ndarray, sigma: numpy.ndarray, number: numpy.ndarray, moving: bool
 ) -> list[str]:
-    """Return notes on the measured positions of one episode.
-
-    Args:
-        time: s, ``(n,)``.
-        position: m, ``(n, k)``.
-        sigma: stated standard deviation, m, ``(n,)``.
-        number: number of each measurement.
-        moving: whether the target cannot stand still.
-
-    Raises:
-        ValueError: if the clock jumped and the target did not.
-    """
+    """Return notes on the measured positions of one episode; ValueError if the clock jumped, not the target."""
     moved, steps = _length(numpy.diff(position, axis=0)), numpy.diff(time)
     step, error, notes = float(numpy.median(steps)), float(numpy.median(sigma)), []
     half = len(position) // 2
