@@ -63,7 +63,7 @@ SPEED = 100.0
 
 
 class Prediction(NamedTuple):
-    """Prediction of the plain filter for a measurement."""
+    """Prediction of the unscented filter without an action, for a measurement."""
 
     innovation: Array
     """m, ``(2, N)``; zero where the scan missed the target."""
@@ -77,17 +77,17 @@ class Prediction(NamedTuple):
 
 
 class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measurement, EstimateState]):
-    """The unscented filter of the turn with settings that an action multiplies."""
+    """Base class of unscented filters of the turn with settings that an action multiplies."""
 
     def __init__(self, task: TargetProblem) -> None:
         super().__init__(task, **PLAIN_FILTER)
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return one where the scan saw the target."""
+        """Return 1 where the scan saw the target, else 0, ``(N,)``."""
         return measurement.available
 
     def examine(self, state: EstimateState, measurement: Measurement) -> Prediction:
-        """Return the prediction of the plain filter for a measurement, with the innovation and its likelihood."""
+        """Return the prediction without an action, with the innovation and its likelihood."""
         xp = self.xp
         mean, covariance = self.predict_turn(state.mean, state.covariance, measurement.interval)
         innovation = measurement.position - mean[:2]
@@ -97,7 +97,7 @@ class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measure
         return Prediction(measurement.available * innovation, prior, sensor, likelihood, mean)
 
     def limit(self, covariance: Array) -> Array:
-        """Limit the deviation of the turn rate: the measurements would no longer determine it."""
+        """Return the covariance with a limited deviation of the turn rate, so that scans still determine it."""
         xp = self.xp
         ratio = xp.minimum(LARGEST_DEVIATION / xp.sqrt(covariance[4, 4]), 1.0)
         factors = xp.stack([*([1.0 + 0.0 * ratio] * 4), ratio])
@@ -105,7 +105,7 @@ class SteeredUnscentedTurn(UnscentedTurn, SteerableFilter[TargetProblem, Measure
 
 
 class WeightedUnscentedTurn(SteeredUnscentedTurn):
-    """The unscented filter whose weights of the sigma points an action multiplies."""
+    """Unscented filter of the turn: an action multiplies the weights of the sigma points."""
 
     settings: Mapping[str, float] = {
         **{f"mean_{side}{axis}": 5.0 for side in "+-" for axis in AXES},
@@ -113,7 +113,7 @@ class WeightedUnscentedTurn(SteeredUnscentedTurn):
     }
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Weigh the propagated sigma points by the factors of the action, and update with the measured position."""
+        """Return the state: propagated sigma points weighted by the action's factors, updated with the position."""
         if inputs.action is None:
             return super().update(state, inputs)
         T, factors = inputs.measurement.interval, self.xp.exp(inputs.action)
@@ -128,7 +128,7 @@ class WeightedUnscentedTurn(SteeredUnscentedTurn):
 
 
 class TunedUnscentedTurn(SteeredUnscentedTurn):
-    """The unscented filter whose scaling and noises an action multiplies."""
+    """Unscented filter of the turn: an action multiplies its scaling and noises."""
 
     settings: Mapping[str, float] = {
         "spread": 2.0**0.5,
@@ -138,7 +138,7 @@ class TunedUnscentedTurn(SteeredUnscentedTurn):
     }
 
     def update(self, state: EstimateState, inputs: FilterInput) -> EstimateState:
-        """Predict with the scaling and noises multiplied by the action, and update with the measured position."""
+        """Return the state predicted with scaling and noises times the action's factors, and updated."""
         if inputs.action is None:
             return super().update(state, inputs)
         xp, measurement, T = self.xp, inputs.measurement, inputs.measurement.interval
@@ -155,7 +155,7 @@ class TunedUnscentedTurn(SteeredUnscentedTurn):
 
 
 class UnscentedState(NamedTuple):
-    """The filter at one moment."""
+    """State of a steered unscented filter, with the values that the agent observes."""
 
     own: EstimateState
     likelihood: Likelihood
@@ -176,11 +176,11 @@ class UnscentedState(NamedTuple):
 
 
 class UnscentedBank(SettingsBank, RadarBank):
-    """The unscented filter of the turn, steered by factors of its settings: common base of both controls."""
+    """Base class of the banks of one unscented filter of the turn, whose settings the action multiplies."""
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """The innovation and its averages, how well it was predicted, and the predicted motion."""
+        """Observation blocks: innovation, its averages, its predicted deviation, and the predicted motion."""
         xp = self.xp
         return (
             innovation_block("xy"),
@@ -214,7 +214,7 @@ class UnscentedBank(SettingsBank, RadarBank):
         )
 
     def start(self, initial: Initial) -> UnscentedState:
-        """Return the bank's state at the initial estimate, with zero action."""
+        """Return the filter's state at the initial estimate, with zero action."""
         own, none = self.own.start(initial), 0.0 * initial.mean[:2]
         action = self.xp.stack([none[0]] * len(self.own.settings))
         return UnscentedState(own, own.likelihood, action, none, none, own.mean, none[0], none, none[0])
@@ -222,7 +222,7 @@ class UnscentedBank(SettingsBank, RadarBank):
     def add_observed(
         self, state: UnscentedState, found: Prediction, measurement: Measurement
     ) -> UnscentedState:
-        """Return the state with the innovation, its averages and the prediction, which the agent observes."""
+        """Return the state with the innovation, its averages and the prediction filled in."""
         xp = self.xp
         innovation = found.innovation / xp.sqrt(found.innovation_variance)
         squares = innovation * innovation
@@ -239,12 +239,12 @@ class UnscentedBank(SettingsBank, RadarBank):
 
 
 class SigmaPointsBank(UnscentedBank):
-    """Control ``sigma-points``: factors of the weights of the sigma points."""
+    """Bank of the control ``sigma-points``: the action multiplies the weights of the sigma points."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = WeightedUnscentedTurn
 
 
 class ScalingBank(UnscentedBank):
-    """Control ``unscented``: factors of the scaling and of the noises."""
+    """Bank of the control ``unscented``: the action multiplies the scaling and the noises."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = TunedUnscentedTurn
