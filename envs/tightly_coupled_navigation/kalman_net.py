@@ -41,7 +41,7 @@ DROPPED = ("log_likelihood", "log_predicted")
 
 
 class KalmanNetBank(RobustBank):
-    """Bank of ``kalman-net``: one extended Kalman filter, whose noises, gain and motion the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the action sets noises, gain and motion of a Kalman filter."""
 
     hypotheses: Sequence[str] = HYPOTHESES[SINGER:]
     reach: float = 1.0  # it learns through the filter, and does not explore
@@ -67,7 +67,7 @@ class KalmanNetBank(RobustBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of the paper's filters, and the deviations of this filter."""
+        """Observation blocks of the paper's filters, and the standard deviations of this filter."""
         xp, p = self.xp, self.parameters
         parts = {
             "position": (gnss_ins.POSITION, p.position_unit),
@@ -89,7 +89,7 @@ class KalmanNetBank(RobustBank):
         return (*shown, sure, last)
 
     def start(self, initial: Initial) -> Filters:
-        """Return the bank's state at the start of the track, from the initial estimate."""
+        """Return the filter's state at the start of the track, from the initial estimate."""
         state = super().start(initial)
         certain = state.log_likelihood
         return state._replace(log_predicted=certain, probabilities=1.0 + certain)
@@ -136,7 +136,7 @@ class KalmanNetBank(RobustBank):
         return unpack(state.covariances[:, 0], gnss_ins.SIZE)
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return the records of the paper's bank without probabilities, by name."""
+        """Return the records of the paper's bank, without probabilities, by name."""
         records = super().records(state, measurement)
         del records["mode_probability"]
         return records

@@ -10,7 +10,7 @@ from .parameters import DEGREE, SensorGroup, TightlyCoupledNavigationParameters
 
 
 class NavigationProblem(Task):
-    """Base class of the task: sensors, orbits of the satellites, and models of motion and errors."""
+    """Base class of the task: sensors, satellite orbits, and models of motion and errors."""
 
     parameters: TightlyCoupledNavigationParameters
 
@@ -57,7 +57,7 @@ class NavigationProblem(Task):
         return self.xp.clip(number, None, self.horizon + 1)
 
     def satellites_at(self, number: Array) -> tuple[Array, Array]:
-        """Return the positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
+        """Return positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
         row = self._row(number)
         return (
             self.xp.take(self._satellite_position, row, axis=2),

@@ -73,7 +73,7 @@ class Measurement(NamedTuple):
 
 
 class NavigationWorld(World[Task, Truth, Measurement]):
-    """World of an aircraft with a satellite receiver and an inertial system."""
+    """World of an aircraft with a satellite receiver and an inertial system (INS)."""
 
     task: NavigationProblem
     parameters: TightlyCoupledNavigationParameters
@@ -103,7 +103,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return self.task.sensor_sigma + 0.0 * measurement.readings
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
-        """Return the drawn truth (legs, disturbances, initial errors) and the initial estimate."""
+        """Draw legs, disturbances and initial errors; return this truth, and the initial estimate."""
         xp, p = self.xp, self.parameters
         zeros = xp.zeros_like(normals[0])
         legs, velocity, heading = self.course.begin(draws, zeros)
@@ -138,10 +138,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     def advance(self, truth: Truth, noise: Array, feedback: Array | None) -> tuple[Truth, Measurement]:
         """Return the truth after one step, and the measurement with noise and disturbances.
 
-        Args:
-            truth: at the measurement before.
-            noise: see :class:`.World`.
-            feedback: where tracking loops have an aperture, the state ``(17, N)`` that they expect.
+        ``feedback`` is the state ``(17, N)`` that tracking loops with an aperture expect.
         """
         xp, p, task = self.xp, self.parameters, self.task
         step = truth.step + 1
@@ -196,11 +193,9 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return the values to record at a measurement, by name: time, true hypothesis, and one where a sensor fails.
+        """Return time, true hypothesis, and one where a sensor fails, to record at a measurement, by name.
 
-        Failures are a rate noisier than stated, stuck accelerometers, and a pseudorange with an error above five
-        standard
-        deviations.
+        Failures are a noisier rate, stuck accelerometers, and a pseudorange error above five standard deviations.
         """
         xp, p = self.xp, self.parameters
         seconds = p.sampling_interval * xp.astype(truth.step, truth.state.dtype)
@@ -214,7 +209,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the context by name: legs, disturbances, true hypothesis, and noise and errors of readings."""
+        """Return legs, disturbances, true hypothesis, and noise and errors of readings, by name."""
         return {
             "leg_start": truth.legs.start,
             "leg_kind": truth.legs.kind,

@@ -60,7 +60,7 @@ class HypothesesState(NamedTuple):
 
 
 class HypothesesBank(SettingsBank, AutopilotBank):
-    """Bank of ``hypotheses``: the bank over noise levels with factors on its weights and noises."""
+    """Bank of ``hypotheses``: estimator ``level-bank`` with factors on its weights and noises."""
 
     filter_class: ClassVar[type[SteerableFilter[Any, Any, Any]]] = LevelBank
 
@@ -83,7 +83,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of every filter, the log-density of the readings, and the probabilities of the levels."""
+        """Observation blocks of every bank, the readings' log-density, and the probabilities of the levels."""
         xp, low, high = self.xp, *self.sensor_limits
         unit = math.prod(self.task.sensor_variances) ** 0.5 * (2.0 * math.pi) ** (
             0.5 * len(self.task.sensors)
@@ -185,5 +185,5 @@ class HypothesesBank(SettingsBank, AutopilotBank):
         )
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return the records of the other banks, with the likelihood and NIS of the estimator, by name."""
+        """Return the records of the other banks, with likelihood and NIS of the estimator, by name."""
         return {**super().records(state, measurement), **state.likelihood._asdict()}

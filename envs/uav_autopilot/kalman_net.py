@@ -55,7 +55,7 @@ class NetFilter(NamedTuple):
 
 
 class KalmanNetBank(NoiseBank):
-    """Bank of ``kalman-net``: the paper's filter, whose noises and gain the action sets."""
+    """Bank of the learned estimator ``kalman-net``: the action sets noises and gain of the paper's filter."""
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -73,7 +73,7 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of the bank, without the last valid reading in a dropout, which estimators do not get."""
+        """Observation blocks of the bank, without a dropout's repeated reading, which estimators do not get."""
         reading = Block(
             "reading",
             lambda _, measurement: measurement.available * measurement.reading / self.sensor_sigmas,
@@ -85,9 +85,7 @@ class KalmanNetBank(NoiseBank):
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Gymnasium box of a factor for each part of the process noise and each sensor, then one more each for the
-        gain.
-        """
+        """Gymnasium box: factors on parts of the process noise and on each sensor's, then the same for the gain."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.action_names),), numpy.float32)
 
     @property
@@ -96,14 +94,14 @@ class KalmanNetBank(NoiseBank):
         return last_action_block(self.action_names, name="action")
 
     def scaled_noise(self, scale: Array, entries: list[int] | slice) -> Array:
-        """Return the process noise with its parts times factors ``(L, N)`` at some packed entries, ``(entries, N)``."""
+        """Return the process noise with its parts times factors ``(L, N)``, at packed entries, ``(entries, N)``."""
         total = scale[0] * self.noise_parts[0][entries]
         for factor, part in zip(scale[1:], self.noise_parts[1:], strict=True):
             total = total + factor * part[entries]
         return total
 
     def start(self, initial: Start) -> Any:
-        """Return the paper's filter at the initial estimate, as a :class:`NetFilter`."""
+        """Return the filter of the paper at the initial estimate, as a :class:`NetFilter`."""
         fields = super().start(initial)._asdict()
         fields["scale"] = self.xp.stack([fields["scale"]] * len(self.noise_parts))
         return NetFilter(**fields, gain_covariance=fields["covariance"])

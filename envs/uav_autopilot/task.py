@@ -37,7 +37,7 @@ from .world import AircraftWorld, Measurement, Start
 
 
 def _picture(model: Model) -> Any:
-    """Return the object that draws an episode; imported here, because it needs matplotlib."""
+    """Return the object that draws an episode; imported late, because it needs matplotlib."""
     from .picture import PICTURE
 
     return PICTURE(model)
