@@ -198,7 +198,6 @@ class Loops:
         return f"{pointer}[{self._index(self._own_places(operand, rows))}]"
 
     def _own_places(self, operand: Operand, rows: Mapping[int, Rows]) -> tuple[int, ...]:
-        """Return the offsets of an operand's elements from the pointer to their array."""
         if operand.array == SCRATCH:
             return operand.places
         of_row = rows[operand.array].places
@@ -263,7 +262,6 @@ def _kind(numbers: Sequence[int]) -> str:
 
 
 def _bytes(numbers: Sequence[int]) -> int:
-    """Return the size of a table in bytes, zero where its entries have constant distances."""
     if common_difference(numbers) is not None:
         return 0
     return len(numbers) * {"char": 1, "short": 2}.get(_kind(numbers).split()[-1], 4)

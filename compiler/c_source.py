@@ -85,8 +85,6 @@ def helper_functions(
 
 
 class _ProgramText:
-    """Writer of a program's statements as C text; values are named by their steps."""
-
     def __init__(
         self,
         program: StraightLineProgram,
@@ -142,19 +140,11 @@ def write_program(
 ) -> ProgramSource:
     """Return the C text of a program for one lane, with loops where they make the text shorter.
 
-    A result is written as soon as it is computed, so results must not overwrite inputs.
-
-    Args:
-        program: the program.
-        name: name of the function that contains the statements, and prefix of the static functions.
-        parameters: parameters of that function and of all static functions.
-        read: function from argument and row to the C expression of an input.
-        write: function from argument and row to the C expression of a destination; ``""``: no destination.
-        scalar: floating-point type.
-        qualifier: qualifier of static functions.
-        between: statements after the first results, before any other input is read.
-        results: number of these results.
-        arrays: pointers and offsets of the rows of all arguments, for loops; default: no loops.
+    A result is written as soon as it is computed, so results must not overwrite inputs. ``read`` and ``write`` are
+    functions from argument and row to a C expression; no result is written to ``""``. ``name`` is that of the
+    function, and prefix of the static functions that it calls. ``between`` are statements after the first ``results``
+    results, before any other input is read. Without ``arrays``, the pointers and offsets of all arguments, there are
+    no loops.
     """
     if "product" in program.steps.operations:
         raise ValueError("a product that is a loop cannot be written in C: trace it with Graph(loops=False)")
@@ -250,16 +240,9 @@ def write_lanes(
 ) -> str:
     """Return the C text of a function that runs a program over lanes, in double; or a CUDA kernel.
 
-    The kernel has a thread for each lane.
-
     The function takes ``a``, the addresses of the arrays, ``stride``, the distance from row to row of each, and the
-    lanes ``first`` to ``last``; the kernel takes ``a``, ``stride`` and the number of lanes.
-
-    Args:
-        program: the program.
-        name: name of the function.
-        lane_first: for every argument whether its layout is lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
-        cuda: write CUDA instead of C.
+    lanes ``first`` to ``last``; the kernel, which has a thread for each lane, takes ``a``, ``stride`` and the number
+    of lanes. An argument that is ``lane_first`` has layout ``(N, rows)``, else ``(rows, N)``.
     """
 
     def place(argument: int, row: int) -> str:

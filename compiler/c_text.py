@@ -153,12 +153,7 @@ def expression(
 ) -> str:
     """Return the C expression of one arithmetic operation on the C expressions of its arguments.
 
-    Args:
-        operation: operation of a step.
-        values: C expressions of its arguments.
-        known: whether each argument is a constant.
-        scalar: floating-point type.
-        table: for ``take``, name and length of its table.
+    ``known`` states whether each argument is a constant; ``table`` are name and length of the table of ``take``.
     """
     if table is not None:
         return f"{table[0]}[place_of({values[0]}, {table[1]})]"

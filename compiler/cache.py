@@ -108,7 +108,6 @@ _REPORTED_FOLDERS: set[Path] = set()
 
 
 def _explain(place: Path, reason: _Untrusted) -> None:
-    """Warn, once, why a cache folder or an entry in it is not used."""
     if place not in _REPORTED_FOLDERS:
         _REPORTED_FOLDERS.add(place)
         warnings.warn(
@@ -168,7 +167,6 @@ _UNCHECKED: dict[Path, int] = {}
 
 
 def _bound(place: Path) -> None:
-    """Remove the least recently used cache entries until the folder is small enough."""
     entries = [(path, path.stat()) for path in place.glob(f"*{SUFFIX}")]
     total = sum(found.st_size for _, found in entries)
     for path, found in sorted(entries, key=lambda entry: entry[1].st_mtime):

@@ -124,7 +124,6 @@ Make = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
-    """Append the code for one pair of random numbers; return the names of both values."""
     one, other = make(text, *pair_of_bits(*(text.word(name) for name in names)))
     return one.name, other.name
 

@@ -177,8 +177,6 @@ def uniform_pair(machine: Machine, first: Any, second: Any) -> tuple[Any, Any]:
 
 
 class _Arrays:
-    """Operations on NumPy arrays of uint64 and float64."""
-
     def bits(self, number: numpy.ndarray) -> numpy.ndarray:
         return number.view(numpy.uint64)
 
@@ -198,13 +196,8 @@ ARRAYS = _Arrays()
 def numbers(identities: numpy.ndarray, t: numpy.ndarray, normals: int, uniforms: int) -> numpy.ndarray:
     """Return the random numbers of N episodes at given measurements, ``(..., normals + uniforms, N)``.
 
-    Standard normal numbers come first, then uniform ones.
-
-    Args:
-        identities: identities of the episodes, ``(2, N)`` uint64.
-        t: measurements, ``(..., N)`` integers from 0 to 2^32 - 1.
-        normals: number of normal numbers.
-        uniforms: number of uniform numbers.
+    Standard normal numbers come first, then uniform ones. Identities are ``(2, N)`` uint64, ``t`` ``(..., N)``
+    integers from 0 to 2^32 - 1.
     """
     key, episode = identities
     t = numpy.asarray(t).astype(numpy.uint64)[..., None, :]

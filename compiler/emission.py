@@ -24,8 +24,6 @@ LONG = 5000
 
 
 class _Places(NamedTuple):
-    """Indices in the scratch array."""
-
     slots: dict[int, int]
     """Index for each step that crosses a cut."""
     products: dict[int, int]
@@ -81,7 +79,6 @@ class _Part(Instructions):
         self.operate(step.operation, values, step.logical, known, f"%v{index}")
 
     def _product(self, index: int) -> None:
-        """Append code that stores the vector in the scratch array and calls the matrix-vector product."""
         table, rows, *vector = self.steps[index].arguments
         for place, step in enumerate(vector):
             value = self.value(step)
@@ -117,16 +114,8 @@ def emit(
 ) -> str:
     """Return the LLVM text of a program, which computes it for a range of lanes.
 
-    Args:
-        program: the program.
-        lane_first: for every argument whether its layout is lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
-        library: library of the functions; no function takes more lanes than the block has.
-        block: lanes that are computed together.
-        part: number of statements of a part: computed steps and stored results.
-        loops: whether a long program is computed in loops where they are shorter.
-
-    Raises:
-        KeyError: for a function that is not in the library.
+    A part of the text has ``part`` statements: computed steps and stored results. An argument that is ``lane_first``
+    has layout ``(N, rows)``, else ``(rows, N)``. No function of the library takes more lanes than the block has.
     """
     text = [*_declarations(program, library, block)]
     rolled = roll_where_shorter(program) if loops and len(program.steps) >= LONG else None
@@ -146,7 +135,6 @@ def emit(
 def _parts(
     program: StraightLineProgram, lane_first: Sequence[bool], block: LaneBlock, size: int
 ) -> tuple[list[list[str]], int]:
-    """Return the LLVM functions of a straight-line program, and the length of their scratch array."""
     parts, _ = cut_parts(program, size)
     slots = scratch_slots(program, parts)
     places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
@@ -242,7 +230,6 @@ def _product_lines(block: LaneBlock) -> Iterator[str]:
 
 
 def _declarations(program: StraightLineProgram, library: Library, block: LaneBlock) -> Iterator[str]:
-    """Yield LLVM declarations of intrinsics and functions, and definitions that call library functions."""
     used = program.steps.operations
     if "product" in used:
         yield f"declare void @{product_symbol(block)}(ptr, ptr, ptr, i64, i64)"

@@ -227,14 +227,8 @@ def run_over(
 ) -> None:
     """Call a function of a range of lanes on all lanes, divided between threads.
 
-    The results do not depend on the number of threads.
-
-    Args:
-        call: function of the first lane and the end of a range.
-        width: number of lanes.
-        threads: number of threads, including this one.
-        fewest: minimal number of lanes of a thread.
-        grain: number of adjacent lanes that are not divided between threads.
+    ``call`` is a function of the first lane and the end of a range. A thread, of which this is one, has ``fewest``
+    lanes at least; ``grain`` adjacent lanes are not divided. The results do not depend on the number of threads.
     """
     threads = min(threads, width // fewest)
     if threads <= 1:
@@ -377,5 +371,4 @@ def _stride(array: numpy.ndarray) -> int:
 
 
 def _lane_stride(array: numpy.ndarray) -> int:
-    """Return the distance between lanes in entries, for an array laid out lane by lane."""
     return array.strides[0] // array.itemsize

@@ -85,9 +85,6 @@ def pullback(
         outputs: arrays that are functions of the inputs.
         adjoints: weights of the outputs, an array of the same shape for each.
         inputs: arrays of any shapes.
-
-    Returns:
-        For each input its gradient, an array of its shape, float64.
     """
     flowing: dict[int, Any] = {}
     roots: list[int] = []

@@ -134,12 +134,7 @@ class Instructions:
     ) -> None:
         """Append the instructions of an arithmetic operation.
 
-        Args:
-            operation: operation of a step, except ``take`` and ``product``.
-            values: names of its arguments.
-            logical: whether its result is a boolean.
-            known: whether each argument is a constant.
-            name: name of the result.
+        It is none of ``take`` and ``product``; ``known`` states whether each argument is a constant.
         """
         a, *rest = values
         if operation in _INFIX:

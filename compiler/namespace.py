@@ -113,7 +113,6 @@ class Traced:
         self.dtype: numpy.dtype = numpy.dtype(dtype)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
-        """Return a NumPy array of objects, for which NumPy's own arithmetic creates expressions."""
         from . import numpy_functions  # noqa: F401  (adds the methods that NumPy calls)
 
         objects = numpy.empty(self.shape, dtype=object)

@@ -91,12 +91,8 @@ class Setting(NamedTuple):
 def quick_setting(features: str, has_products: bool) -> Setting:
     """Return the settings for the shortest compilation: no optimisation, loops, small blocks.
 
-    With products of matrices the blocks are those of the fastest code, as a product takes twice as long in half of a
-    block.
-
-    Args:
-        features: features of the processor.
-        has_products: whether the program multiplies with matrices.
+    With products of matrices the blocks are those of the fastest code: in half of a block a product takes twice as
+    long.
     """
     return Setting(LANES if has_products else block_for(features).lanes, 150, 0, loops=not has_products)
 
@@ -120,10 +116,7 @@ which on a straight line saves none either, since its code exceeds them.
 def better_setting(quick: Setting, steps: int, in_loops: bool) -> Setting | None:
     """Return the settings for the fastest code; None if the quick settings already give it.
 
-    Args:
-        quick: the quick setting.
-        steps: number of steps of the program.
-        in_loops: whether the quick code is loops.
+    ``steps`` is the number of steps of the program, ``in_loops`` whether the quick code is loops.
     """
     if steps < LONG:
         return OPTIMISED
@@ -193,10 +186,7 @@ class Code:
 def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Library | None = None) -> Code:
     """Return the machine code of a program, shared by all programs that differ only in constants.
 
-    Args:
-        program: the program.
-        lane_first: for every argument whether its layout is ``(N, rows)``.
-        library: library of the functions; default: the fastest for this processor.
+    An argument that is ``lane_first`` has layout ``(N, rows)``. The default library is the fastest for this processor.
     """
     with LOCK:
         binding, (_, features) = llvm(), processor()
@@ -235,15 +225,8 @@ def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Li
 def native_text(text: str, signature: Any = NATIVE, level: int = 1) -> Any:
     """Compile an LLVM text without library functions; return it as a native function.
 
-    Its results are the same on every processor.
-
-    Args:
-        text: LLVM text with a function ``@program``.
-        signature: ctypes signature of the function; default: that of :data:`Native`, ``(table, first, last)``.
-        level: LLVM's optimisation level.
-
-    Raises:
-        ImportError: without llvmlite.
+    Its results are the same on every processor. ``signature`` is that of ``@program`` for ctypes, by default of
+    :data:`Native`.
     """
     with LOCK:
         key = _key(text, str(level))

@@ -284,8 +284,6 @@ def call_function(function: Any, arguments: Sequence[Any], keywords: Mapping[str
 
 
 def _on_objects(function: Any, arguments: Any, keywords: Mapping[str, Any]) -> Any:
-    """Return a NumPy function's result on arrays of objects, whose arithmetic creates expressions."""
-
     def objects(given: Any) -> Any:
         if isinstance(given, list | tuple):
             return type(given)(map(objects, given))

@@ -149,9 +149,7 @@ class Graph:
     def settle(self, node: int, use: str) -> Any:
         """Return the plain number of an expression; None, unless a subclass knows one.
 
-        Args:
-            node: the expression.
-            use: ``branch`` for a condition, ``number`` for a conversion to float, ``words`` for formatting.
+        ``use`` is ``branch`` for a condition, ``number`` for a conversion to float, ``words`` for formatting.
         """
         return None
 
@@ -241,9 +239,7 @@ class Graph:
     def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
         """Return the indices of an array operation's expressions, ``(n,)``: :meth:`node` for many at once.
 
-        Args:
-            name: name of the operation.
-            columns: for each argument the expressions of all members, ``(n,)``.
+        ``columns`` are the expressions of each argument, ``(n,)``.
         """
         if len(columns[0]) < FEW:
             rows = zip(*(column.tolist() for column in columns), strict=True)
@@ -292,7 +288,6 @@ class Graph:
         return name in ("negative", "logical_and", "logical_or")
 
     def _count(self) -> None:
-        """Copy the values of new constant expressions into arrays."""
         first, count = self._counted, len(self.values)
         if count > len(self._numbers):
             for each in ("_numbers", "_known"):
@@ -305,7 +300,6 @@ class Graph:
         self._counted = count
 
     def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
-        """Return the expressions of array elements that have no simpler form; new ones are added."""
         ordered = (numpy.minimum(*columns), numpy.maximum(*columns)) if name in COMMUTATIVE else columns
         keys = list(zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False))
         count = len(self.operations)

@@ -76,8 +76,6 @@ class Rolled(NamedTuple):
 
 
 class _Read(NamedTuple):
-    """Source of an operand."""
-
     source: int | None
     """Number of the argument, or ``CONSTANTS``; None: the scratch array, or the same turn."""
     turn: int | None
@@ -108,8 +106,6 @@ class _Draft:
 
 
 class _Roller:
-    """Algorithm of :func:`roll`, with its data."""
-
     def __init__(self, program: StraightLineProgram, results: int) -> None:
         self.program, self.steps = program, program.steps
         self.pause = first_steps(program, results)
@@ -136,7 +132,6 @@ class _Roller:
             draft.reads = [next(reads) for _ in draft.columns]
 
     def _read_steps(self) -> None:
-        """Copy the arguments of steps into arrays, operation by operation."""
         steps = self.steps
         self.tables = numpy.zeros(len(steps), dtype=numpy.int64)
         for kind, name in enumerate(steps.names):
@@ -252,7 +247,6 @@ class _Roller:
         ]
 
     def _copy_mixed_operands(self) -> None:
-        """Add copies to the scratch array of inputs and constants that share an operand with other values."""
         for late in (False, True):
             columns = [column for draft in self.drafts if draft.late == late for column in draft.columns]
             pairs = zip(columns, self._sources(columns), strict=True)
@@ -406,7 +400,6 @@ class _Roller:
 
 
 def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
-    """Return the columns as one array, and the start and length of each."""
     lengths = numpy.array([len(column) for column in columns], dtype=numpy.int64)
     steps = numpy.concatenate([*columns, numpy.zeros(0, dtype=numpy.int64)])
     return steps, numpy.cumsum(lengths) - lengths, lengths
@@ -416,20 +409,14 @@ def _join_columns(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, nump
 def roll(program: StraightLineProgram, results: int = 0) -> Rolled:
     """Convert a straight-line program to loops over the elements of its array operations.
 
-    Args:
-        program: program with origins, and without products that are loops.
-        results: number of first results that are written before any other input than theirs is read.
+    The program has origins, and no products that are loops. The first ``results`` results are written before any input
+    is read that they do not need.
     """
     return _Roller(program, results).finish()
 
 
 def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled | None:
-    """Convert a program to loops if that makes less code; return None if a straight line is shorter.
-
-    Args:
-        program: program with origins.
-        results: number of first results, see :func:`roll`.
-    """
+    """Convert a program to loops if that makes less code; return None if a straight line is shorter."""
     if "product" in program.steps.operations:
         return None
     operations = numpy.count_nonzero(~program.steps.which(*FREE))

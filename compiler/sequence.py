@@ -284,7 +284,6 @@ class CallSequence:
         self.run(width, threads)
 
     def _run_share(self, first: int, last: int) -> None:
-        """Run all steps over the lanes from ``first`` to before ``last`` with a thread's own tables."""
         share = self._shares.get((first, last))
         if share is None:
             share = self._shares[first, last] = self._make_share()
@@ -316,8 +315,6 @@ class CallSequence:
 
 
 class _Share(NamedTuple):
-    """Tables and arrays of one thread, for its part of the lanes."""
-
     tables: list[numpy.ndarray]
     addresses: numpy.ndarray
     entries: numpy.ndarray

@@ -101,21 +101,11 @@ class VectorFunction:
         return tuple(found[result.node] for result in self._value.results)
 
     def value(self, x: Any, xp: Any) -> Any:
-        """Return the function's values ``(m, N)`` at N vectors.
-
-        Args:
-            x: vectors, ``(n + g, N)``.
-            xp: array namespace of x.
-        """
+        """Return the function's values ``(m, N)`` at vectors ``(n + g, N)``."""
         return xp.stack(_compute(self._value, x, xp))
 
     def jacobian(self, x: Any, xp: Any) -> Any:
-        """Return the Jacobians ``(m, n, N)`` with respect to the first n inputs at N vectors.
-
-        Args:
-            x: vectors, ``(n + g, N)``.
-            xp: array namespace of x.
-        """
+        """Return the Jacobians ``(m, n, N)`` with respect to the first n inputs at vectors ``(n + g, N)``."""
         entries, n = _compute(self._jacobian, x, xp), self.inputs
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
 

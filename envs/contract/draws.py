@@ -36,12 +36,7 @@ class Draws:
 
     @classmethod
     def counting(cls, average: Array, xp: ModuleType) -> "Draws":
-        """Return draws that only count the random numbers used, in ``used``; every number is one half.
-
-        Args:
-            average: ``(1, N)``, all one half.
-            xp: array namespace.
-        """
+        """Return draws that only count the random numbers used, in ``used``; every number is one half."""
         draws = cls(average, xp)
         draws._average = average
         return draws
@@ -87,9 +82,7 @@ class Draws:
     def category(self, name: str, thresholds: Sequence[Array]) -> Array:
         """Draw an integer index ``(N,)`` with the given cumulative probabilities.
 
-        Args:
-            name: that of the quantity.
-            thresholds: the cumulative probabilities but the last, numbers or ``(N,)`` each.
+        ``thresholds`` are the cumulative probabilities but the last, numbers or ``(N,)`` each.
         """
         return self._keep(name, category(self._rows(None), thresholds, self.xp))
 

@@ -155,10 +155,8 @@ class Disturbances:
     ) -> "Disturbances":
         """Return the disturbances of these kinds that a task's parameters switch on.
 
-        Args:
-            task: their task.
-            kinds: in the order in which they act.
-            drawn: the kinds that are drawn first; the others follow in the order of ``kinds``.
+        ``kinds`` are in the order in which they act. Those ``drawn`` are drawn first, the others in the order of
+        ``kinds``.
         """
         parts = [kind(task) for kind in kinds if kind.is_enabled(task.parameters)]
         order = *drawn, *kinds

@@ -178,11 +178,7 @@ class LiveInput:
         return type(self.measurement)(**made), {**memory, "time": time, "count": count}
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
-        """Return the initial mean and covariance by name from two measurements with ``time``; here raise ValueError.
-
-        Raises:
-            ValueError: if two measurements cannot start a track of this task, or a value is missing.
-        """
+        """Return the initial mean and covariance by name from two measurements with ``time``; here raise ValueError."""
         raise ValueError(f"a track of {self.task.id} does not start from two measurements: call start")
 
     def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
@@ -202,7 +198,6 @@ class LiveValues:
         return all(self.values.get(name) is not None for name in names)
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the value of this name for each track, ``(N,)``; NaN where it is missing."""
         return numpy.atleast_1d(self.input.read(self.values, name))
 
     def place(self, number: int) -> str:

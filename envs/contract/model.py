@@ -61,11 +61,9 @@ class Model:
         self.action_space = filter.action_space
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Model":
-        """Return the model itself, which is immutable."""
         return self
 
     def __reduce__(self) -> Any:
-        """Return the constructor's arguments for pickling, without computed values."""
         return type(self), (self.task, self.control)
 
     @property
@@ -100,8 +98,7 @@ class Model:
     def with_filter(self, make: Callable[["Model"], Filter[Any, Any, Any]]) -> "Model":
         """Return a model of the same task with another filter in place of the bank.
 
-        Args:
-            make: makes the filter for a model. Pass the same function each time: compiled code is stored by it.
+        Pass the same function each time: compiled code is stored by it.
         """
         other = copy.copy(self)
         other._take_filter(make(self))
@@ -113,9 +110,6 @@ class Model:
         Args:
             function: of model and arrays; pass the same one each time, since it may be compiled once.
             *parts: nested tuples of arrays ``(..., N)``.
-
-        Returns:
-            Nested tuples or dictionaries of arrays ``(..., N)``.
         """
         return function(self, *parts)
 

@@ -207,11 +207,7 @@ class Blocks:
         return xp.concat(values)
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Return the positions of fields in the observation, by their names.
-
-        Raises:
-            ValueError: for a name that is no field.
-        """
+        """Return the positions of fields in the observation, by their names; ValueError for a name that is no field."""
         positions = {field.name: i for i, field in enumerate(self.fields)}
         missing = [name for name in names if name not in positions]
         if missing:
@@ -343,9 +339,7 @@ def log_squared_block(parts: Sequence[str] = ()) -> Block:
 def average_log_squared_block(average: str, parts: Sequence[str] = ()) -> Block:
     """Return the observation block of the running average of ``log(1 + NIS)``.
 
-    Args:
-        average: measurements of the average, in words.
-        parts: suffixes of the rows.
+    ``average`` names the measurements of the average, in words.
     """
     return Block(
         "average_log_squared_innovation",
@@ -364,11 +358,7 @@ def expected_nis_block(
 ) -> Block:
     """Return the observation block of a bank's NIS averaged over its hypotheses; 0 without a measurement.
 
-    Args:
-        xp: array namespace.
-        received: from a measurement to booleans, ``(N,)``.
-        text: meaning, in words.
-        over_interval: its value over several measurements, see :class:`Field`.
+    ``received`` is a function from a measurement to booleans, ``(N,)``; for ``over_interval`` see :class:`Field`.
     """
     return Block(
         "squared_innovation",
@@ -408,10 +398,7 @@ def log_predicted_block(
 def predicted_block(parts: Sequence[str], measurement: str = "measurement", of: str = "") -> Block:
     """Return the observation block of a bank's predicted probabilities, as logarithms.
 
-    Args:
-        parts: suffixes of the rows.
-        measurement: the word for one.
-        of: words for the hypotheses, such as " of the level".
+    ``measurement`` is the word for one, ``of`` words for the hypotheses, such as " of the level".
     """
     return Block(
         "log_predicted",

@@ -97,11 +97,9 @@ class TaskBase(ABC):
         """Return whether the task overrides :meth:`.Task.feedback`."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Return the task itself, which is immutable."""
         return self
 
     def __reduce__(self) -> Any:
-        """Return the constructor's arguments for pickling; the array namespace, a module, by its name."""
         return _remake, (type(self), self.parameters, self.xp.__name__, self.device, self.recording)
 
     def on(self, xp: ModuleType, device: Any = None) -> Self:

@@ -115,13 +115,7 @@ def is_folder(path: Path) -> bool:
 def read_content(path: Path, most: int | None = None) -> bytes:
     """Return the bytes of a file, if it is a regular file and not too large.
 
-    Args:
-        path: its path.
-        most: largest size, bytes; default: the limit of memory.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        ValueError: as of :func:`open_foreign`.
+    ``most`` is the largest size in bytes, by default the limit of memory.
     """
     most = limits().memory if most is None else most
     with open_foreign(path, most) as file:
@@ -251,7 +245,6 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
 
 
 def _explain_end(code: int, seconds: float) -> ValueError:
-    """Return a ValueError that explains why a parser process ended without a result."""
     if code == 3:
         return refuse_memory("its parser needs more memory")
     if -code in (9, 24):  # SIGKILL, SIGXCPU

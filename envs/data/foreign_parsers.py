@@ -70,12 +70,8 @@ def parse_netcdf4(
 ) -> Any:
     """Return the attributes and variables of a NetCDF-4 file's root group, as lists of pairs.
 
-    Args:
-        file: the open file.
-        path: path of the file; unused.
-        wanted: ``names``, in lower case, and ``prefix``: of the variables whose values are read; None: all variables.
-        bytes_limit: of all values together, counted before any is read.
-        numbers_limit: limit of their number.
+    ``wanted`` has the lower-case ``names`` and the ``prefix`` of the variables whose values are read; None: all.
+    Before any is read their bytes, and their number, are checked against the limits.
     """
     import h5netcdf
     import h5py
@@ -159,12 +155,8 @@ def parse_parquet(
 ) -> Any:
     """Return the names of all columns in a Parquet file, and the wanted columns as numbers, dates or text indices.
 
-    Args:
-        file: the open file.
-        path: path of the file; unused.
-        wanted: ``names``, in lower case, and ``prefix``, of the columns that are read.
-        rows_limit: of the table.
-        bytes_limit: of these columns unpacked, as the file states.
+    ``wanted`` has the lower-case ``names`` and the ``prefix`` of the columns that are read. ``bytes_limit`` is of
+    these columns unpacked, as the file states.
     """
     import pyarrow
     from pyarrow import parquet
@@ -314,15 +306,12 @@ POSES = (ODOMETRY, "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs
 
 
 class _Bag(NamedTuple):
-    """An open bag of ROS 1 or 2."""
-
     reader: Any
     parse: Callable[[bytes, str], Any]
     digests: Callable[[str], str] | None
     """Digests of the library's definitions of types; None where a bag contains none."""
 
     def busiest(self, kind: str) -> str:
-        """Return the topic with the most messages of a type; empty if there are none."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             if connection.msgtype == kind:

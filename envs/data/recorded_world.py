@@ -262,7 +262,6 @@ class LiveWorld(_ForeignWorld):
         return truth, self._fill(self.measurement, noise)
 
     def _fill(self, like: Any, numbers: Array) -> Any:
-        """Return a NamedTuple like ``like`` whose arrays are successive rows of ``numbers``, ``(numbers, N)``."""
         parts, first = {}, 0
         for name, array in named_arrays(like):
             last = first + math.prod(array.shape[:-1])

@@ -109,7 +109,6 @@ class Recording(ScenarioData):
             self._check_episode(episode, int(rows[episode]), name)
 
     def _check_episode(self, episode: int, rows: int, name: str) -> None:
-        """Raise ValueError if an episode cannot be replayed."""
         if not 1 <= self.lengths[episode] <= rows:
             raise ValueError(
                 f"recording {name!r}: length must be from 1 to its {rows} measurements, got {self.lengths[episode]}"
@@ -136,7 +135,6 @@ class Recording(ScenarioData):
                 raise ValueError(f"recording {name!r}: initial_{what} is not finite")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
-        """Return the recording itself, which is immutable."""
         return self
 
     def __repr__(self) -> str:
@@ -402,10 +400,7 @@ def recording_from(fields: Mapping[str, Any]) -> Recording:
 def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
     """Join recordings with the parameters of the first into one recording; the others are omitted.
 
-    Args:
-        recordings: at least one.
-        name: name of the result.
-        notes: remarks on the reading, a line each; omissions are added.
+    ``notes`` are remarks on the reading, a line each; omissions are added.
     """
     first, lines = recordings[0], list(notes)
     kept: list[Recording] = []
@@ -440,9 +435,7 @@ def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[
 def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
     """Join recordings into one that has all their episodes, padded to the same length.
 
-    Args:
-        recordings: at least one; the truth is known where all have one.
-        **fields: fields of the result that differ from those of the first.
+    The truth is known where all have one. ``fields`` are those of the result that differ from the first recording's.
     """
     first, longest = recordings[0], max(one.seconds.shape[1] for one in recordings)
 

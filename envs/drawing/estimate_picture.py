@@ -148,7 +148,6 @@ class EstimatePicture(Picture):
             self.ellipse.set_angle(float(numpy.degrees(numpy.arctan2(directions[1, 1], directions[0, 1]))))
 
     def _places(self, values: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Return the coordinates of values in the panel: in the plane, or over time."""
         return (values[0], values[1]) if self.plane else (numpy.arange(1, len(values[0]) + 1), values[0])
 
 

@@ -163,9 +163,7 @@ class Picture:
     def draw(self, history: History, state: Any) -> None:
         """Update the panels of :meth:`open` to the current measurement.
 
-        Args:
-            history: of the measurements acted on.
-            state: after the last measurement, which is not yet acted on.
+        ``history`` is of the measurements acted on; ``state`` is after the last measurement, not yet acted on.
         """
 
 
@@ -175,8 +173,6 @@ def picture_of(model: Model) -> Picture:
 
 
 class _StripPanel:
-    """Axes and artists of one time series."""
-
     def __init__(self, axes: Axes, strip: Strip) -> None:
         self.axes, self.strip = axes, strip
         axes.set_title(strip.title, loc="left", fontsize=9, pad=4)
@@ -312,10 +308,7 @@ class EpisodePicture:
     def keep(self, state: Any, action: numpy.ndarray, observation: numpy.ndarray) -> None:
         """Append a measurement, the action and the observation before it to the picture's history.
 
-        Args:
-            state: after the action; lane 0 is stored.
-            action: the applied action, ``(A,)`` or a scalar.
-            observation: the observation before the action, ``(len(model.fields),)``.
+        ``state`` is after the action, of which lane 0 is stored; ``observation``, ``(fields,)``, is before it.
         """
         nothing = numpy.full(len(self.model.task.components), numpy.nan)
         error = self.model.error(state)[:, 0] if self.model.task.has_truth else nothing
@@ -493,10 +486,7 @@ class EpisodePictures:
     def keep(self, state: Any, actions: numpy.ndarray, observations: numpy.ndarray) -> None:
         """Append a measurement, actions and the observations before them to the histories of the pictures.
 
-        Args:
-            state: of all episodes after the action.
-            actions: the applied actions, ``(count, ...)``.
-            observations: those before the actions, ``(count, len(model.fields))``.
+        ``state`` is that of all episodes after the actions; ``observations``, ``(count, fields)``, are before them.
         """
         for i, picture in enumerate(self.pictures):
             picture.keep(_alone(state, i), actions[i], observations[i].copy())

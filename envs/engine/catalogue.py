@@ -148,10 +148,6 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
 def find_user_module(module: str, refusal: str) -> Path:
     """Return the path of the file of a module whose name a user gave, without importing it.
 
-    Args:
-        module: its name, without dots.
-        refusal: beginning of the error.
-
     Raises:
         ValueError: if there is no such file.
     """
@@ -243,10 +239,7 @@ def parameter_names(cls: "type[Task]") -> list[str]:
 def check_names(cls: "type[Task]", keywords: Iterable[str], others: Iterable[str] = ()) -> None:
     """Raise :class:`UnknownKeyword` if a keyword is not the name of a parameter of an environment.
 
-    Args:
-        cls: the environment.
-        keywords: that were given as parameters.
-        others: further valid names, to suggest.
+    ``others`` are further valid names, to suggest.
     """
     known = parameter_names(cls)
     for name in keywords:

@@ -83,11 +83,7 @@ class CompiledModel(Model):
     def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "CompiledModel":
         """Return a compiled model of the same task with another filter in place of the bank.
 
-        Args:
-            make: makes the filter for a model, on NumPy's arrays and on traced ones.
-
-        Raises:
-            NotTraceable: if the filter is no straight line of arithmetic, and does not declare it.
+        ``make`` must work on NumPy arrays and on traced ones.
         """
         other = copy.copy(self)
         other._plain = self._plain.with_filter(make)

@@ -57,10 +57,6 @@ def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy
     """Return the uniform and normal numbers at the start of the episodes with these identities.
 
     Their shapes are ``(layout.uniforms, N)`` and ``(layout.initial_normals, N)``.
-
-    Args:
-        identities: ``(2, N)`` uint64.
-        layout: of the task.
     """
     t = numpy.zeros(identities.shape[1], dtype=numpy.int64)
     found = numbers(identities, t, layout.initial_normals, layout.uniforms)
@@ -68,12 +64,7 @@ def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy
 
 
 def uniforms_of_seeds(seeds: Sequence[int], layout: NoiseLayout) -> numpy.ndarray:
-    """Return the uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of N seeds.
-
-    Args:
-        seeds: as in :func:`identities_of_seeds`.
-        layout: of the task.
-    """
+    """Return the uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of N seeds."""
     return start_numbers(identities_of_seeds(seeds), layout)[0]
 
 
@@ -134,8 +125,7 @@ class EpisodeNoise:
     def start_call(self, memory: numpy.ndarray) -> Call:
         """Return the native call that writes the random numbers of the episodes' start, after :meth:`put`.
 
-        Args:
-            memory: for normals and uniforms, ``(initial_normals + uniforms, width)``.
+        They are written to ``memory``, ``(initial_normals + uniforms, width)``.
         """
         return bind_numbers(self.identities, self.measurement, memory, self._layout.initial_normals)
 
@@ -224,9 +214,8 @@ class EpisodeNoise:
     def grow(self, count: int, index: numpy.ndarray) -> None:
         """Enlarge the memory of random numbers to ``count`` lanes.
 
-        Args:
-            count: new number of lanes, a multiple of eight.
-            index: for each lane the one whose numbers it uses until it begins an episode.
+        That is a multiple of eight; ``index`` is for each lane the one whose numbers it uses until it begins an
+        episode.
         """
         identities, measurement = self.identities[:, index], self.measurement[index]
         self._set_width(count)

@@ -295,9 +295,7 @@ class Lanes:
     def begin(self, identities: numpy.ndarray, lanes: Sequence[int] | None = None) -> None:
         """Start the episodes with these identities in some lanes, up to the first measurement.
 
-        Args:
-            identities: ``(2, lanes)``, see :mod:`.episode_noise`.
-            lanes: numbers of the lanes, ascending; default: all.
+        Identities are ``(2, lanes)``, see :mod:`.episode_noise`; the lanes are ascending, by default all.
         """
         task = self.task
         is_whole = lanes is None or len(lanes) == self.count
@@ -331,9 +329,7 @@ class Lanes:
     def step_reward(self, action: Array, kind: str) -> Array:
         """Apply one action in each lane; return the mean rewards over its measurements, ``(count,)``.
 
-        Args:
-            action: batch first, as the action space has it.
-            kind: one of :data:`~.reward.REWARDS`.
+        The action has the batch first; ``kind`` is one of :data:`~.reward.REWARDS`.
         """
         own, *baseline = self._take_and_decide(action, REWARD_FUNCTIONS[kind])
         rewards = (
@@ -346,9 +342,7 @@ class Lanes:
     def step_alone(self, action: Array, kind: str) -> tuple[Array, float, bool]:
         """Apply an action in the only lane; return observation, reward, and whether the episode is over.
 
-        Args:
-            action: as the action space has it.
-            kind: one of :data:`~.reward.REWARDS`; the reward equals that of :meth:`step_reward`.
+        The reward, of a kind of :data:`~.reward.REWARDS`, equals that of :meth:`step_reward`.
         """
         steppers, report = self._moving, REWARD_FUNCTIONS[kind]
         if steppers is not self._steppers.get(report):
@@ -483,11 +477,7 @@ class Lanes:
         return {**self.__dict__, "_steppers": {}, "_some": {}}
 
     def grow(self, count: int) -> None:
-        """Enlarge to ``count`` lanes, whose new ones run arbitrary episodes until they are restarted.
-
-        Args:
-            count: a multiple of eight.
-        """
+        """Enlarge to ``count`` lanes, whose new ones run arbitrary episodes until they are restarted."""
         self._settle()
         beyond = numpy.zeros(count - self.width, dtype=numpy.int64)
         index = self.task.xp.asarray(numpy.append(numpy.arange(self.width), beyond), device=self.task.device)
@@ -503,7 +493,6 @@ class Lanes:
     # --- copies, growth, gradients
 
     def _episodes(self) -> tuple[Any, ...]:
-        """Return the running episodes and observations of task and baseline, in arrays that never change."""
         return tuple((stepper.episode(), stepper.shown) for stepper in self._settle())
 
     def _load(self, episodes: tuple[Any, ...]) -> None:

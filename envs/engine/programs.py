@@ -103,11 +103,7 @@ class Programs:
         self._kept: dict[Any, Any] = {}
 
     def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "Programs":
-        """Return the programs of the same task with another filter, from a cache.
-
-        Raises:
-            NotTraceable: if the filter is no straight line of arithmetic.
-        """
+        """Return the programs of the same task with another filter, from a cache."""
         if make not in self._with_filter:
             with namespace.tracing(self.graph):
                 programs = Programs(self.traced.with_filter(make), self.graph, self._of_world)
@@ -178,11 +174,7 @@ class Programs:
 
     @_ComputedOnce
     def later(self) -> Parts:
-        """Compiled parts of every later step, from an action to the next measurement.
-
-        Raises:
-            NotTraceable: if one is no straight line of arithmetic.
-        """
+        """Compiled parts of every later step, from an action to the next measurement."""
         first = self.first
         later = self._parts(first.advance.example()[0], *first.update.example())
         shapes = [
@@ -225,9 +217,5 @@ class Programs:
         return Parts(update, advance, predict, Episode(following, measurement, predicted))
 
     def report_program(self, report: Report) -> Specialised:
-        """Return the compiled program of a report function on the episodes.
-
-        Raises:
-            NotTraceable: if it is no straight line of arithmetic.
-        """
+        """Return the compiled program of a report function on the episodes."""
         return self.function(report).specialise(self.later.episode)

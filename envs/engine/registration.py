@@ -42,7 +42,6 @@ def add_task(cls: type[Task]) -> None:
 
 
 def _check_contract(cls: Any) -> None:
-    """Raise ValueError if a class lacks declarations that an environment must have."""
     if not (isinstance(cls, type) and issubclass(cls, Task)):
         raise ValueError(f"an environment is a subclass of filtergym.envs.contract.task.Task, got {cls!r}")
     name = cls.__name__

@@ -192,7 +192,6 @@ class Stepper:
         return self._drawn
 
     def _bind_beginnings(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
-        """Return the native call that starts episodes up to the first measurement, bound to memory."""
         turns = [[noise.start_call(self._start_numbers), draw] for _ in (0, 1)]
         for each in (self, *others):
             for begin, turn in zip(each._begin, turns, strict=True):
@@ -235,11 +234,7 @@ class Stepper:
     ) -> tuple[numpy.ndarray, numpy.ndarray]:
         """Start new episodes in some lanes up to the first measurement; return the uniform and normal numbers used.
 
-        Args:
-            lanes: numbers of the lanes, ascending.
-            identities: of the episodes, ``(2, lanes)``.
-            noise: of at least as many lanes.
-            others: steppers of the same task.
+        Lanes are ascending, identities ``(2, lanes)``; ``noise`` is of at least as many lanes.
         """
         steppers = (self, *others)
         for each in steppers:
@@ -279,7 +274,6 @@ class Stepper:
             self._shown[:, self._means.columns] = total[:, self._averages]
 
     def _bind_decisions(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
-        """Return the native call for all measurements of a decision, bound to memory."""
         columns, interval = self._means.columns, self._interval
         if columns:
             self._passing = numpy.empty((interval, *self._shown.shape))

@@ -122,7 +122,6 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         return self._single_observation(), self._with_context({})
 
     def _single_observation(self) -> Any:
-        """Return the observation of the only episode in the chosen type, with privileged values if wanted."""
         if not self.privileged:
             return self._to_dtype(self.fleet.observe()[0])
         return {name: values[0] for name, values in self._observations().items()}

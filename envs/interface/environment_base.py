@@ -52,7 +52,6 @@ class EnvBase:
         return self.model.task
 
     def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
-        """Store the options of the environment; raise ValueError for an unknown task or parameter."""
         self._class = task_class(task)
         check_names(self._class, names, inspect.signature(type(self)).parameters)
         self.options = options
@@ -78,7 +77,6 @@ class EnvBase:
         count: int,
         longest: int | None,
     ) -> None:
-        """Create the models of a scenario, their lanes, and the spaces of the environment."""
         self._make, self._keywords = make, dict(keywords)
         distribution = self._distribution(scenario, {})
         if not all(model.task.has_whole_truth for model in distribution.models):
@@ -189,7 +187,6 @@ class EnvBase:
         return self.task.xp.astype(values, self.task.xp.float32)
 
     def _observations(self) -> Any:
-        """Return the observations of all lanes, batch first, with privileged values if wanted."""
         shown = self._to_dtype(self.fleet.observe())
         if not self.privileged:
             return shown

@@ -159,7 +159,6 @@ class Fleet:
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
-        """Return the :class:`.Lanes` of a task, which are made on first use."""
         for part in self._parts:
             if part.model is model or part.model.task.parameters == model.task.parameters:
                 return part

@@ -14,12 +14,8 @@ from ..data.scenario_data import ScenarioData
 def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
     """Return a copy of a Gymnasium spec with the length of an episode, and keywords that JSON can store.
 
-    Gymnasium registers one length for an id; here it follows from scenario and parameters. It is computed on request:
-    the environment truncates by itself, without a ``TimeLimit`` wrapper.
-
-    Args:
-        spec: spec by Gymnasium.
-        decisions: in an episode.
+    Gymnasium registers one length for an id; here it follows from scenario and parameters. The environment truncates
+    by itself, without a ``TimeLimit`` wrapper.
     """
     kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
     return dataclasses.replace(spec, max_episode_steps=decisions, kwargs=kwargs)

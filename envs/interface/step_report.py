@@ -28,11 +28,8 @@ class StepReport(NamedTuple):
 def step_report(kind: str, errors: bool = False, details: bool = False, episode: bool = False) -> Report:
     """Return the function that computes a :class:`StepReport`, the same one for equal arguments.
 
-    Args:
-        kind: of reward, one of :data:`.reward.REWARD_FUNCTIONS`.
-        errors: whether error and covariance are reported.
-        details: whether ``info`` contains the details of the measurement.
-        episode: whether ``info`` contains the statistics of the episode.
+    It reports the reward of this kind, and if wanted error and covariance, the details of the measurement, and the
+    statistics of the episode for ``info``.
     """
     reward = REWARD_FUNCTIONS[kind]
 

@@ -30,7 +30,6 @@ class _OneThread:
         self._free = [True]
 
     def __enter__(self) -> None:
-        """Raise gymnasium.error.Error if another thread is inside."""
         try:
             self._free.pop()
         except IndexError:
@@ -56,23 +55,17 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.make_model`; or "torch": observations,
-            rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, their
-            random numbers made on the host; float64 results differ by rounding. Torch's gradients flow from rewards and
-            observations back to actions that require them, over all steps since the last reset; pass detached
-            actions where none are wanted.
+            rewards, masks and ``info`` are tensors, actions may be. Episodes are the same; float64 results differ by
+            rounding. Torch's gradients flow from rewards and observations back to actions that require them, over all
+            steps since the last reset; pass detached actions where none are wanted.
         device: where the torch backend computes, such as "cpu" (default) or "cuda".
         threads: number of threads of the compiled backend; results do not depend on it.
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
         max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on); None or -1: do not.
-        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Model.track`), error,
-            cost and the further records of an evaluation.
-        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
-            return.
-        context: whether ``info["context"]`` contains the random draws of the episode and their current values
-            (:meth:`.World.context`), at resets and steps.
-        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
-            and of "privileged" values, the context and the error after the last action in units of its reported
-            standard deviation (zero at a reset). No policy may observe them where it is evaluated.
+        detailed_info: whether ``info`` carries the details that :class:`.TaskEnv` lists.
+        dtype: type of observations and rewards: "float64" (default), or "float32".
+        context: whether ``info["context"]`` contains the random draws of the episode (:meth:`.World.context`).
+        observation: "measured" (default), or "asymmetric" with privileged values, see :class:`.TaskEnv`.
         **keywords: parameters of the task.
 
     Raises:
@@ -225,7 +218,6 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self._observations(), self._with_context({}, begun)
 
     def _with_context(self, info: dict[str, Any], lanes: numpy.ndarray) -> dict[str, Any]:
-        """Return ``info`` with the context of some lanes added in Gymnasium's form, if it is wanted."""
         if self.options.context and lanes.any():
             values, present = self._context()
             context = {}

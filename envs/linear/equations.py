@@ -132,11 +132,7 @@ def process_noise(
 ) -> numpy.ndarray:
     """Return the process noise covariance Q of a model, ``(n, n)``.
 
-    Args:
-        model: the equations.
-        x: state, ``(n,)``.
-        interval: s.
-        inputs: ``(p,)``.
+    ``x`` is a state ``(n,)``, ``interval`` in s, ``inputs`` ``(p,)``.
     """
     if not isinstance(model.Q, VectorFunction):
         return model.Q
@@ -150,11 +146,7 @@ def sensor_noise(
 ) -> numpy.ndarray:
     """Return the measurement noise covariance R of a model at K measurements, ``(m, m, K)``.
 
-    Args:
-        model: the equations.
-        x: state, ``(n,)``.
-        interval: s, ``(K,)``.
-        inputs: ``(p, K)``.
+    ``x`` is a state ``(n,)``, ``interval`` in s ``(K,)``, ``inputs`` ``(p, K)``.
     """
     m, K = model.h.size, len(interval)
     if not isinstance(model.R, VectorFunction):
@@ -200,13 +192,8 @@ def find_invalid_noise(
 ) -> InvalidNoise | None:
     """Return the first of K measurements at which a sensor's R is not positive definite; None if there is none.
 
-    Sensors whose R depends on the state are skipped.
-
-    Args:
-        definition: the models.
-        available: above zero where a number was received, ``(m, K)``.
-        interval: s, ``(K,)``.
-        inputs: ``(p, K)``.
+    Sensors whose R depends on the state are skipped. ``available``, ``(m, K)``, is above zero where a number was
+    received.
     """
     n = len(definition.mean)
     for model in definition.filters:
@@ -274,12 +261,14 @@ class StateSpaceProblem(Task):
         self.transition: Array = self.constant([list(row) for row in own.transition])
 
     def _sampling_interval(self) -> float | None:
-        """Return the time between measurements, s; None where it varies."""
         return None if self.parameters.jitter > 0.0 else self.parameters.sampling_interval
 
 
 class Equations:
-    """Equations of a state-space model on the arrays of a task."""
+    """Equations of a state-space model on the arrays of a task.
+
+    In the methods x are states, ``(n, N)``, and ``passed`` the interval and inputs until the next measurement.
+    """
 
     def __init__(self, task: StateSpaceProblem, model: StateSpaceModel) -> None:
         self.model = model
@@ -303,12 +292,7 @@ class Equations:
         return None if isinstance(noise, VectorFunction) else task.constant(noise)
 
     def move(self, x: Array, passed: Passed) -> Array:
-        """Return the state f(x) at the next measurement, without process noise, ``(n, ...)``.
-
-        Args:
-            x: ``(n, ...)``.
-            passed: interval and inputs until then.
-        """
+        """Return the state f(x) at the next measurement, without process noise, ``(n, ...)``."""
         return self._value("f", self.model.f, self._with_passed(x, passed))
 
     def _with_passed(self, x: Array, passed: Passed) -> Array:
@@ -321,10 +305,7 @@ class Equations:
     def process_noise(self, x: Array, passed: Passed, of_sources: Mapping[str, Any] | None = None) -> Array:
         """Return the process noise covariance Q, ``(n, n, N)``; ``(n, n, 1)`` where it is constant.
 
-        Args:
-            x: predicted state, ``(n, N)``.
-            passed: interval and inputs until then.
-            of_sources: factors on terms of Q by name, a number or ``(N,)`` each.
+        ``of_sources`` are factors on terms of Q by name, a number or ``(N,)`` each.
         """
         if not of_sources:
             return self._noise(self.model.Q, self._Q, x, passed)
@@ -346,10 +327,7 @@ class Equations:
         return self.xp.reshape(entries, (size, size, *x.shape[1:]))
 
     def input_noise(self, x: Array, passed: Passed) -> Array | float:
-        """Return the covariance ``G N G^T`` that noise of the inputs adds to a prediction, ``(n, n, N)``, or 0.0.
-
-        ``x`` is the state at the previous measurement, ``passed`` interval and inputs since then.
-        """
+        """Return the covariance ``G N G^T`` that noise of the inputs adds to a prediction, ``(n, n, N)``, or 0.0."""
         return self._through(self.model.G, self._with_passed(x, Passage(passed.interval, None)), passed)
 
     def measured_noise(self, R: Array, x: Array, passed: Passed) -> Array:
@@ -373,11 +351,7 @@ class Equations:
     ) -> Array:
         """Return the measurement noise covariance R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
 
-        Args:
-            x: state at the measurement, ``(n, N)``.
-            passed: interval and inputs until then.
-            factor: a number, or ``(N,)``.
-            of_sensors: further factors for some sensors, by their names.
+        ``of_sensors`` are further factors for some sensors, by their names.
         """
         R = factor * self._noise(self.model.R, self._R, x, passed)
         if not of_sensors:
@@ -389,12 +363,7 @@ class Equations:
         return self.xp.stack(rows)
 
     def measure(self, x: Array, passed: Passed) -> Array:
-        """Return the measurement h(x) without noise, ``(m, ...)``.
-
-        Args:
-            x: ``(n, ...)``.
-            passed: interval and inputs until then.
-        """
+        """Return the measurement h(x) without noise, ``(m, ...)``."""
         return self._value("h", self.model.h, self._with_inputs(x, passed))
 
     def _with_inputs(self, x: Array, passed: Passed) -> Array:
@@ -411,11 +380,6 @@ class Equations:
 
         An angle follows its slope over any number of turns along states in which it is linear; along the others the
         points are so close that it changes by less than half a turn.
-
-        Args:
-            mean: predicted state, ``(n, N)``.
-            covariance: its covariance, ``(n, n, N)``.
-            passed: interval and inputs until then.
         """
         return self._unfold(
             partial(self.measure, passed=passed),
@@ -427,13 +391,7 @@ class Equations:
     def continuous_motion(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Return the function f with angles unwrapped to the mean's turn, and sigma points for it.
-
-        Args:
-            mean: state, ``(n, N)``.
-            covariance: its covariance, ``(n, n, N)``.
-            passed: interval and inputs until the next measurement.
-        """
+        """Return the function f with angles unwrapped to the mean's turn, and sigma points for it."""
         return self._unfold(
             partial(self.move, passed=passed),
             (self.model.f, lambda: self.transition_matrix(mean, passed), self.angles),
@@ -473,13 +431,7 @@ class Equations:
         return continuous, limit_spread(turns, covariance, QUARTER)
 
     def receive(self, measurement: StateSpaceMeasurement, mean: Array, R: Array) -> Received:
-        """Return the innovation, Jacobian H and noise R of the received numbers of a measurement.
-
-        Args:
-            measurement: finite also where nothing was received.
-            mean: predicted mean, ``(n, N)``.
-            R: covariance of the noise, ``(m, m, N)`` or ``(m, m, 1)``.
-        """
+        """Return the innovation, Jacobian H and noise R of the received numbers of a measurement."""
         nu = self.subtract(measurement.values, self.measure(mean, measurement))
         R = self.measured_noise(R, mean, measurement)
         return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
@@ -493,12 +445,7 @@ class Equations:
         return kalman_gain(covariance, received)
 
     def within_gates(self, nu: Array, S: Array) -> Array:
-        """Return 1 for the numbers of sensors whose innovation passes the sensor's gate, else 0, ``(m, N)``.
-
-        Args:
-            nu: innovation, ``(m, N)``.
-            S: its covariance, ``(m, m, N)``.
-        """
+        """Return 1 for the numbers of sensors whose innovation passes the sensor's gate, else 0, ``(m, N)``."""
         xp, rows = self.xp, []
         for channel in self.channels:
             within = 1.0 + 0.0 * nu[channel.first]
@@ -549,13 +496,7 @@ class Equations:
     def explain_loss(
         self, mean: numpy.ndarray, covariance: numpy.ndarray, measurement: StateSpaceMeasurement
     ) -> str:
-        """Return a sentence that names the function, f or h, that is not finite near an estimate; else empty.
-
-        Args:
-            mean: last valid mean, ``(n, N)``.
-            covariance: its covariance, ``(n, n, N)``.
-            measurement: the next one.
-        """
+        """Return a sentence that names the function, f or h, that is not finite near an estimate; else empty."""
         with numpy.errstate(all="ignore"):
             points = sigma_points(mean, covariance)
             given = self._with_passed(points, measurement).reshape(-1, points[0].size)
@@ -579,13 +520,7 @@ class Equations:
         return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))
 
     def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
-        """Return mean and covariance predicted to the next measurement, without process noise.
-
-        Args:
-            mean: ``(n, N)``.
-            covariance: ``(n, n, N)``.
-            passed: interval and inputs until then.
-        """
+        """Return mean and covariance predicted to the next measurement, without process noise."""
         F = self.transition_matrix(mean, passed)
         carried = product(product(F, covariance), transpose(F))
         if self.model.G is not None:

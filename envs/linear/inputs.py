@@ -60,11 +60,7 @@ class InputProcesses:
         self.normals: int = len(inputs) + len(self.noisy)
 
     def begin(self, normals: Array) -> Array | None:
-        """Return the initial inputs, ``(p, N)``, drawn from their stationary distribution; None if p is 0.
-
-        Args:
-            normals: standard normal numbers, ``(p, N)``.
-        """
+        """Return the initial inputs, ``(p, N)``, drawn from their stationary distribution; None if p is 0."""
         if not self.inputs:
             return None
         each = zip(self.inputs, normals, strict=True)
@@ -73,10 +69,7 @@ class InputProcesses:
     def advance(self, inputs: Array, interval: Array, normals: Array) -> Array:
         """Return the inputs that act until the next measurement, ``(p, N)``.
 
-        Args:
-            inputs: those that acted until the previous measurement, ``(p, N)``.
-            interval: s, ``(N,)``.
-            normals: standard normal numbers, ``(normals, N)``.
+        ``inputs`` are those until the previous measurement, ``interval`` is in s, ``normals`` are ``(normals, N)``.
         """
         xp, after = self.xp, []
         for j, one in enumerate(self.inputs):
@@ -86,12 +79,7 @@ class InputProcesses:
         return xp.stack(after)
 
     def report(self, inputs: Array, normals: Array) -> Array:
-        """Return the inputs with noise, as filters receive them, ``(p, N)``.
-
-        Args:
-            inputs: those that act, ``(p, N)``.
-            normals: standard normal numbers, ``(normals, N)``.
-        """
+        """Return the inputs with noise, as filters receive them, ``(p, N)``."""
         reported = [inputs[j] for j in range(len(self.inputs))]
         for place, j in enumerate(self.noisy):
             reported[j] = reported[j] + self.inputs[j].noise * normals[len(reported) + place]

@@ -340,10 +340,7 @@ def state_space_attributes(
 ) -> dict[str, Any]:
     """Return the class attributes of a task by name, from the definition of its state-space models.
 
-    Args:
-        definition: the models.
-        components: components of the state.
-        defaults: parameters of the training distribution that differ from the defaults of such tasks.
+    ``defaults`` are parameters of the training distribution that differ from the defaults of such tasks.
     """
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))

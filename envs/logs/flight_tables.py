@@ -102,7 +102,7 @@ class ColumnNames(frozenset[str]):
     prefix: str
 
     def __new__(cls, names: Iterable[str], prefix: str = "") -> "ColumnNames":
-        """Return a set of the names, with a prefix of further names."""
+        """Return a set of names, and a prefix of further ones."""
         found = super().__new__(cls, names)
         found.prefix = prefix
         return found
@@ -141,7 +141,6 @@ def _csv(file: Path, known: ColumnNames) -> FlightTable:
 
 
 def _bounded_lines(text: TextIO) -> Iterator[str]:
-    """Yield the lines of a text; raise ValueError for a line longer than ``LONGEST_LINE``."""
     while line := text.readline(LONGEST_LINE):
         if len(line) == LONGEST_LINE:
             raise ValueError(f"it has a line of more than {LONGEST_LINE:,} characters, and no row is so long")
@@ -194,7 +193,6 @@ def netcdf_attribute_names(file: Path) -> list[str]:
 
 
 def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xarray.Dataset":
-    """Return the content of a NetCDF file as a dataset, not decoded."""
     import xarray
 
     if not _is_hdf(file):
@@ -227,7 +225,6 @@ def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xa
 
 
 def _plain_attributes(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return attributes by name, an array of one number as that number."""
     return {
         name: value[()] if isinstance(value, numpy.ndarray) and value.ndim == 0 else value
         for name, value in pairs
@@ -421,7 +418,6 @@ def _rewrite_date(date: Any) -> str:
 
 
 def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
-    """Return the times of day in seconds, continued through midnight."""
     found = values.map(CLOCK.fullmatch)
     if found.isna().any():
         row = found.isna().idxmax()

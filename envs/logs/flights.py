@@ -341,7 +341,6 @@ def _check_site(site: Any) -> tuple[float, float] | None:
 
 
 def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[FlightSource]:
-    """Return the flights in one file as sources, with a reason for every flight that cannot be used."""
     try:
         table = read_table(file)
     except ValueError as error:

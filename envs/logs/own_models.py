@@ -32,12 +32,7 @@ SIMULATION_PARAMETERS = (
 
 
 def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping[str, Any]) -> LogFormat:
-    """Return the :class:`LogFormat` of the tables of a state-space model.
-
-    Args:
-        definition: the models.
-        defaults: parameters of the task.
-    """
+    """Return the :class:`LogFormat` of the tables of a state-space model."""
     one = len(definition.filters) == 1
     columns = {name.lower(): unit for name, unit in definition.measured.items()}
     acting = {name.lower(): given.unit for name, given in definition.inputs.items()}
@@ -64,7 +59,6 @@ def _read(
     defaults: Mapping[str, Any],
     columns: Columns,
 ) -> TrackLog:
-    """Return the measurements of one track from the columns of a table."""
     names, inputs = ([name.lower() for name in part] for part in (definition.measured, definition.inputs))
     lacking = [name for name in (*names, *inputs) if not columns.has(name)]
     if lacking:

@@ -191,13 +191,7 @@ def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma:
 
 
 def check_extents(names: tuple[str, str], one: numpy.ndarray, other: numpy.ndarray) -> None:
-    """Raise ValueError if one of two series of the same positions is in metres and the other in kilometres.
-
-    Args:
-        names: names of the series.
-        one: ``(n, k)``, NaN where there is no position.
-        other: ``(n, k)``, NaN where there is no position.
-    """
+    """Raise ValueError if one of two series of the same positions is in metres and the other in kilometres."""
     extents = [
         _length(numpy.nanmax(values, axis=0) - numpy.nanmin(values, axis=0)) for values in (one, other)
     ]
@@ -308,17 +302,7 @@ def _is_noise(name: str) -> bool:
 def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, float]) -> list[str]:
     """Return notes on the plausibility of every episode of a recording; ValueError for impossible values.
 
-    Args:
-        recording: the recording.
-        task: the task that replays it.
-        speeds: lowest and highest possible speed, m/s; the lowest holds where targets always
-            move, see :class:`.LogFormat`.
-
-    Returns:
-        Notes, one line each.
-
-    Raises:
-        ValueError: for the first episode with impossible values.
+    ``speeds`` are the lowest and highest possible speed, m/s; the lowest holds where targets always move.
     """
     world: Any = task.world  # a RecordedWorld
     # Latitude and longitude have a known unit, and their receiver may stand still.
@@ -365,7 +349,6 @@ def limit_notes(notes: list[str]) -> list[str]:
 
 
 def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) -> None:
-    """Raise ValueError if true velocities disagree with the differences of true positions."""
     pairs = [
         (i, names.index(rate))
         for i, name in enumerate(names)
@@ -381,7 +364,6 @@ def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) ->
 
 
 def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.ndarray) -> None:
-    """Raise ValueError if the truth is much farther from the measurements than their deviations."""
     known = numpy.isfinite(truth).all(axis=1)
     if not known.any():
         return

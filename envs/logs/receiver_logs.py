@@ -133,7 +133,6 @@ def _rtklib_time(cells: Sequence[str]) -> tuple[str, float]:
 
 
 def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the columns of positions and standard deviations, and notes on them."""
     if {"latitude", "longitude"} <= {*found}:
         columns = {"latitude": found["latitude"], "longitude": found["longitude"]}
         if "height" in found:
@@ -185,8 +184,6 @@ SENTENCE = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GST),[^\r\n$]*")
 
 
 class _Epoch:
-    """Contents of the NMEA sentences of one time."""
-
     def __init__(self, time: float) -> None:
         self.time = time
         self.date: datetime.date | None = None
@@ -291,7 +288,6 @@ def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
 
 
 def _format_time(time: float, day: datetime.date | None) -> str:
-    """Return the time of day as text, with its date if known."""
     clock = (datetime.datetime.min + datetime.timedelta(seconds=time)).time().isoformat()
     return clock if day is None else f"{day.isoformat()}T{clock}Z"
 
@@ -347,13 +343,11 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _autopilot_notes(topic: str, fixed: numpy.ndarray) -> tuple[str, ...]:
-    """Return notes on positions in the log of an autopilot, of which some have a fix, booleans ``(rows,)``."""
     source = f"positions are of {topic}, times seconds since the start of the autopilot"
     return (source, *_missing_fixes(fixed, "row"))
 
 
 def _missing_fixes(fixed: numpy.ndarray, noun: str) -> tuple[str, ...]:
-    """Return a note on how many rows or messages have no fix; empty if all have one."""
     return () if fixed.all() else (f"{count_of(int((~fixed).sum()), noun)} without a fix",)
 
 
@@ -414,7 +408,6 @@ def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Return the columns of ``NavSatFix`` messages from the numbers ``(8, n)`` of :func:`.parse_bag`."""
     time, status, latitude, longitude, altitude, east, north, covariance_type = values
     fixed = status != NO_FIX
     columns = {"time": time, "altitude": altitude}
@@ -430,7 +423,6 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Return the columns of poses from the numbers ``(5, n)`` of :func:`.parse_bag`."""
     time, x, y, *variances = values
     columns = {"time": time, "x": x, "y": y}
     notes = (f"positions are of the topic {topic}, metres in its own frame",)

@@ -55,7 +55,7 @@ class Columns:
     Args:
         table: numbers by column name, NaN where a cell is empty, with ``time`` in seconds. Its index
             counts the rows of the file.
-        given: parameters that the user has set.
+        user_parameters: parameters that the user has set.
         log_time: times as written in the file, numbers or text, ``(rows,)``; default: those of the table.
     """
 
@@ -90,7 +90,6 @@ class Columns:
         return [name for name in self.table if name.startswith(TRUTH)]
 
     def __getitem__(self, name: str) -> numpy.ndarray:
-        """Return the numbers of a column, ``(rows,)``; NaN where a cell is empty."""
         return self.table[name].to_numpy()
 
     def place(self, number: int) -> str:
@@ -387,7 +386,6 @@ def _add_truth(
     components: Sequence[Component],
     truth: TruthFile,
 ) -> tuple["pandas.DataFrame", tuple[str, ...]]:
-    """Return a log's table with the truth from a separate file added, and notes."""
     here = [name for name in table if name.startswith(TRUTH)]
     if here:
         raise ValueError(f"it has {', '.join(here)}: leave these columns or the file of the truth out")
@@ -425,7 +423,6 @@ def _rename(
 
 
 def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str]) -> str:
-    """Return a hint with the option ``--rename`` for columns that have other names."""
     wanted, pairs = [*first, *columns], []
     for name in names:
         free = [each for each in wanted if each not in names]
@@ -441,7 +438,6 @@ def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str])
 
 
 def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:
-    """Return the table with other names of latitude, longitude and altitude replaced, and all names."""
     renamed: dict[str, str] = {}
     for true in ("", TRUTH):
         for name in GEODETIC:
@@ -452,7 +448,6 @@ def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas
 
 
 def _times_as_written(values: "pandas.Series") -> numpy.ndarray:
-    """Return the times as written in a table: numbers, or text of dates."""
     try:
         return numbers("time", values).to_numpy()
     except ValueError:
@@ -560,6 +555,5 @@ def _take_rows(values: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
 
 
 def _truth_of_rows(columns: Columns, rows: numpy.ndarray, names: list[str]) -> numpy.ndarray:
-    """Return the truth of every component, ``(T, C)``; NaN where it is unknown."""
     unknown = numpy.full(len(columns.time), numpy.nan)
     return _take_rows(numpy.stack([columns[name] if name else unknown for name in names], axis=1), rows)

@@ -141,7 +141,6 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
 
 
 def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any]) -> None:
-    """Set the initial estimate in ``fields``, computed from the tracks' first measurements."""
     log_format = find_companion(cls, LogFormat)
     if log_format is None:
         raise ValueError(

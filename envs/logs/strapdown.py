@@ -154,9 +154,7 @@ def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0)
 def check_rest(rates: numpy.ndarray, force: numpy.ndarray) -> None:
     """Raise ValueError unless mean rates and forces at rest fit axes forward, right and down.
 
-    Args:
-        rates: mean rates, rad/s, ``(3,)``.
-        force: mean specific force, m/s^2, ``(3,)``.
+    ``rates`` are in rad/s, ``force`` in m/s^2, ``(3,)`` each.
     """
     size = float(numpy.linalg.norm(force))
     if abs(size - GRAVITY) > GRAVITY_TOLERANCE * GRAVITY:

@@ -465,10 +465,7 @@ def _covariance(arrays: list[Array]) -> faults.FaultCovariance:
 def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.FaultCovariance, ...]:
     """Return the process noise covariances of one step: Q of the INS, W of the receiver's coloured error.
 
-    Args:
-        noises: of the hypotheses.
-        s: sampling of the INS error.
-        pulls: errors of the receiver beside the coloured one.
+    ``pulls`` is the number of receiver errors beside the coloured one.
     """
     none = 0.0 * noises.decay
     ins = AugmentedCovariance(none, none, none, none, none, none)

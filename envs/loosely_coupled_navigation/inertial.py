@@ -293,9 +293,7 @@ def read_positions(data: Any, what: str, site: Sequence[float] | None) -> tuple[
 def geodetic_of_local(coordinates: numpy.ndarray, site: Sequence[float]) -> numpy.ndarray:
     """Return latitude, longitude (degrees) and height (m), ``(3, n)``, of points east, north and up of a site.
 
-    Args:
-        coordinates: ``(3, n)``, m.
-        site: latitude, longitude, degrees, and height, m.
+    ``site`` is its latitude and longitude, degrees, and height, m.
     """
     latitude, longitude, height = numpy.radians(site[0]), numpy.radians(site[1]), site[2]
     away = east_north_up(latitude, longitude).T @ coordinates

@@ -447,7 +447,6 @@ class FilterBank(RadarBank):
         return self._in_force(state, measurement, after._replace(probabilities=probabilities))
 
     def _update_filters(self, state: Filters, measurement: Measurement, alpha: Array, beta: Array) -> Filters:
-        """Return the filters updated with position gains alpha and velocity gains beta."""
         elapsed = self.time_since_last(measurement)
         updated = alpha_beta.update(state.mean[:2], state.mean[2:], state.innovation, alpha, beta, elapsed)
         covariance = alpha_beta.update_joint_covariance(

@@ -68,10 +68,7 @@ class Course(ABC):
     def context(self, flight: Any, scan: Array, time: Array) -> dict[str, Array]:
         """Return the context of the flight by name: times and sizes of manoeuvres, and the current one.
 
-        Args:
-            flight: constants of :meth:`begin`.
-            scan: number of the current scan.
-            time: of the current scan, in scan periods since the start.
+        ``time`` is that of the current scan, in scan periods since the start.
         """
         return {}
 
@@ -196,7 +193,6 @@ class StatedManeuver(Maneuvered):
 
 
 def _draw_start(draws: Draws, p: ManeuveringTargetParameters) -> Motion:
-    """Draw the position and velocity at the start of a random flight."""
     xp = draws.xp
     start_range, azimuth = draws.uniform("start_range", p.start_range), draws.uniform("azimuth", CIRCLE)
     speed, course = draws.uniform("speed", p.speed), draws.uniform("course", CIRCLE)

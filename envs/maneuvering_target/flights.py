@@ -19,7 +19,6 @@ MOST_SCANS = 100_000
 
 
 def _scenario_of_trajectory(trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
-    """Return a scenario that flies a user's trajectory, sampled once a scan and straight beyond its end."""
     interval, _, horizon = _sampling(keywords)
     farthest = float(numpy.hypot(*trajectory.position.T).max())
     if farthest > FARTHEST_RANGE:

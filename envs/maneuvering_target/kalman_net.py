@@ -105,10 +105,8 @@ def sensor_blocks(
 ) -> Sequence[Block]:
     """Return the observation blocks of a measurement's covariance along and across the velocity.
 
-    Args:
-        bank: that of these blocks.
-        variances: along and across, ``(2, N)``, m^2, of the bank's state and the measurement.
-        coupling: the correlation, ``(N,)``.
+    ``variances`` along and across, ``(2, N)``, m^2, and ``coupling``, the correlation, are functions of state and
+    measurement.
     """
     xp, p = bank.xp, bank.parameters
     return (
@@ -252,10 +250,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
     def noise(self, frame: Array, deviation: Array, T: Array) -> Array:
         """Return the process noise covariance of accelerations along and across, over intervals, ``(4, 4, N)``.
 
-        Args:
-            frame: rows along and across, ``(2, 2, N)``.
-            deviation: of each, m/s^2, ``(2, N)``.
-            T: s, ``(N,)``.
+        ``frame`` has the rows along and across, ``(2, 2, N)``; ``deviation`` is of each, m/s^2, ``(2, N)``.
         """
         xp = self.xp
         variance = deviation * deviation

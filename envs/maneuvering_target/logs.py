@@ -268,7 +268,6 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
 
 
 def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
-    """Return the typical deviations of the plots by column name, and the source of these numbers in words."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:
         if columns.has(*pair):
@@ -287,7 +286,6 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
 
 
 def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
-    """Return notes on the assumed deviations, if neither a column nor the user states one."""
     if not is_assumed(source) or "range_sigma" in columns.user_parameters:
         return []
     return [f"{source}: {deviation_words(deviations)}"]
@@ -336,7 +334,6 @@ def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray
 
 
 def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Return the times since the previous scan and since the last scan with a plot, s, by name."""
     import pandas
 
     last = pandas.Series(numpy.where([True, *seen], time, numpy.nan)).ffill().to_numpy()[:-1]

@@ -55,12 +55,7 @@ class RegularScans:
     ) -> tuple[Any, Scan]:
         """Move the target to the next scan; return the state of the scans, and the :class:`Scan`.
 
-        Args:
-            scans: result of :meth:`begin`, or the previous state.
-            flight: of the course.
-            number: of the scan, ``(N,)``.
-            before: motion at the time of the previous scan.
-            uniforms: ``(row_uniforms, N)``.
+        ``before`` is the motion at the time of the previous scan.
         """
         always = self.xp.ones_like(number)
         interval = self.parameters.sampling_interval * always

@@ -344,5 +344,4 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
 
 
 def _moved(table: AgedHypotheses, mean: Array, covariance: Array) -> AgedHypotheses:
-    """Return the hypotheses with mean and covariance as predicted."""
     return table._replace(mean=mean, covariance=mirror_lower(covariance))

@@ -79,7 +79,6 @@ class Filters(NamedTuple):
 
 @functools.lru_cache(8)  # an evaluation makes the same bank for every competitor, on numbers and on symbols
 def _design_channels(content: Sequence[tuple[tuple[int, ...], bytes]], scans: int) -> class_fusion.Channels:
-    """Return the gains and innovation statistics of the classes' filters at every scan of an episode."""
     *models, start = (numpy.frombuffer(numbers).reshape(shape) for shape, numbers in content)
     return class_fusion.design_channels(class_fusion.Models(*models), start, scans)
 

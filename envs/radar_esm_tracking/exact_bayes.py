@@ -286,10 +286,6 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
     def predict_motion(self, memory: ClassTracks, process: Array = 1.0) -> tuple[Array, Array]:
         """Return the means and covariances of all hypotheses predicted to the next scan.
 
-        Args:
-            memory: hypotheses after the previous scan.
-            process: factor on the covariance of the process noise, ``(N,)`` or a number.
-
         Returns:
             Means ``(n, S, M, N)`` and covariances ``(n, n, S, M, N)``.
         """

@@ -273,7 +273,6 @@ class HypothesisBank(SatelliteBank):
         thresholds: Sequence[Array] | None = None,
         cautions: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
-        """Return every filter updated with the readings (steps 5 and 6)."""
         expected, rows = gnss_ins.observe(
             means,
             measurement.satellite_position[:, :, None],
@@ -382,7 +381,6 @@ class NoiseBank(HypothesisBank):
         return self.weigh_by_bayes(state, exponent)
 
     def _variance(self, exponent: Array, state: Filters) -> list[Array]:
-        """Return the noise variance of every reading under an action, ``(N,)`` each."""
         xp, p, task = self.xp, self.parameters, self.task
         up, down = 2.0 * math.log(p.noise_scale), 2.0 * math.log(p.noise_reduction)
         factor = xp.exp(xp.where(exponent > 0.0, up * exponent, down * exponent))

@@ -49,7 +49,6 @@ class Course:
         return self._fixed_legs(draws, zeros)
 
     def _fixed_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Return the legs, initial velocity and heading of the paper's experiment, or of the matched course."""
         xp, p = self.xp, self.parameters
         # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
         draws.unit("legs", 15)
@@ -71,7 +70,6 @@ class Course:
         return legs, along * speed, heading
 
     def _random_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
-        """Draw legs of rest, straight flight and manoeuvre, the initial velocity and the heading."""
         xp, p = self.xp, self.parameters
         columns: list[tuple[Array, ...]] = []
         start: Array = None

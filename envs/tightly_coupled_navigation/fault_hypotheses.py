@@ -426,7 +426,6 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         )
 
     def _move_levels(self, levels: Array) -> Array:
-        """Return the probabilities of the noise levels after a step, ``(L, N)``."""
         L = levels.shape[0]
         return self.xp.stack(
             [

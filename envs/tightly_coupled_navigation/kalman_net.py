@@ -95,7 +95,6 @@ class KalmanNetBank(RobustBank):
         return state._replace(log_predicted=certain, probabilities=1.0 + certain)
 
     def _predict_hypotheses(self, state: Filters) -> Prediction:
-        """Return the prediction with the motion noise that the last action set."""
         common = self.task.common
         factor = self.xp.exp(2.0 * math.log(MANOEUVRE_RANGE) * state.action[self.manoeuvre])
         noise = self.common_noise + factor * self.manoeuvre_noise

@@ -194,7 +194,6 @@ class TightlyCoupledNavigationPicture(Picture):
         self.motion.set_ylim(0.0, ACCELERATION_LIMIT)
 
     def _show_course(self, places: numpy.ndarray) -> None:
-        """Widen the limits of the course panel to the positions, at equal scales."""
         sides = []
         for values in places:
             low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
@@ -245,7 +244,6 @@ def _runs(flags: Sequence[bool]) -> list[tuple[float, float]]:
 
 
 def _segments(runs: Sequence[tuple[float, float]], row: float) -> tuple[list[float], list[float]]:
-    """Return the coordinates of one broken line along a row."""
     x = [value for first, last in runs for value in (first, last, numpy.nan)]
     return x, [row] * len(x)
 

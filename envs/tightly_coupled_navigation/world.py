@@ -173,7 +173,6 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return truth, measurement
 
     def _move(self, truth: Truth, k: Array, normals: Array) -> tuple[Array, Array, Array]:
-        """Return the state at step k, the hypothesis that it follows, and whether its acceleration has jumped."""
         xp, common, c = self.xp, self.task.common, self.clock_root
         moved = gnss_ins.advance(truth.state, self.task.axis[:, :, SINGER], common.T, common.decay)
         w = xp.reshape(normals[:9], (3, 3, *normals.shape[1:]))

@@ -166,11 +166,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
     def compare(self, state: Any, measurement: Measurement, readings: Array, S: Array) -> Any:
         """Return the state with innovations, NIS, log-likelihood and averages at a measurement filled in.
 
-        Args:
-            state: state predicted to the measurement.
-            measurement: the new measurement.
-            readings: predicted readings, ``(m, N)``.
-            S: covariance of the innovations, ``(m, m, N)``.
+        ``readings`` are predicted, ``(m, N)``; S is the covariance of the innovations, ``(m, m, N)``.
         """
         xp, available, m = self.xp, measurement.available, len(self.task.sensors)
         residual = available * (measurement.reading - readings)
@@ -225,11 +221,9 @@ class _KalmanBank(AutopilotBank):
         self.diagonal: list[int] = packed_covariance.diagonal(n)
 
     def scaled_noise(self, scale: Array, entries: list[int]) -> Array:
-        """Return the process noise times a factor at some entries of the packed matrix, ``(entries, N)``."""
         return scale * self.process_noise[entries]
 
     def log_trace(self, state: KalmanState) -> Array:
-        """Return the logarithm of the trace of the covariance predicted with the last action's noise, ``(N,)``."""
         variances = state.covariance[self.diagonal] + self.scaled_noise(state.scale, self.diagonal)
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
@@ -277,7 +271,6 @@ class _KalmanBank(AutopilotBank):
         return update.mean, update.covariance
 
     def act(self, state: KalmanState, measurement: Measurement, action: Array) -> KalmanState:
-        """Return the state updated by equations (12) and (11) with the noises that the action sets."""
         shown, scale = self.decode_action(action)
         update = packed_covariance.update_coordinates(
             state.mean,

@@ -35,8 +35,6 @@ def draw_steps(
 
 
 class _OfSensors(Disturbance):
-    """Base class of disturbances of all m sensors, or of some."""
-
     def __init__(self, task: AutopilotProblem) -> None:
         super().__init__(task)
         self.task = task

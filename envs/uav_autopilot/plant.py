@@ -108,7 +108,6 @@ MOST_CONDITION = 1e14
 
 
 def _check_digits(parameters: UavAutopilotParameters, ratios: numpy.ndarray) -> None:
-    """Raise ValueError if a sensor's variance is lost in the rounding of the predicted variance."""
     p = parameters
     scale = max(p.wide_band_scale, 10.0**p.gain_decades, 10.0 ** (p.process_decades + 2.0 * p.sensor_decades))
     worst = int(numpy.argmax(ratios))

@@ -32,7 +32,6 @@ class AutopilotProblem(Task):
         self._L = self.constant(self.design.feedback)
 
     def _sampling_interval(self) -> float:
-        """Return the sampling interval, s; the plant's default if the parameter is None."""
         return float(self.parameters.value("sampling_interval"))
 
     def autopilot(self, estimate: Array, command: Array) -> Array:

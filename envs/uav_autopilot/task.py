@@ -44,7 +44,6 @@ def _picture(model: Model) -> Any:
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Return the control that the autopilot computes from the estimate, by name."""
     return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 

@@ -203,7 +203,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         return self.xp.stack(rows)
 
     def cost(self, truth: Truth, mean: Array) -> Array:
-        """Return the weighted squares of the deviation from the command's equilibrium and of the control, ``(N,)``."""
+        """Return the loop's cost, a weighted sum of squared control and distance to the commanded state, ``(N,)``."""
         task = self.task
         control = task.autopilot(mean, truth.command)
         total = task.design.control_weight * control * control
