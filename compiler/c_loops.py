@@ -139,7 +139,6 @@ class Loops:
         return " + ".join([str(least)] * (least != 0 or not text) + [text] * (text != ""))
 
     def _choose_form(self, loop: Loop) -> None:
-        """Select the form of a loop with the shortest tables: one loop, rows and columns, or runs."""
         self._columns, self._runs, self._starts = 1, [0], {}
         irregular = set()
         for statement in loop.body:
@@ -223,7 +222,6 @@ class Loops:
         return least, "" if step == 0 else letter if abs(step) == 1 else f"{abs(step)} * {letter}"
 
     def _table(self, values: tuple[Any, ...]) -> str:
-        """Return the name of a C constant array of these numbers, which is defined at its first use."""
         key = (type(values[0]), *(struct.pack("d", value) for value in values))
         if key not in self._found:
             name = self._found[key] = (

@@ -1,9 +1,8 @@
 """C99 text of a program for one lane, in double or float; the statements also form a CUDA kernel.
 
 Every step is one statement, or, in a loop, every array operation (:mod:`.rolling`). Numbers that pass from one static
-function or loop to the next are stored in a scratch array ``w``. Comparisons with NaN, and the results of ``maximum``,
-``minimum``, ``sign``, ``remainder`` and ``take`` for NaN, are those of :mod:`.emission`; of the two zeros a ``maximum``
-may return either.
+function or loop to the next are stored in a scratch array ``w``. Results for NaN are those of :mod:`.emission`; of the
+two zeros a ``maximum`` may return either.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -193,7 +192,6 @@ def write_program(
 
 
 def _merge_blocks(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
-    """Return the statements joined into blocks of a function's length, and the number of blocks before a pause."""
     packed: list[list[str]] = []
     before = 0
     for i, block in enumerate(blocks):

@@ -1,8 +1,8 @@
 """Cache of compiled machine code in the user's cache folder, by content.
 
 An entry is written to a temporary file and moved into place, begins with its own checksum, and is ignored if it is
-invalid. The size of the folder is limited: the least recently used entries are removed first. If the operating system
-refuses an access, the entry is treated as missing.
+invalid. The least recently used entries are removed first where the folder is too large. If the operating system
+refuses an access, the entry counts as missing.
 
 An entry is executed. So, like a key of ssh, it must be safe from other users: folder and entry belong to this
 user or to root, and neither group nor others may write to them. The checks use the opened file itself, so
@@ -145,7 +145,6 @@ def _open_folder(place: Path) -> Iterator[int | None]:
 
 @contextlib.contextmanager
 def _open(path: str | Path, flags: int, within: int | None) -> Iterator[int]:
-    """Yield the handle of a file or folder opened for reading; links are refused."""
     # O_NONBLOCK: do not wait for the other end of a pipe; Windows has only O_BINARY.
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"):
         flags |= getattr(os, name, 0)

@@ -245,7 +245,6 @@ def _declarations(program: StraightLineProgram, library: Library, block: LaneBlo
 
 
 def _block_function(block: LaneBlock, name: str, symbol: str, lanes: int) -> Iterator[str]:
-    """Yield the LLVM lines of a function of a block that calls a library function of fewer lanes."""
     width, numbers = block.lanes, block.numbers
     kind = "double" if lanes == 1 else f"<{lanes} x double>"
     operands = ("%a", "%b") if name in BINARY else ("%a",)

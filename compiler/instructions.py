@@ -88,7 +88,6 @@ class Instructions:
             self.lines.append(f"store double {number}, ptr {address}, align 8")
 
     def _lane_places(self, argument: int, row: int | str) -> Iterator[str]:
-        """Yield the names of the numbers' addresses in an argument laid out lane by lane."""
         start, stride = self.argument(argument)
         first = self.new(f"mul i64 %lane, {stride}")
         first = self.new(f"add i64 {first}, {row}")

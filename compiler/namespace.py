@@ -493,7 +493,6 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
 
 
 def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) -> numpy.ndarray:
-    """Return the expressions in each row ``(R, choices)`` at constant indices, ``(R, places)``."""
     chosen = numpy.empty((len(rows), len(places)), dtype=numpy.int64)
     open_rows, open_places = [], []
     graph.begin_group()

@@ -2,9 +2,8 @@
 
 A trace consists of scalars, each with the number of the array operation that made it
 (:attr:`.StraightLineProgram.origins`). Members of one operation are independent: they become one :class:`Statement`.
-Statements with equal numbers of members share a loop, where a member may use results of the same turn; all other values
-pass from loop to loop through a scratch array. Operations, operands and their order are those of the straight line, so
-that the results have the same bits.
+Statements with equal numbers of members share a loop, where a member may use results of the same turn; all other
+values pass through a scratch array. Results have the same bits as those of the straight line.
 """
 
 import heapq
@@ -156,7 +155,6 @@ class _Roller:
     # --- statements
 
     def _group_steps(self) -> Iterator[numpy.ndarray]:
-        """Yield the steps of each array operation that have one form, in the order of its members."""
         parts = self.parts
         computed = numpy.flatnonzero(self.source == COMPUTED)
         if not len(computed):
@@ -187,7 +185,6 @@ class _Roller:
                 yield steps[start:end]
 
     def _levels(self) -> numpy.ndarray:
-        """Return the depth of each step in the dependencies within its array operation."""
         inside = (self.parts >= 0) & (self.group[self.parts] == self.group[:, None])
         inside &= self.source[self.parts] == COMPUTED
         levels = numpy.zeros(len(self.steps), dtype=numpy.int64)
@@ -212,7 +209,6 @@ class _Roller:
             self._add(draft)
 
     def _write(self, argument: int, nodes: dict[int, int], late: bool) -> None:
-        """Add statements that write results: one for the results of a whole statement, one for all others."""
         by_draft: dict[int, list[tuple[int, int]]] = {}
         rest = []
         for row, step in sorted(nodes.items()):

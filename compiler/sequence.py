@@ -1,8 +1,7 @@
 """Native calls over many time steps in one call, without a return to Python in between.
 
-A step is a list of calls, each a function and its table of addresses. Two memories alternate between steps: one step
-writes what the next one reads. So there are two lists, for even and odd steps. Some entries of the tables advance with
-every step: the address of a row of noise or of a report, or a counter.
+A step is a list of calls, each a function and its table of addresses. Two memories alternate: one step writes what the
+next one reads. So there are two lists, for even and odd steps. Some entries of the tables advance with every step.
 
 A tile of lanes passes through all steps before the next tile begins, so that it stays in the processor's cache.
 """

@@ -1,8 +1,8 @@
 """Functions of a vector with exact Jacobians, for arrays of any namespace.
 
 A user's function in NumPy is traced once, on a vector of symbols, and its Jacobian is derived by reverse mode, one row
-for each entry of the result (:mod:`.gradients`). Both are straight lines of arithmetic on one lane, which can be
-computed with the functions of any array namespace: NumPy's, torch's, or on traced arrays again.
+for each entry of the result (:mod:`.gradients`). Both are straight lines of arithmetic on one lane, which any array
+namespace can compute.
 """
 
 import functools

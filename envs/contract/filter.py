@@ -4,7 +4,7 @@ A **filter** starts at a given initial estimate, predicts to every measurement, 
 covariance. Every competitor is a filter: a bank that a policy steers, an estimator of a user, a learned estimator, a
 reference with additional information, a bound.
 
-State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last axis, and are never changed in place.
+State and measurement are NamedTuples of arrays ``(..., N)``, which are never changed in place.
 """
 
 import math

@@ -6,8 +6,7 @@
         \"\"\"Standard deviation of the range, m (paper).\"\"\"
 
 The type of a field determines the values that it takes (number, whole number, boolean, word, tuples of them, None);
-:func:`parameter` declares further limits. Every error is a ``ValueError`` with the name, the value and the
-expected values.
+:func:`parameter` declares further limits. Errors state name, value and expected values.
 """
 
 import dataclasses

@@ -1,8 +1,7 @@
 """Reading of files from outside: opened, measured and parsed under limits of memory and processor time.
 
 JSON is counted before it is parsed. Formats that need other libraries (NetCDF-4, Parquet, ULog, bags, SQLite, YAML)
-are parsed in a process of their own (:mod:`.foreign_parsers`) with limits of memory and of processor time, which
-returns plain arrays.
+are parsed in a process of their own (:mod:`.foreign_parsers`), which returns plain arrays.
 
 A file that breaks a limit is refused in one sentence, with the way to raise it: ``FILTERGYM_READ_MEMORY`` in MB and
 ``FILTERGYM_READ_SECONDS`` in the environment.
@@ -256,7 +255,6 @@ def _explain_end(code: int, seconds: float) -> ValueError:
 
 
 def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
-    """Return the JSON head and the arrays that a parser process sent; None for an incomplete result."""
     size = answer.read(8)
     if len(size) < 8 or int.from_bytes(size, "little") > memory:
         return None, []

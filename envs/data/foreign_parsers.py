@@ -5,8 +5,8 @@ path, and the limits. The file to read is open as standard input. The result goe
 head in eight bytes, the head in JSON, then the bytes of the arrays that the head names. Nothing of the package is
 imported here, so that a start costs a tenth of a second; a parser may use NumPy and its own library only.
 
-A parser returns plain values: numbers, words, lists, arrays, and dictionaries whose keys are defined here; names from a
-foreign file are in lists of pairs. It raises ``ValueError`` with a sentence for the user.
+A parser returns plain values: numbers, words, lists, arrays, and dictionaries whose keys are defined here; names from
+a file are in lists of pairs. It raises ``ValueError`` with a sentence for the user.
 """
 
 import json

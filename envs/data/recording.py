@@ -1,12 +1,10 @@
 """Recorded measurements in place of a simulated world: readings of real sensors, replayed under any policy.
 
 As a scenario a :class:`Recording` replaces the task's own world by a :class:`.RecordedWorld`: an episode replays one
-recording, which its first uniform number draws. Banks, estimators, backends and evaluations are the same as in a
-simulation.
+recording, which its first uniform number draws.
 
-The environment determines the arrays: it measures once, and the recording must have arrays of the same names and
-shapes. So this module is the same for every task whose measurements do not depend on the estimates. In a closed
-loop they do, and no recording has the readings that another estimate would have caused.
+The recording must have arrays of the same names and shapes as one simulated measurement. A task with a closed loop has
+no recordings: none has the readings that another estimate would have caused.
 
 Without truth there are no errors and no costs, and rewards are zero.
 """
@@ -268,7 +266,6 @@ class Recording(ScenarioData):
             self._check_cost_known(task)
 
     def _check_cost_known(self, task: Task) -> None:
-        """Raise ValueError if the known part of the truth does not determine the cost of an error."""
         world, rows = task.World(task), self.rows
         for episode, name in enumerate(self.names):
             nothing = 0.0 * self.truth[episode, : rows[episode]].T  # type: ignore[index]

@@ -5,7 +5,7 @@ the episode is a function of its identity, the measurement ``t`` and the number'
 (:mod:`..compiler.counter_numbers`): at ``t = 0`` those of its start, from ``t = 1`` on those of measurement ``t``. So
 policies of different controls that start from the same seed have the same noise.
 
-With llvmlite compiled code makes the numbers, otherwise NumPy, for many measurements at once; the bits are the same.
+Compiled code and NumPy make the same bits.
 """
 
 import copy

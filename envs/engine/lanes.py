@@ -7,8 +7,7 @@ classes and the evaluation use :class:`Lanes`.
 kernels by the width, and widths that are multiples of eight agree. So lane i of N equals the single
 environment with the same seed bit for bit.
 
-**Steppers.** A compiled model whose report can be traced moves its episodes in memory of its own
-(:class:`~.stepper.Stepper`), any other by the model's functions (:class:`ModelStepper`), both by the same calls.
+**Steppers.** A compiled model whose report can be traced has a :class:`~.stepper.Stepper`, any other a :class:`ModelStepper`.
 """
 
 from collections.abc import Callable, Sequence
@@ -355,7 +354,6 @@ class Lanes:
         return own.observation_of_first(), reward, taken >= self._lengths.item(0)
 
     def _take_and_decide(self, action: Array, report: Report) -> Sequence[Any]:
-        """Apply one action in each lane; return the steppers, which have the reports on its measurements."""
         steppers = self._reporting(report)
         steppers[0].take(action)
         steppers[0].decide(self.noise, steppers[1:])

@@ -92,7 +92,6 @@ def _check_contract(cls: Any) -> None:
 
 
 def _check_action(model: Model) -> None:
-    """Raise ValueError if the engine does not support the action space or the action of the paper's policy."""
     space: Any = model.action_space
     flat = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.is_bounded()
     if not flat and not (isinstance(space, gymnasium.spaces.Discrete) and space.start == 0):
@@ -112,7 +111,6 @@ def _check_action(model: Model) -> None:
 
 
 def _check_causes(model: Model) -> None:
-    """Raise ValueError if names of causes of cost repeat or are reserved."""
     names = [cause.name for cause in Causes.of(model.task).causes]
     twice = [name for name in names if names.count(name) > 1 or name in RESERVED]
     if twice or len(names) > MOST_CAUSES:

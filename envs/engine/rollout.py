@@ -1,8 +1,7 @@
 """Rollout of compiled episodes whose states are stored, and reverse-mode differentiation through them.
 
-Forward, every measurement writes the episodes after it into memory of their own. Backward, the code of a step's
-pullback (:mod:`..compiler.gradients`) computes the step again from them, and turns the gradient with respect to its
-output into that with respect to its input.
+Forward, every measurement writes the episodes after it into memory of their own. Backward, a step's pullback
+(:mod:`..compiler.gradients`) computes the step again from them.
 """
 
 import functools

@@ -208,7 +208,6 @@ class Stepper:
         return _bound(draw, sequences, shown)
 
     def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
-        """Run one decision, or one start, of this and the other steppers as one native call."""
         draw = noise.call_of_each()
         if self._given:
             self._show_in(numpy.empty_like(self._shown))

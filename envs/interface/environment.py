@@ -35,8 +35,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Model.track`), error,
             cost and the further records of an evaluation.
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
-        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded on
-            return.
+        dtype: type of observations and rewards: "float64" (default), or "float32", to which they are rounded on return.
         context: whether ``info["context"]`` contains the random draws of the episode and their current values
             (:meth:`.World.context`), at resets and steps.
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
@@ -98,7 +97,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Start a new episode; return the observation of its first measurement, and ``info``.
 
-        ``options["scenario"]``: as the argument ``scenario`` of the environment; None: the environment's own again.
+        ``options["scenario"]``: as the environment's argument ``scenario``; None: the environment's own again.
         ``options["parameters"]``: parameters that override those of the environment; ``{}`` for none. Each applies
         until a reset names another.
 

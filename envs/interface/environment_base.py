@@ -103,7 +103,6 @@ class EnvBase:
     # --- scenarios
 
     def _distribution(self, scenario: Any, parameters: Mapping[str, Any]) -> EpisodeDistribution:
-        """Return the distribution of episodes over the tasks of a scenario or mixture."""
         keywords = {**self._keywords, **parameters}
         mixture = find_mixture(self._class, scenario)
         choices = [scenario] if mixture is None else list(mixture)
@@ -198,7 +197,6 @@ class EnvBase:
         }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
-        """Return the context of all lanes by name, batch first, and masks of the lanes that have each part."""
         found = []
         for (part,) in self.fleet.parts():
             context, xp = part.model.context(part.state), part.task.xp

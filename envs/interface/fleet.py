@@ -1,10 +1,8 @@
 """The fleet of an environment: its lanes (parallel episodes), of one task or of several tasks.
 
-A task has one set of parameters. While all episodes are of one task, the fleet is that task's
-:class:`~.lanes.Lanes`, and every call goes directly to them. Where scenarios are mixed, or a reset names another
-scenario or other parameters, every distinct set has a task and lanes of its own. A lane's next episode gets a free
-place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. An unused place is
-stepped too: the time of a step grows with the largest number of environments that ever ran each task at once.
+A task has one set of parameters. Where scenarios are mixed, or a reset names another scenario or other parameters,
+every distinct set has a task and :class:`~.lanes.Lanes` of its own. A lane's next episode gets a free place in the
+lanes of its task, which grow by eight places when none is free. Unused places are stepped, too.
 
 A lane's generator gives first, in a mixture only, the uniform number that chooses the task, then the identity of the
 episode, see :mod:`.episode_noise`. So sub-environment i of N equals the single environment with the same seed.

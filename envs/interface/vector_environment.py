@@ -295,7 +295,6 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return shown, reward, self._mask(self._never), self._mask(finished), info
 
     def _watch(self, action: Array) -> Callable[[Any], None] | None:
-        """Return a function that adds the states of this step to the pictures; None without a render mode."""
         if self.pictures is None:
             return None
         pictures, actions, shown = self.pictures, host_array(action), host_array(self.fleet.observe())

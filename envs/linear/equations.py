@@ -460,7 +460,6 @@ class Equations:
         return self.xp.reshape(values, (function.size, *x.shape[1:]))
 
     def _warn(self, name: str, compute: Callable[[Array, Any], Array], x: Array) -> Array:
-        """Return a function's values at ``(n, N)``; warn, with its name, of values that are not finite."""
         if self.xp is not numpy:
             return compute(x, self.xp)
         with numpy.errstate(all="ignore"):
@@ -473,7 +472,6 @@ class Equations:
         return values
 
     def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
-        """Return a text on a function's first value that is not finite at a finite state; empty if there is none."""
         entries = values.reshape(len(values), -1, x.shape[1])
         wrong = numpy.asarray(~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0))
         if not wrong.any():

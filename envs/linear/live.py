@@ -88,7 +88,6 @@ class StateSpaceInput(LiveInput):
         return made
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values by name, with the numbers of all sensors joined in one array, ``(m, N)`` or ``(m,)``."""
         named = [name for name in self._names if values.get(name) is not None]
         if named in ([], ["values"]):
             return dict(values)

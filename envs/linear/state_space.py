@@ -6,8 +6,7 @@ A timed model depends on the interval since the previous measurement, and may ha
 episode, that acted in it (:mod:`.equations`, :mod:`.inputs`). A measurement then contains both.
 
 The world has one model, or switches between several as a Markov chain from measurement to measurement. The filters may
-use other models. The functions are traced once, on vectors of symbols, and differentiated exactly
-(:mod:`..compiler.vector_functions`).
+use other models. The functions are traced once, and differentiated exactly (:mod:`..compiler.vector_functions`).
 """
 
 from collections.abc import Sequence

@@ -159,7 +159,6 @@ def fit_parabolas(
 def _check_units(
     time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray | None, limits: Cleaning
 ) -> None:
-    """Raise ValueError with the likely cause if a flight cannot be in seconds and metres."""
     check_speed(time, position, limits.speeds)
     step = float(numpy.median(numpy.diff(time)))
     if step > limits.longest_gap:

@@ -1,9 +1,7 @@
 """Recorded flights from files: read by column names, projected to the radar's plane, cleaned and cut into pieces.
 
-:mod:`.flight_tables` lists the accepted columns. Latitude and longitude become metres east and north of the
-radar's site, in the plane that touches the ellipsoid there. The package has its own
-projection, because it is a rotation of Earth-fixed coordinates that the satellites need anyway; the tests compare it
-with a geodesy library.
+:mod:`.flight_tables` lists the accepted columns. Latitude and longitude become metres east and north of the radar's
+site, in the plane that touches the ellipsoid there.
 
 :mod:`.flight_cleaning` checks every file: a flight with an impossible speed is an error with the likely cause, a
 single position far off the track is removed, and a track is cut where it jumps or has a long gap. Notes list these
@@ -131,7 +129,6 @@ def flight_of(trajectory: Trajectory) -> str:
 
 
 def _number_namesakes(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Return the trajectories, with numbers appended to equal names of different flights."""
     names = [flight_of(trajectory) for trajectory in trajectories]
     return [
         replace(trajectory, name=f"{trajectory.name} {i}")

@@ -1,8 +1,8 @@
 """Plausibility checks of tracks in files: units, clocks, and positions that no target can reach.
 
 Flights (:mod:`.flight_cleaning`) and recordings (:func:`check_recording`) use these checks. Impossible values raise an
-error of one sentence with the likely cause. Possible but noteworthy values give a note. The checks never change or drop
-rows of a recording, because a sensor may have measured them.
+error with the likely cause; noteworthy ones give a note. No row of a recording is changed or dropped, because a sensor
+may have measured it.
 """
 
 import difflib
@@ -383,7 +383,6 @@ def _check_scale(
     moving: bool,
     known_unit: bool,
 ) -> None:
-    """Raise ValueError if measured positions cannot be metres, by their speed and their noise."""
     check_speed(time, position, speeds, float(numpy.median(sigma)), moving)
     if len(time) < FEWEST or known_unit:
         return

@@ -271,7 +271,6 @@ def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
 
 
 def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
-    """Return the date of every epoch, counted from those that contain one; None if none does."""
     known = next((i for i, epoch in enumerate(epochs) if epoch.date), None)
     if known is None:
         return [None] * len(epochs)
@@ -293,7 +292,6 @@ def _format_time(time: float, day: datetime.date | None) -> str:
 
 
 def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, numpy.ndarray]:
-    """Return the standard deviations east and north, with gaps filled forward, then backward."""
     import pandas
 
     stated = pandas.DataFrame(
@@ -433,7 +431,6 @@ def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _add_odometry(log: ReceiverLog, values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Return the log with the displacements since the previous row added, from poses ``(5, n)``."""
     order = numpy.argsort(values[0], kind="stable")
     time, x, y, *_ = values[:, order]
     now = log.columns["time"]

@@ -401,7 +401,6 @@ def _add_truth(
 def _rename(
     read: "pandas.DataFrame", names: list[str], renamed: Sequence[tuple[str, str]], known: ColumnNames
 ) -> tuple["pandas.DataFrame", list[tuple[str, str]]]:
-    """Return the table with renamed columns, and pairs of the old and new names of all columns in the file."""
     for old, new in renamed:
         if old not in names:
             fate = "be left out" if new == LEFT_OUT else f"become {new}"

@@ -1,9 +1,9 @@
 """Inertial navigation from rates and accelerations: alignment, aiding by fixes, and free running.
 
-The strapdown algorithm and the error-state Kalman filter are those of pyins (``pip install 'filtergym[ins]'``). Tables
-are of pandas, by time in s: inertial measurements with the columns ``gyro_x`` to ``gyro_z`` (rad/s) and ``accel_x`` to
-``accel_z`` (specific force, m/s^2) forward, right and down in the vehicle; fixes with ``lat``, ``lon`` (degrees),
-``alt`` (m) and ``VN``, ``VE``, ``VD`` (m/s north, east, down).
+Strapdown algorithm and error-state Kalman filter are those of pyins (``filtergym[ins]``). Tables are of pandas, by
+time in s: inertial measurements with the columns ``gyro_x`` to ``gyro_z`` (rad/s) and ``accel_x`` to ``accel_z``
+(specific force, m/s^2) forward, right and down in the vehicle; fixes with ``lat``, ``lon`` (degrees), ``alt`` (m) and
+``VN``, ``VE``, ``VD`` (m/s north, east, down).
 
 1. **Alignment.** While the vehicle stands, the mean specific force gives roll and pitch, and the mean rates less the
    rotation of the Earth are the bias of the gyroscopes. The heading is the course of the first motion less the angle

@@ -2,11 +2,10 @@
 
 False plots are a Poisson field over the whole plane, new in every scan. A tracker processes a window around the
 predicted position, so the plots of a scan are those in the window of the filter in the loop: uniformly distributed,
-independent of the target, and of unknown origin. That closes a loop: the radar needs the filter's estimate for the
-plots around it. The same random numbers make false plots at the same places of every filter's window.
+independent of the target, and of unknown origin. That closes a loop: the radar needs the filter's estimate. The same
+random numbers make false plots at the same places of every filter's window.
 
-Filters that use one plot receive the nearest to their prediction, as a common front end does it. The rule is the same
-for all: their estimate and covariance, predicted at constant velocity.
+Filters that use one plot receive the nearest to their estimate, predicted at constant velocity.
 """
 
 import math

@@ -78,12 +78,10 @@ class PlotInput(LiveInput):
         return measurement._replace(odometry=odometry), {**after, "velocity": velocity}
 
     def _velocity(self, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Return the velocity by the second sensor, m/s, ``(2, N)`` or ``(2,)``; NaN where it has none."""
         heading = numpy.radians(self.read(values, "odometry_heading"))
         return east_north(self.read(values, "odometry_speed"), heading)
 
     def _position(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return x and y of a plot, m, from its Cartesian or polar values; NaN where there is none."""
         if "latitude" in values or "longitude" in values:
             return self._project(values)
         if "range" not in values:

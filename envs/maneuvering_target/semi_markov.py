@@ -144,9 +144,9 @@ class SemiMarkovState(NamedTuple):
 class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measurement, SemiMarkovState]):
     """Estimator ``semi-markov``: Gaussian sum over straight flight, constant thrust and turns, each with its age.
 
-    Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
-    distribution, not geometrically. Turns to the left and to the right are kinds of their own, and so are gentle
-    and steep ones: about a turn rate of zero the extended filter would linearise where no turn is.
+    Every hypothesis of kind and age has a Kalman filter, an extended one of the turn. Turns to the left and to the
+    right are kinds of their own, and so are gentle and steep ones: about a turn rate of zero the extended filter would
+    linearise where no turn is.
 
     Args:
         prior: of flights and measurements.

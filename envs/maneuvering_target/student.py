@@ -2,8 +2,7 @@
 
 The frame is that of the predicted velocity, along it and across it to the left, for positions and for velocities. The
 unit of a position is the measurement's sigma in the frame; that of a velocity is this sigma over the scan period. The
-network outputs the acceleration until the next scan, along and across. A rotation or shift of the whole problem rotates
-or shifts the estimates.
+network outputs the acceleration until the next scan, along and across.
 """
 
 from collections.abc import Sequence

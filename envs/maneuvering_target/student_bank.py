@@ -117,8 +117,8 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
     def blocks(self) -> Sequence[Block]:
         """Observation blocks: the innovation and the features, without the last action.
 
-        At the beginning of training the outputs vary little. As observations they would be normalised by that small
-        spread, and their gradients would grow with every scan in the backward pass.
+        Outputs vary little at the beginning of training: normalised by that spread, their gradients would grow with
+        every scan.
         """
         return (
             Block(
@@ -172,7 +172,6 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         )
 
     def _correct(self, by_gain: Array, offset: Array, innovation: Array) -> tuple[list[Array], Array]:
-        """Return the gain G of each component, and the correction c, ``(C, N)``."""
         gains, corrections = [], []
         for row, beyond, (axis, first) in zip(by_gain, offset, self.gain, strict=True):
             gain = 1.0 / (1.0 + (1.0 / first - 1.0) * self.xp.exp(-GAIN_REACH * row[axis]))

@@ -1,7 +1,7 @@
 r"""Controls ``sigma-points`` and ``unscented``: the filter ``unscented-turn`` with settings that an action multiplies.
 
-Both are rivals of 2026, made from their abstracts without their code. At a scan that saw the target, with X_i the sigma
-points after the turn (i = 0 that of the mean, n = 5), W_i their weights and f the factors of the action,
+Both are rivals of 2026, made from their abstracts without their code. At a scan that saw the target, with X_i the
+sigma points after the turn (i = 0 that of the mean, n = 5), W_i their weights and f the factors of the action,
 
     sigma-points   x' = sum V_i X_i,  V_i = W_i f_i / sum W_j f_j,   P' = sum W_i^c f_i^c (X_i - x')(X_i - x')^T + Q
     unscented      alpha <- alpha f_1,   Q <- Q (f_2: acceleration, f_3: turn rate),   R <- R f_4
@@ -12,13 +12,12 @@ encoder compresses the history of innovations, and from it a policy network sets
 mean and covariance at each step; both are trained through the filter. Reading: the network sees the innovation under
 the plain weights, and its weights apply to the points of the same scan; they are factors of the plain ones, so that
 they stay positive and those for the mean sum to one. The mean's own point, of weight zero, has no factor for the mean.
-The update is Kalman's, because the measurement is linear.
 
 ``unscented`` is of O. Straka, F. Giraldo-Grueso and R. Zanetti, "Learning Adaptive Parameter Policies for Nonlinear
-Bayesian Filtering" (arXiv 2603.19910, 2026). The abstract states: a policy of reinforcement learning selects parameters
-of a filter's numerical approximation at each step, among them scaling parameters, with experiments on the unscented
-filter. That is f_1. The factors of the noises are ours: the measurement is linear here, and the scaling alone, at the
-ends of its range, changes the cost by less than a hundredth of a per cent.
+Bayesian Filtering" (arXiv 2603.19910, 2026). The abstract states: a policy of reinforcement learning selects
+parameters of a filter's numerical approximation at each step, among them scaling parameters, with experiments on the
+unscented filter. That is f_1. The factors of the noises are ours: the measurement is linear here, and the scaling
+alone, at the ends of its range, changes the cost by less than a hundredth of a per cent.
 
 Both limit the deviation of the turn rate, which factors of every scan could raise until nothing determines it.
 """

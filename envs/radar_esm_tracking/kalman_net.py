@@ -2,17 +2,16 @@ r"""The learned estimator ``kalman-net`` of RadarEsmTracking: a recurrent networ
 
 This is the paper's algorithm with two covariances for the Kalman filter of each class: P of the errors, and M, from
 which the gain is computed. At every scan the network returns numbers in [-1, 1]: evidence of every class as under
-control ``evidence``, then a_0 for the acceleration and a_i for the radar's range and range rate, then b_0 and b_i
-like them. They are the same for all classes:
+control ``evidence``, then a_0 for the acceleration and a_i for the radar's range and range rate, then b_0 and b_i like
+them. They are the same for all classes:
 
     noise    Q(s) = noise_range^(2 a_0) Q(s),  R_i = noise_range^(2 a_i) R_i,  P' = Phi P Phi^T + Q(s)
     gain     M' = Phi M Phi^T + caution^(2 b_0) Q(s),  K = M' H^T (H M' H^T + diag(caution^(2 b_i) R_i))^-1,
              M = (I - K H) M'
     update   x = x' + K Delta,  P = (I - K H) P' (I - K H)^T + K R K^T                              (Joseph form)
 
-The likelihoods of the classes use P' and R of the previous scan's output. All zero is the paper's algorithm. M follows
-the Riccati equation of noises between limits, so that the filters are stable for any output. References and reading are
-in ``maneuvering_target/kalman_net.py``.
+The likelihoods of the classes use P' and R of the previous scan's output. All zero is the paper's algorithm.
+References and reading are in ``maneuvering_target/kalman_net.py``.
 """
 
 import math

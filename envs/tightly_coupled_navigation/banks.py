@@ -320,7 +320,6 @@ class HypothesisBank(SatelliteBank):
         return self._combine(state, probabilities, last_action)
 
     def _combine(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
-        """Return the state with these weights and the combined mean (step 8)."""
         return state._replace(
             probabilities=probabilities,
             mean=weighted_sum(probabilities, state.means),
@@ -391,7 +390,6 @@ class NoiseBank(HypothesisBank):
         ]
 
     def _thresholds(self, exponent: Array) -> Sequence[Array] | None:
-        """Return each reading's threshold of the robust update, ``(N,)``; None for the plain update."""
         return None
 
     def covariance(self, state: Filters) -> Array:

@@ -1,9 +1,8 @@
 """Motion of the user of TightlyCoupledNavigation: random legs for every episode, or the fixed legs of the paper.
 
-Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so no jump
-is left for step 2000. The truth was probably a sequence of states with V incremented and A = 0:
-``course="increment"``. Physically that is an accelerometer stuck at zero through leg 2. The consistent
-alternative, where A = 30 m/s^2 in leg 2 and turns by 90 degrees, is ``course="kinematic"``.
+Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so no jump is left
+for step 2000. The truth was probably a sequence of states with V incremented and A = 0: ``course="increment"``. In the
+consistent alternative, ``course="kinematic"``, A = 30 m/s^2 in leg 2 and turns by 90 degrees.
 """
 
 import math

@@ -250,7 +250,6 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
     def _predict(
         self, memory: Hypotheses, measurement: Measurement, between: Array, factors: Factors
     ) -> tuple[Array, Array, Array]:
-        """Return the mean, covariance and probability predicted under each of the four hypotheses."""
         xp, task, prior, common = self.xp, self.task, self.prior, self.task.common
         number = xp.astype(measurement.number, memory.means.dtype)
         # Half a step further, or rounding would choose the measurement at which the time is over.

@@ -1,8 +1,8 @@
 r"""The filter of TightlyCoupledNavigation inside the learned estimator ``kalman-net``, which a recurrent network
 steers.
 
-One extended Kalman filter with Singer's model of the manoeuvre, in place of the paper's three hypotheses on the motion.
-At every measurement the network outputs numbers in [-1, 1]:
+One extended Kalman filter with Singer's model of the manoeuvre, in place of the paper's three hypotheses on the
+motion. At every measurement the network outputs numbers in [-1, 1]:
 
     noise    the groups of sensors, accelerometers that repeat themselves, and outliers of ranges and rates, as under
              control ``robust`` at its full range
@@ -11,9 +11,8 @@ At every measurement the network outputs numbers in [-1, 1]:
              k = P h^T / (h P h^T + g r),  P -= k u^T + u k^T,  u = P h^T - k (h P h^T + r) / 2         (Joseph form)
 
 All zero is the policy ``singer``, the paper's third hypothesis alone, except for the state that steers the tracking
-loops where there are apertures: for ``singer`` it is predicted by all three hypotheses, here by this filter. In place
-of the paper's hypotheses of rest, constant velocity and manoeuvre the network sets the noise of the motion. References
-and reading are in ``maneuvering_target/kalman_net.py``.
+loops where there are apertures: for ``singer`` it is predicted by all three hypotheses, here by this filter.
+References and reading are in ``maneuvering_target/kalman_net.py``.
 """
 
 import math

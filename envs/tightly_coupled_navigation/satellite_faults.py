@@ -1,11 +1,10 @@
 r"""A bank over faults of one pseudorange: a filter of healthy satellites, and one for a fault of each satellite.
 
-Every member is a whole :class:`.FaultHypotheses`. In member j the error of pseudorange j may jump rarely and then walks
-at random, so that this pseudorange gives little information on the position from the start on, and a slowly growing
-fault cannot bias the estimate before it is detected (solution separation: R. G. Brown and P. W. McBurney,
-Self-contained GPS integrity check using maximum solution separation, Navigation 35, 1988). At most one pseudorange is
-wrong. Faults begin at a rate h, of all satellites together, and last. With weights w0 of no fault and wj of that of
-satellite j,
+Every member is a whole :class:`.FaultHypotheses`. In member j the error of pseudorange j may jump rarely and then
+walks at random, so that a slowly growing fault cannot bias its estimate before it is detected (solution separation: R.
+G. Brown and P. W. McBurney, Self-contained GPS integrity check using maximum solution separation, Navigation 35,
+1988). At most one pseudorange is wrong. Faults begin at a rate h, of all satellites together, and last. With weights
+w0 of no fault and wj of that of satellite j,
 
     w0' = (1 - h T) w0,    wj' = wj + h T w0 / S,
 

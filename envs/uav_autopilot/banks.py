@@ -262,7 +262,6 @@ class _KalmanBank(AutopilotBank):
         raise NotImplementedError
 
     def sensor_variances(self, action: Array) -> Any:
-        """Return each sensor's variance for the update, numbers or ``(m, N)``."""
         return self.task.sensor_variances
 
     def autopilot_estimate(

@@ -1,18 +1,17 @@
 r"""The learned estimator ``kalman-net`` of UavAutopilot: a recurrent network sets noises and gain of the filter.
 
-This is the Kalman filter of the paper with two covariances: P of its errors, and M, from which the gain is computed. At
-every measurement the network returns numbers in [-1, 1]: a_l for each part l of the process noise (the part that the
-level of the disturbance multiplies, and the rest), a_i for each sensor i, then b_l and b_i like them:
+This is the Kalman filter of the paper with two covariances: P of its errors, and M, from which the gain is computed.
+At every measurement the network returns numbers in [-1, 1]: a_l for each part l of the process noise (the part that
+the level of the disturbance multiplies, and the rest), a_i for each sensor i, then b_l and b_i like them:
 
     noise    Q_l = 10^(process_decades a_l) Q_l,  R_i = 10^(2 sensor_decades a_i) R_i,  P' = F P F^T + sum_l Q_l
     gain     M' = F M F^T + sum_l agility^(2 b_l) Q_l,  K = M' H^T (H M' H^T + diag(caution^(2 b_i) R_i))^-1,
              M = (I - K H) M'
     update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
 
-All zero is the paper's filter: M is P. The column of K of a sensor in a dropout is zero. The autopilot uses x.
-M follows the Riccati equation of noises between limits, so that the filter is stable for any output; with P in place
-of M it is not. References and reading are in ``maneuvering_target/kalman_net.py``. The network does not change the
-dynamics, because they are known here.
+All zero is the paper's filter: M is P. The column of K of a sensor in a dropout is zero. The autopilot uses x. M
+follows the Riccati equation of noises between limits, so that the filter is stable for any output; with P in place of
+M it is not. References and reading are in ``maneuvering_target/kalman_net.py``.
 """
 
 import math
