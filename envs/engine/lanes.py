@@ -7,7 +7,8 @@ classes and the evaluation use :class:`Lanes`.
 kernels by the width, and widths that are multiples of eight agree. So lane i of N equals the single
 environment with the same seed bit for bit.
 
-**Steppers.** A compiled model whose report can be traced has a :class:`~.stepper.Stepper`, any other a :class:`ModelStepper`.
+**Steppers.** A compiled model whose report can be traced has a :class:`~.stepper.Stepper`, any other a
+:class:`ModelStepper`.
 """
 
 from collections.abc import Callable, Sequence
