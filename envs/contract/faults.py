@@ -82,7 +82,7 @@ class Disturbance(ABC):
         """
         return None
 
-    def complete(self, state: Any, draws: Draws) -> Any:
+    def draw_further(self, state: Any, draws: Draws) -> Any:
         """Return the state of :meth:`begin` with the quantities added that only some scenarios draw.
 
         They come after the draws of all scenarios, so that the other scenarios use the same numbers as without them.
@@ -170,9 +170,9 @@ class Disturbances:
             used += part.initial_normals
         return self._draw(lambda part: part.begin(draws, shares[part.name], zero))
 
-    def complete(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
+    def draw_further(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
         """Return the states with the quantities added that only some scenarios draw."""
-        return self._draw(lambda part: part.complete(states[part.name], draws))
+        return self._draw(lambda part: part.draw_further(states[part.name], draws))
 
     def _draw(self, draw: Callable[[Disturbance], Any]) -> dict[str, Any]:
         states = {part.name: draw(part) for part in self.drawn}
@@ -257,12 +257,12 @@ class Outliers(Disturbance):
 
     def __init__(self, task: TaskBase) -> None:
         super().__init__(task)
-        self.probability, self.factor = self.limits(self.parameters)
+        self.probability, self.factor = self.probability_and_factor(self.parameters)
         self.row_uniforms = 1 if self.probability else 0
 
     @staticmethod
     @abstractmethod
-    def limits(parameters: Any) -> tuple[float, float]:
+    def probability_and_factor(parameters: Any) -> tuple[float, float]:
         """Return the probability of an outlier and the factor on its standard deviation, from the parameters."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
@@ -288,7 +288,7 @@ class Glint(Outliers):
         return bool(parameters.glint_probability > 0.0)
 
     @staticmethod
-    def limits(parameters: Any) -> tuple[float, float]:
+    def probability_and_factor(parameters: Any) -> tuple[float, float]:
         """Return the probability and the factor of glint, from the parameters."""
         return parameters.glint_probability, parameters.glint_factor
 
@@ -358,10 +358,10 @@ class ColouredErrors(Disturbance):
         """Draw the stationary standard deviation and the correlation time, s, each ``(N,)`` or ``(n, N)``."""
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> tuple[Array, Array]:
-        """Return the normal numbers and zeros from which :meth:`complete` makes the initial errors."""
+        """Return the normal numbers and zeros from which :meth:`draw_further` makes the initial errors."""
         return normals, zero
 
-    def complete(self, state: tuple[Array, Array], draws: Draws) -> ColouredErrorsState:
+    def draw_further(self, state: tuple[Array, Array], draws: Draws) -> ColouredErrorsState:
         """Return the state with drawn deviation and correlation time; the errors are stationary from the start."""
         normals, zero = state
         deviation, lasting = self.draw(draws, zero)

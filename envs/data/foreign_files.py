@@ -61,7 +61,7 @@ def limits() -> ReadingLimits:
     return ReadingLimits(int(found[0] * 1e6), found[1])
 
 
-def refuse_memory(what: str) -> ValueError:
+def memory_limit_error(what: str) -> ValueError:
     """Return a ValueError for a file whose part ``what`` needs more memory than the limit."""
     most = limits().memory / 1e6
     return ValueError(
@@ -131,7 +131,7 @@ def parse_json(content: bytes) -> Any:
     text = (3 if content.isascii() else 6) * len(content)
     most = text + BYTES_OF_VALUE * values + BYTES_OF_CONTAINER * openings
     if most > limits().memory:
-        raise refuse_memory(f"it holds {values:,} values, up to {most / 1e6:,.0f} MB")
+        raise memory_limit_error(f"it holds {values:,} values, up to {most / 1e6:,.0f} MB")
     try:
         return json.loads(content)
     except RecursionError:
@@ -235,7 +235,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
     if head is None:
         raise _explain_end(code, seconds)
     if "memory" in head:
-        raise refuse_memory(head["memory"])
+        raise memory_limit_error(head["memory"])
     if "missing" in head:
         raise ValueError(f"it needs one more package: {extra}")
     if "error" in head:
@@ -245,7 +245,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
 
 def _explain_end(code: int, seconds: float) -> ValueError:
     if code == 3:
-        return refuse_memory("its parser needs more memory")
+        return memory_limit_error("its parser needs more memory")
     if -code in (9, 24):  # SIGKILL, SIGXCPU
         return ValueError(
             f"reading it took more than {seconds:.0f} s: it is damaged, or set {SECONDS}={4 * seconds:.0f} (s) if you "

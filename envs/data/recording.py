@@ -426,10 +426,10 @@ def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[
     for one in kept:
         alone = len(one.names) == 1
         names += [one.name] if alone else [f"{one.name}: {episode}" for episode in one.names]
-    return side_by_side(kept, names=tuple(names), name=name, source=name, notes=tuple(lines))
+    return stack_recordings(kept, names=tuple(names), name=name, source=name, notes=tuple(lines))
 
 
-def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
+def stack_recordings(recordings: Sequence[Recording], **fields: Any) -> Recording:
     """Join recordings into one that has all their episodes, padded to the same length.
 
     The truth is known where all have one. ``fields`` are those of the result that differ from the first recording's.

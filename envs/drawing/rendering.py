@@ -481,7 +481,7 @@ class EpisodePictures:
         """Start new episodes in some lanes (parallel episodes) of the pictures, after their first measurement."""
         for i, picture in enumerate(self.pictures):
             if i in lanes:
-                picture.begin(_alone(state, i))
+                picture.begin(_single_lane(state, i))
 
     def keep(self, state: Any, actions: numpy.ndarray, observations: numpy.ndarray) -> None:
         """Append a measurement, actions and the observations before them to the histories of the pictures.
@@ -489,11 +489,11 @@ class EpisodePictures:
         ``state`` is that of all episodes after the actions; ``observations``, ``(count, fields)``, are before them.
         """
         for i, picture in enumerate(self.pictures):
-            picture.keep(_alone(state, i), actions[i], observations[i].copy())
+            picture.keep(_single_lane(state, i), actions[i], observations[i].copy())
 
     def frames(self, state: Any) -> tuple[numpy.ndarray, ...]:
         """Return an image for each episode, ``(height, width, 3)``, the same blank one beyond the first few."""
-        drawn = [picture.frame(_alone(state, i)) for i, picture in enumerate(self.pictures)]
+        drawn = [picture.frame(_single_lane(state, i)) for i, picture in enumerate(self.pictures)]
         return (*drawn, *[numpy.full_like(drawn[0], 255)] * (self.count - len(drawn)))
 
     def close(self) -> None:
@@ -502,7 +502,7 @@ class EpisodePictures:
             picture.close()
 
 
-def _alone(state: Any, lane: int) -> Any:
+def _single_lane(state: Any, lane: int) -> Any:
     """Return the episode of one lane (parallel episode) on the CPU, padded with copies, for a picture."""
     return map_arrays(lambda values: host_array(values)[..., [lane] * round_up_lanes(1)], state)
 

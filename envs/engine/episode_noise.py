@@ -115,7 +115,7 @@ class EpisodeNoise:
         generators = self.generators
         return numpy.concatenate([draw_identity(generators[lane]) for lane in lanes]).reshape(-1, 2).T
 
-    def put(self, identities: numpy.ndarray) -> None:
+    def set_identities(self, identities: numpy.ndarray) -> None:
         """Set new episodes with these identities, ``(2, lanes)``, into the first lanes; the others are padding."""
         self.identities[:, : identities.shape[1]] = identities
         self.identities[:, identities.shape[1] :] = 0
@@ -123,7 +123,7 @@ class EpisodeNoise:
         self._ahead, self._row, self._due = None, None, False
 
     def start_call(self, memory: numpy.ndarray) -> Call:
-        """Return the native call that writes the random numbers of the episodes' start, after :meth:`put`.
+        """Return the native call that writes the random numbers of the episodes' start, after :meth:`set_identities`.
 
         They are written to ``memory``, ``(initial_normals + uniforms, width)``.
         """
@@ -144,7 +144,7 @@ class EpisodeNoise:
         self.start_call(memory)(0, self.width)
         return memory[normals:], memory[:normals]
 
-    def take(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:
+    def replace_episodes(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:
         """Replace the episodes in some lanes by the first episodes of another :class:`EpisodeNoise`."""
         self.identities[:, lanes] = other.identities[:, : len(lanes)]
         self.measurement[lanes] = other.measurement[: len(lanes)]
@@ -167,7 +167,7 @@ class EpisodeNoise:
             self._row = row if task.xp is numpy else task.xp.asarray(row, device=task.device)
         return self._row
 
-    def call_of_each(self) -> Call:
+    def next_measurement_call(self) -> Call:
         """Return the native call that advances to the next measurement and writes its numbers at :attr:`address`.
 
         It is for native code over several measurements, which runs it at least once.
@@ -179,7 +179,7 @@ class EpisodeNoise:
 
     @property
     def address(self) -> int:
-        """Address of the memory into which :meth:`call_of_each` writes."""
+        """Address of the memory into which :meth:`next_measurement_call` writes."""
         return address_of(self._next_call().arrays[2])
 
     def _copied_from_code(self) -> numpy.ndarray:

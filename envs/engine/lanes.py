@@ -130,7 +130,7 @@ class ModelStepper:
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()
     ) -> tuple[Array, Array]:
         """Start new episodes in all lanes up to the first measurement; return the uniform and normal numbers used."""
-        noise.put(identities)
+        noise.set_identities(identities)
         start = self._start(noise)
         for each in (self, *others):
             each.load(each.model.measure(each.model.begin(*start), noise.row))
@@ -153,7 +153,7 @@ class ModelStepper:
         others: "Sequence[ModelStepper]" = (),
     ) -> tuple[Array, Array]:
         """Start new episodes in some lanes up to the first measurement; return the uniform and normal numbers used."""
-        noise.put(identities)
+        noise.set_identities(identities)
         start = self._start(noise)
         for each in (self, *others):
             task = each.model.task
@@ -309,7 +309,7 @@ class Lanes:
         else:
             noise = self._noise_of_some(len(index))
             start = own.begin_some(index, identities, noise, baseline)
-            self.noise.take(noise, index)
+            self.noise.replace_episodes(noise, index)
         self.decisions[index] = 0
         if task.flights:
             lengths = task.lengths(host_array(start[0])[:, : identities.shape[1]]) // task.decision_interval

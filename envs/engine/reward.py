@@ -112,8 +112,8 @@ REWARD_FUNCTIONS: dict[str, Callable[[Model, Any], Array]] = {
     "log-relative": log_cost_reward,
     "none": no_reward,
 }
-"""Functions of a model and its episodes. Where there is a :func:`reference`, its reward is subtracted later. "none" is
-for recordings without truth."""
+"""Functions of a model and its episodes. The reward of a :func:`reward_baseline` is subtracted later. "none" is for
+recordings without truth."""
 REWARDS = tuple(kind for kind in REWARD_FUNCTIONS if kind != "none")
 """Kinds of reward that a user can choose."""
 
@@ -127,7 +127,7 @@ class RewardBaseline(NamedTuple):
     """Action of the baseline in every decision, an element of the control's space."""
 
 
-def reference(kind: str, model: Model) -> RewardBaseline | None:
+def reward_baseline(kind: str, model: Model) -> RewardBaseline | None:
     """Return the :class:`RewardBaseline` of a kind of reward for an agent's model; None if it is not relative."""
     if kind == "relative":
         paper = model.task.paper_policy

@@ -140,7 +140,7 @@ class Rollout:
         self._states[0][...] = numpy.concatenate(values)
         self._flown = 0
 
-    def go_on(self) -> None:
+    def drop_stored(self) -> None:
         """Delete the stored measurements; the episodes continue."""
         self._states[0][...] = self._states[self._flown]
         self._flown = 0

@@ -187,7 +187,7 @@ class Stepper:
             Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)``, valid until the next start.
         """
         self._policy_memory = None
-        noise.put(identities)
+        noise.set_identities(identities)
         self._run_bound(False, noise, others)
         return self._drawn
 
@@ -208,7 +208,7 @@ class Stepper:
         return _bound(draw, sequences, shown)
 
     def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
-        draw = noise.call_of_each()
+        draw = noise.next_measurement_call()
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
         now, bound = self._now, self._bound.get(whole)
@@ -289,7 +289,7 @@ class Stepper:
             for now, turn in enumerate(turns):
                 turn += each._bound_copies(now, noise, each.reported, moving)
         passing = self._tiled(turns, others)
-        passing += self._let_pass(turns, noise, others) if self.width > self._together else []
+        passing += self._bind_temporaries(turns, noise, others) if self.width > self._together else []
         shown = [turn[len(self._calls[0])] for turn in turns]
         if self._passing is not None:
             moving += [moving_array(call, len(call.arrays) - 1, self._passing) for call in shown]
@@ -300,7 +300,7 @@ class Stepper:
         ]
         return _bound(draw, sequences, [shown, shown] if interval > 1 else [shown[:1], shown[1:]])
 
-    def _let_pass(
+    def _bind_temporaries(
         self, turns: Sequence[Sequence[Call]], noise: EpisodeNoise, others: "Sequence[Stepper]"
     ) -> list[tuple[Call, int, int]]:
         """Bind the temporary values of calls to memory of one tile of lanes; return where they are bound.
@@ -308,7 +308,7 @@ class Stepper:
         Temporary are the noise, and the filters between update and prediction. The result is ``passing`` of
         :class:`.CallSequence`.
         """
-        row = noise.call_of_each().arrays[2]
+        row = noise.next_measurement_call().arrays[2]
         places = {
             id(array): empty_lanes(array.shape[:-1], self._together)
             for each in (self, *others)
@@ -363,7 +363,7 @@ class Stepper:
         memories[0] = self._policy_memory or memories[0]
         if compiled_policy is not None:
             actions = empty_lanes((steps, *self.action.shape[:-1]), self.width)
-        draw = noise.call_of_each()
+        draw = noise.next_measurement_call()
         turns: list[list[Call]] = []
         moving: list[Moving] = []
         for now in (self._now, 1 - self._now):

@@ -18,7 +18,7 @@ from ..contract.model import Model
 from ..contract.observation import Array
 from ..data.recording import Recording
 from ..engine.lanes import Lanes
-from ..engine.reward import REWARD_FUNCTIONS, reference
+from ..engine.reward import REWARD_FUNCTIONS, reward_baseline
 from .specification import plain
 
 ROOM = 8
@@ -153,7 +153,7 @@ class Fleet:
         return most if self._longest is None else min(most, self._longest)
 
     def _make_lanes(self, model: Model, count: int) -> Lanes:
-        beside, report = reference(self._kind, model), REWARD_FUNCTIONS[self._kind]
+        beside, report = reward_baseline(self._kind, model), REWARD_FUNCTIONS[self._kind]
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
@@ -209,7 +209,7 @@ class Fleet:
             self.whole.restart(lanes)
             return
         if self.whole is not None:
-            self._leave(self.whole)
+            self._split_tasks(self.whole)
         self._sent = False
         chosen = list(range(self.count) if lanes is None else lanes)
         self._part[chosen] = -1
@@ -234,7 +234,7 @@ class Fleet:
             part.restart(free)
         self._arrange()
 
-    def _leave(self, whole: Lanes) -> None:
+    def _split_tasks(self, whole: Lanes) -> None:
         """Switch from the lanes of a single task to those of several tasks; running episodes continue."""
         self.whole = None
         if whole.has_episodes:

@@ -517,7 +517,7 @@ class Equations:
             return self._H[:, :, None]
         return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))
 
-    def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
+    def predict_moments(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
         """Return mean and covariance predicted to the next measurement, without process noise."""
         F = self.transition_matrix(mean, passed)
         carried = product(product(F, covariance), transpose(F))

@@ -133,7 +133,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
         """Return the state predicted to a measurement, with innovation statistics under the last action."""
-        mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
+        mean, carried = self.equations.predict_moments(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def compare(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
@@ -311,7 +311,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
     def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
         """Return the state predicted with the last action's offset, with innovation statistics."""
-        mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
+        mean, carried = self.equations.predict_moments(state.mean, state.covariance, measurement)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
@@ -438,7 +438,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         means, covariances = imm.mix(self._align(state.means), state.covariances, chain.mixing)
         updates = []
         for j, equations in enumerate(self.task.filter_equations):
-            mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
+            mean, carried = equations.predict_moments(means[:, j], covariances[:, :, j], measurement)
             P = carried + self.factor * equations.process_noise(mean, measurement, self.of_sources)
             R = equations.sensor_noise(mean, measurement, *self.sensor_factors)
             received = equations.receive(measurement, mean, R)

@@ -19,11 +19,11 @@ from ..data.clock import SINCE_1970, time_unit
 from ..data.foreign_files import (
     MOST_NUMBERS,
     limits,
+    memory_limit_error,
     open_foreign,
     parse_apart,
     parse_json,
     read_content,
-    refuse_memory,
 )
 from ..data.foreign_parsers import MOST_COLUMNS, check_cells, check_column_names, check_rows
 from .receiver_logs import RECEIVER_READERS, receiver_columns
@@ -283,7 +283,7 @@ def _json(file: Path, known: ColumnNames) -> FlightTable:
     with open_foreign(file, limits().memory) as content:
         text = (gzip.GzipFile(fileobj=content) if file.suffix == ".gz" else content).read(most + 1)
     if len(text) > most:
-        raise refuse_memory(f"its text has more than {most / 1e6:,.0f} MB")
+        raise memory_limit_error(f"its text has more than {most / 1e6:,.0f} MB")
     rows = parse_json(text)
     # A list of rows, or columns, each with the numbers of its rows.
     parts = list(rows.values()) if isinstance(rows, dict) else rows

@@ -19,7 +19,7 @@ from ..contract.live_input import LARGEST
 from ..contract.log_format import RECORDING, TIME, TRUTH, LogFormat, TrackLog, check_deviations
 from ..contract.task import Component, Task
 from ..data.recorded_world import measure_once
-from ..data.recording import Recording, side_by_side
+from ..data.recording import Recording, stack_recordings
 from .flight_tables import (
     COLUMNS,
     FLIGHT_SUFFIXES,
@@ -527,7 +527,7 @@ def _side_by_side(
                 origin={} if own.origin is None else own.origin._asdict(),
             )
         )
-    return side_by_side(recordings, notes=tuple(limit_notes(notes)))
+    return stack_recordings(recordings, notes=tuple(limit_notes(notes)))
 
 
 def _true_columns(task: Task, columns: Columns) -> list[str]:

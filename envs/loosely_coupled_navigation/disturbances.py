@@ -44,7 +44,7 @@ def _within(window: str, phrase: str) -> Cause:
     return Cause(window, phrase, holds)
 
 
-def number_at(time: Array, parameters: LooselyCoupledNavigationParameters) -> Array:
+def measurement_number(time: Array, parameters: LooselyCoupledNavigationParameters) -> Array:
     """Return the number of the measurement nearest to a time in s."""
     return namespace(time).round(time / parameters.sampling_interval)
 
@@ -75,7 +75,7 @@ class NoiseChanges(Disturbance):
         xp, p = self.xp, self.parameters
         factor = draws.log_uniform("receiver_factor", p.receiver_factor)
         changes = draws.integer("noise_changes", p.noise_changes)
-        first, second = number_at(draws.uniform("change_start", p.change_start, 2), p)
+        first, second = measurement_number(draws.uniform("change_start", p.change_start, 2), p)
         factors = [factor, *draws.log_uniform("changed_receiver_factor", p.receiver_factor, 2)]
         unreported = draws.event("unreported", p.unreported, 2)
         both = changes == 2
@@ -175,8 +175,8 @@ class _Once(Disturbance):
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Spell:
         xp, p = self.xp, self.parameters
         happens = draws.event(self.name, self.probability)
-        first = number_at(draws.uniform(f"{self.name}_start", self.start), p)
-        beyond = first + number_at(draws.uniform(f"{self.name}_duration", self.duration), p)
+        first = measurement_number(draws.uniform(f"{self.name}_start", self.start), p)
+        beyond = first + measurement_number(draws.uniform(f"{self.name}_duration", self.duration), p)
         window = xp.stack([xp.where(happens, first, NEVER), xp.where(happens, beyond, NEVER)])
         return Spell(window, zero, zero)
 
@@ -218,7 +218,7 @@ class Jamming(_Hidden):
     name = "jamming"
     causes: ClassVar[tuple[Cause, ...]] = (_within("jamming", "under jamming"),)
 
-    def complete(self, state: Spell, draws: Draws) -> Spell:
+    def draw_further(self, state: Spell, draws: Draws) -> Spell:
         """Return the state with the jamming's drawn factor on the standard deviation."""
         factor = draw_between(draws.log_uniform, "jamming_factor", self.parameters.jamming_factor)
         return state._replace(strength=self.xp.sqrt(state.strength + factor))
@@ -241,19 +241,19 @@ class Spoofing(_Hidden):
     name = "spoofing"
     causes: ClassVar[tuple[Cause, ...]] = (_within("spoofing", "under spoofing"),)
 
-    def complete(self, state: Spell, draws: Draws) -> Spell:
+    def draw_further(self, state: Spell, draws: Draws) -> Spell:
         """Return the state with the spoofing's drawn drift rate, m/s."""
         rate = draw_between(draws.uniform, "spoofing_rate", self.parameters.spoofing_rate)
         return state._replace(strength=state.strength + rate)
 
-    def pull(self, state: Spell) -> Array:
+    def fix_error(self, state: Spell) -> Array:
         """Return the error of the spoofed fix on every axis at this measurement, m, ``(N,)``."""
         run = (state.strength * self.parameters.sampling_interval) * (state.number - state.window[0] + 1.0)
         return self.xp.where(is_within(state.number, state.window), run, 0.0)
 
     def change_reading(self, state: Spell, reading: Array) -> tuple[Spell, Array]:
         """Return the state, and the fix with the spoofing error added."""
-        return state, reading + self.pull(state) if self.probability else reading
+        return state, reading + self.fix_error(state) if self.probability else reading
 
     def context(self, state: Spell) -> dict[str, Array]:
         """Return the window of the spoofing and its drift rate, m/s, by name."""
@@ -267,7 +267,7 @@ class ReceiverOutliers(Outliers):
     causes: ClassVar[tuple[Cause, ...]] = (OUTLIER,)
 
     @staticmethod
-    def limits(parameters: LooselyCoupledNavigationParameters) -> tuple[float, float]:
+    def probability_and_factor(parameters: LooselyCoupledNavigationParameters) -> tuple[float, float]:
         """Return the probability of an outlier and the factor on its standard deviation."""
         return parameters.outlier_probability, math.sqrt(parameters.outlier_factor)
 

@@ -189,7 +189,9 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         """Return the duration so far of each hypothesis' spoofing, s, ``(B, N)``; onsets lie midway between two."""
         return self.interval * (self.since_onset(number) + 0.5 * (self.spacing + 1))
 
-    def change(self, free: Hypotheses, pulled: Hypotheses, number: Array) -> tuple[Hypotheses, Hypotheses]:
+    def switch_spoofing(
+        self, free: Hypotheses, pulled: Hypotheses, number: Array
+    ) -> tuple[Hypotheses, Hypotheses]:
         """Return the hypotheses with spoofing ended and begun at a measurement, by their hazards."""
         xp, prior, T = self.xp, self.prior, self.interval
         since, age = self.since_onset(number), self.age(number)
@@ -241,7 +243,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
     def predict(self, state: FaultState, measurement: Measurement) -> FaultState:
         """Return the state predicted to a measurement, after spoofing may have begun or ended."""
         memory = state.memory
-        free, pulled = self.change(memory.free, memory.pulled, measurement.number)
+        free, pulled = self.switch_spoofing(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
         changing = 1.0 - _exponential(-self.prior.level_rate * self.interval)
         chain = (1.0 - changing) * memory.levels + changing * self.uniform
@@ -287,7 +289,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
             weighing = self.weigh(predicted, measurement)
         else:
             predicted, weighing = self.apply_factors(predicted, measurement, inputs.action)
-        return self.take(predicted, measurement, weighing)
+        return self.posterior_state(predicted, measurement, weighing)
 
     def likelihood(self, weighing: Weighing, measurement: Measurement) -> Likelihood:
         """Return the likelihood of a fix under its prediction; NaN where there is none."""
@@ -343,8 +345,8 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
             self.weigh_part(pulled, xp.stack([xp.ones_like(age), age]), fix, there, levels, q),
         ]
         expected, innovations, directions, noises = zip(*parts, strict=True)
-        before = self.join([free.weights, pulled.weights], 0)
-        log_weights = self.join(
+        before = self.join_groups([free.weights, pulled.weights], 0)
+        log_weights = self.join_groups(
             [
                 imm.log_probabilities(part.weights) + xp.where(there, noise.log_density, 0.0)
                 for part, noise in zip((free, pulled), noises, strict=True)
@@ -354,16 +356,16 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         log_weights = log_weights + evidence
         log_likelihood = imm.log_sum(log_weights)
         weights = xp.exp(log_weights - log_likelihood)
-        posterior = weighted_sum(weights, self.join([noise.responsibilities for noise in noises], 1))
+        posterior = weighted_sum(weights, self.join_groups([noise.responsibilities for noise in noises], 1))
         if prior.outlier:
             posterior = posterior[:-1] + posterior[-1] * chain
-        innovation = weighted_sum(before, self.join(innovations, 1))
-        own = weighted_sum(before, self.join([along.variance for along in directions], 0))
+        innovation = weighted_sum(before, self.join_groups(innovations, 1))
+        own = weighted_sum(before, self.join_groups([along.variance for along in directions], 0))
         return Weighing(
             log_likelihood,
             weights,
             xp.where(there, posterior, chain),
-            weighted_sum(before, self.join(expected, 1)),
+            weighted_sum(before, self.join_groups(expected, 1)),
             own,
             ordered_sum(innovation * innovation) / (own + white),
             innovations,
@@ -398,7 +400,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         )
         return expected, innovation, along, noise
 
-    def take(self, predicted: Memory, measurement: Measurement, weighing: Weighing) -> FaultState:
+    def posterior_state(self, predicted: Memory, measurement: Measurement, weighing: Weighing) -> FaultState:
         """Return the state after the update of predicted hypotheses with their posterior weights."""
         xp = self.xp
         there = measurement.available > 0.0
@@ -416,9 +418,11 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
                 strict=True,
             )
         )
-        weights, delta = weighing.weights, self.join([free.mean[0], pulled.mean[0]], 1)
+        weights, delta = weighing.weights, self.join_groups([free.mean[0], pulled.mean[0]], 1)
         mean = weighted_sum(weights, delta)
-        own = weighted_sum(weights, self.join([each.covariance.ins.position for each in (free, pulled)], 0))
+        own = weighted_sum(
+            weights, self.join_groups([each.covariance.ins.position for each in (free, pulled)], 0)
+        )
         offsets = delta - mean[:, None]
         spread = weighted_sum(weights, offsets[:, None] * offsets[None])
         memory = Memory(free, pulled, weighing.levels, predicted.reported)
@@ -442,7 +446,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         mean = xp.concat([xp.stack(moved), h.mean[3:] + along.faults[:, None] * push])
         return Hypotheses(mean, faults.update_fault(h.covariance, along, weight), h.weights)
 
-    def join(self, values: Sequence[Array], before: int) -> Array:
+    def join_groups(self, values: Sequence[Array], before: int) -> Array:
         """Return values of both groups of hypotheses as one array ``(..., H, N)``, with ``before`` leading axes."""
         return self.xp.concat(
             [self.xp.reshape(each, (*each.shape[:before], -1, each.shape[-1])) for each in values],

@@ -102,7 +102,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         """Return the bank's state at the start of the track, from the initial estimate."""
         own, zero = self.own.start(initial), 0.0 * initial.mean
         memory, none = own.memory, zero[0]
-        weights = self.own.join([memory.free.weights, memory.pulled.weights], 0)
+        weights = self.own.join_groups([memory.free.weights, memory.pulled.weights], 0)
         groups = self.group(weights, self.own.age(none))
         return HypothesesState(
             own=own,
@@ -135,7 +135,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
         """Return the state with innovations, and the probabilities before and after the fix, filled in."""
         bank, predicted, p = self.own, state.own.memory, result.weights
         age = bank.age(measurement.number)
-        weights = bank.join([predicted.free.weights, predicted.pulled.weights], 0)
+        weights = bank.join_groups([predicted.free.weights, predicted.pulled.weights], 0)
         expected = measurement.ins - result.expected
         return state._replace(
             likelihood=bank.likelihood(result, measurement),

@@ -131,7 +131,7 @@ def inertial_recording(
     seconds = T * numpy.broadcast_to(numpy.arange(1.0, K + 2.0), (len(starts), K + 1))
     return Recording(
         environment=TASK.id,
-        measurements=measurements_beside(
+        measurements=paired_measurements(
             ins, tangent_plane(positions, origin).T, deviations, rows[at[:, 1:]]
         ),
         initial={"mean": ins[:, 0], "covariance": numpy.zeros((len(starts), 2, 2))},
@@ -148,7 +148,7 @@ def inertial_recording(
     )
 
 
-def measurements_beside(
+def paired_measurements(
     ins: numpy.ndarray, fixes: numpy.ndarray, deviations: numpy.ndarray, rows: numpy.ndarray
 ) -> dict[str, numpy.ndarray]:
     """Return the arrays of a ``Measurement`` by name, from INS positions and the fixes at the same times.

@@ -105,7 +105,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         states = self.disturbances.begin(draws, normals[2 * p.axes :], zeros[0])
         harmonics, turn = self._motion(draws, zeros)
         reference = ordered_sum(harmonics[0])
-        states = self.disturbances.switch_off(self.disturbances.complete(states, draws), calm)
+        states = self.disturbances.switch_off(self.disturbances.draw_further(states, draws), calm)
         truth = Truth(
             number=zeros[0],
             reference=reference,

@@ -55,7 +55,9 @@ class Course(ABC):
         """
         return self.advance(flight, scan - early, before)
 
-    def carry(self, flight: Any, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
+    def propagate_deviation(
+        self, flight: Any, scan: Array, early: tuple[Array, Array] | None, velocity: Array
+    ) -> Motion:
         """Return the deviations of position and velocity at a scan caused by a velocity deviation at the previous scan.
 
         A coordinated turn rotates the deviation, thrust does not. By default, without known turn rates, it is not
@@ -73,7 +75,7 @@ class Course(ABC):
         return {}
 
 
-def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
+def motion_in_turn(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
     """Return the motion after a time (s) of a coordinated turn at constant speed; ``turn`` in rad/s, zero: straight."""
     state = coordinated_turn.propagate(task.xp.concat([*motion, turn[None]]), time)
     return state[:2], state[2:4]
@@ -131,23 +133,23 @@ class Maneuvered(Course):
             self._pick(flight, flight.turn, scan) / T,
             self._pick(flight, flight.acceleration, scan),
         )
-        position, velocity = after(time, turn, before, self.task)
+        position, velocity = motion_in_turn(time, turn, before, self.task)
         return position + (0.5 * time * time) * acceleration, velocity + time * acceleration
 
-    def carry(
+    def propagate_deviation(
         self, flight: Maneuvers, scan: Array, early: tuple[Array, Array] | None, velocity: Array
     ) -> Motion:
         """Return the deviations at a scan that a velocity deviation causes, rotated at the turn rates until then."""
         if not self.turns:
-            return super().carry(flight, scan, early, velocity)
+            return super().propagate_deviation(flight, scan, early, velocity)
         nowhere = 0.0 * velocity
         if early is None:
             still = flight._replace(effect=self._without_thrust(flight.effect))
             return self.advance(still, scan, (nowhere, velocity))
         T, (before, now) = self.parameters.sampling_interval, early
         rates = [self._pick(flight, flight.turn, number) / T for number in (scan - 1.0, scan)]
-        motion = after(T * before, rates[0], (nowhere, velocity), self.task)
-        return after(T * (1.0 - now), rates[1], motion, self.task)
+        motion = motion_in_turn(T * before, rates[0], (nowhere, velocity), self.task)
+        return motion_in_turn(T * (1.0 - now), rates[1], motion, self.task)
 
     def _without_thrust(self, effect: Array) -> Array:
         return self.xp.concat([effect[:4], 0.0 * effect[4:]])
@@ -328,7 +330,7 @@ class LegCourse(Course):
             turn = (math.radians(rate) * side) * ones
             flown = duration * draws.uniform(f"leg_{i}", (1.0 - p.leg_spread, 1.0 + p.leg_spread))
             begins.append(xp.concat([xp.stack([time, turn]), position, velocity]))
-            position, velocity = after(flown, turn, (position, velocity), self.task)
+            position, velocity = motion_in_turn(flown, turn, (position, velocity), self.task)
             time = time + flown
         begins.append(xp.concat([xp.stack([time, 0.0 * ones]), position, velocity]))
         return Legs(xp.stack(begins)), start
@@ -337,9 +339,11 @@ class LegCourse(Course):
         """Return the motion at a scan, also a fractional one, computed from the legs alone."""
         now = self.parameters.sampling_interval * scan
         leg = StepSignal(flight.begins, flight.time[1:]).at(now, self.xp)
-        return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
+        return motion_in_turn(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
 
-    def carry(self, flight: Legs, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
+    def propagate_deviation(
+        self, flight: Legs, scan: Array, early: tuple[Array, Array] | None, velocity: Array
+    ) -> Motion:
         """Return the deviations at a scan that a velocity deviation causes, rotated and scaled as the velocity is."""
         before, now = early or (0.0, 0.0)
         (position, flown), (there, afterwards) = (

@@ -252,7 +252,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         straight, (thrust, *kinds) = semi_markov.switch(straight, modes)
         return straight, thrust, *([semi_markov.join(kinds)] if kinds else [])
 
-    def fly(
+    def predict_hypotheses(
         self, straight: AgedHypotheses, thrust: AgedHypotheses, *turns: AgedHypotheses, T: Array
     ) -> Tables:
         """Return the hypotheses predicted over an interval (s), each by its kind of motion."""
@@ -278,7 +278,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
     def predict(self, state: SemiMarkovState, measurement: Measurement) -> SemiMarkovState:
         """Return the hypotheses predicted to the scan, after manoeuvres may have begun or ended."""
         switched = self.switch(*(table.unpack() for table in state.track))
-        tables = self.fly(*switched, T=measurement.interval)
+        tables = self.predict_hypotheses(*switched, T=measurement.interval)
         return state._replace(track=tuple(table.pack() for table in tables))
 
     def has_effect(self, measurement: Measurement) -> Array:

@@ -111,7 +111,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         identity = xp.eye(4, dtype=diagonal.dtype, device=diagonal.device)[:, :, None]
         scans = self.scans.begin(draws, (position, velocity))
         states = self.disturbances.begin(draws, normals[4:], 0.0 * ones)
-        states = self.disturbances.complete(states, draws)
+        states = self.disturbances.draw_further(states, draws)
         truth = Truth(0.0 * ones, position, velocity, flight, scans, states)
         return truth, Initial(xp.concat([start, start_velocity]), identity * diagonal)
 

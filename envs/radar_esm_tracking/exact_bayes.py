@@ -327,7 +327,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, SMALLEST_PROBABILITY, None),
             changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], SMALLEST_PROBABILITY, None),
         )
-        moved = self.change(moved, measurement.scan)
+        moved = self.change_class(moved, measurement.scan)
         looked = measurement.looked
         first, later = (
             emitters.predict_silence(table, self.grid, looked) for table in (moved.first, moved.later)
@@ -349,7 +349,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             estimate, covariance = class_fusion.remove_coloured_errors(estimate, covariance)
         return ClassState(estimate, mirror_lower(covariance), memory, likelihood)
 
-    def change(self, m: ClassTracks, scan: Array) -> ClassTracks:
+    def change_class(self, m: ClassTracks, scan: Array) -> ClassTracks:
         """Return the hypotheses after a possible change of class, at one scan of every ``spacing``."""
         xp, prior, B, others = self.xp, self.prior, self.prior.onsets, self.classes - 1
         p, S, n = self.parameters, range(self.classes), self.states

@@ -187,7 +187,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
             radar_kick=wandering.kick,
             radar_correlation=correlation,
             radar_error=(coloured if self.radar_is_coloured else 0.0) * normals[own - 2 : own],
-            disturbances=self.disturbances.complete(
+            disturbances=self.disturbances.draw_further(
                 self.disturbances.begin(draws, normals[own:], zero), draws
             ),
         )

@@ -171,7 +171,7 @@ class NoisyRate(_Hidden):
         """Draw the index of the satellite with a noisy rate, ``(1, N)``."""
         return draws.integer("noisy_satellite", (0, self.satellites - 1))[None]
 
-    def complete(self, state: Fault, draws: Draws) -> Fault:
+    def draw_further(self, state: Fault, draws: Draws) -> Fault:
         """Return the state with the drawn factor on the standard deviation of the satellite's rate."""
         factor = draw_between(draws.log_uniform, "rate_fault_factor", self.parameters.rate_fault_factor)
         return state._replace(own=state.own + factor)
@@ -285,7 +285,7 @@ class Reflections(_OfSatellites):
         none = self.xp.stack([zero] * self.satellites)
         return Reception(zero, cn0, none, none)
 
-    def complete(self, state: Reception, draws: Draws) -> Reception:
+    def draw_further(self, state: Reception, draws: Draws) -> Reception:
         """Return the state with the drawn choice whether the episode is between houses."""
         urban = _draw_share(draws, "urban", self.parameters, state.urban)
         return state._replace(
@@ -350,10 +350,10 @@ class Ramp(_Hidden):
     causes = (Cause("wrong range", f"where a pseudorange is off by more than {PULLED:g} m", _is_pulled),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
-        """Return the state without a ramp, which :meth:`complete` draws."""
+        """Return the state without a ramp, which :meth:`draw_further` draws."""
         return Fault(self.xp.stack([zero - 1.0] * 2), zero[None], self.xp.stack([zero] * 2), zero)
 
-    def complete(self, state: Fault, draws: Draws) -> Fault:
+    def draw_further(self, state: Fault, draws: Draws) -> Fault:
         """Return the state with the drawn start, satellite and initial error of the ramp."""
         xp, p, zero = self.xp, self.parameters, state.now
         if not p.ramp_probability:
@@ -389,10 +389,10 @@ class Aperture(_OfSatellites):
     name = "aperture"
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
-        """Return zeros: the state without an aperture, which :meth:`complete` draws."""
+        """Return zeros: the state without an aperture, which :meth:`draw_further` draws."""
         return zero
 
-    def complete(self, state: Array, draws: Draws) -> Array:
+    def draw_further(self, state: Array, draws: Draws) -> Array:
         """Draw the state: one in episodes whose tracking loops have an aperture, else zero, ``(N,)``."""
         return _draw_share(draws, "aperture", self.parameters, state)
 

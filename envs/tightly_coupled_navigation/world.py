@@ -108,7 +108,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         zeros = xp.zeros_like(normals[0])
         legs, velocity, heading = self.course.begin(draws, zeros)
         states = self.disturbances.begin(draws, normals[gnss_ins.SIZE :], zeros)
-        states = self.disturbances.complete(states, draws)
+        states = self.disturbances.draw_further(states, draws)
         states = self.disturbances.switch_off(states, draw_undisturbed(draws, p))
         between_houses = states["reflections"].urban > 0.0
         velocity = xp.where(between_houses, p.urban_speed * velocity, velocity)

@@ -117,7 +117,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         commands = self._commands(draws, zero)
         levels = draw_steps(draws, "disturbance", p.disturbance_levels, p.disturbance_times, zero)
         states = self.disturbances.begin(draws, normals[size:], zero)
-        states = self.disturbances.complete(states, draws)
+        states = self.disturbances.draw_further(states, draws)
         calm = draw_undisturbed(draws, p)
         if calm is not None:
             levels = levels._replace(values=xp.where(calm, 1.0, levels.values))
