@@ -36,7 +36,7 @@ twice as fast.
 
 
 class ProgramSource(NamedTuple):
-    """C text of a program."""
+    """C text of a program: static functions, statements, and what they need."""
 
     functions: str
     """Tables and static functions, to be placed before the function."""

@@ -76,7 +76,7 @@ def _target(level: int = 1) -> Any:
 
 
 class Setting(NamedTuple):
-    """Settings of code generation; results have the same bits in every setting."""
+    """Settings of code generation, such as optimisation level; results have the same bits under each."""
 
     lanes: int
     """Number of lanes of a block."""

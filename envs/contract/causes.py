@@ -123,7 +123,7 @@ OUTLIER = Cause("outlier", f"on outliers beyond {LARGE_ERROR:g} stated sigma", _
 
 
 class Causes(NamedTuple):
-    """The causes by which an evaluation splits the costs of estimates."""
+    """Companion of a problem: the causes by which an evaluation splits the costs of estimates."""
 
     causes: tuple[Cause, ...] = (MISSED,)
     start: int = 10

@@ -56,7 +56,7 @@ class LostTracks(NamedTuple):
 
 
 class ArrayMeanings(NamedTuple):
-    """Descriptions of a task's arrays, in words for users of another program."""
+    """Descriptions of a task's measurement and feedback arrays, for users of another program."""
 
     measurement: str = ""
     """Meaning of the numbers of a measurement, in a sentence; empty where the names suffice."""

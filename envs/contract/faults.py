@@ -12,7 +12,7 @@ from .task_base import TaskBase
 
 
 class DisturbanceInput(NamedTuple):
-    """Input of a disturbance at one measurement: time and random numbers."""
+    """Input of a disturbance at one measurement, such as time and random numbers."""
 
     number: Array
     """Number of the measurement, from 1 on, ``(N,)``."""
@@ -326,7 +326,7 @@ class GaussMarkov(NamedTuple):
 
 
 class ColouredErrorsState(NamedTuple):
-    """State of :class:`ColouredErrors`."""
+    """State of coloured errors: drawn standard deviation, Gauss-Markov process, current errors."""
 
     deviation: Array
     """Stationary standard deviation, ``(..., N)``."""

@@ -41,7 +41,7 @@ class FlightData(ScenarioData):
 
 
 class Reader(NamedTuple):
-    """Functions that recognise and read one kind of scenario data."""
+    """Functions that recognise and read one kind of scenario data, such as flights."""
 
     takes: Callable[[Any], bool]
     """Function that returns whether a value, not the name of a scenario, names or contains data of this kind."""

@@ -18,7 +18,7 @@ from .reward import REWARD_FUNCTIONS, teacher_reward
 
 
 class TrainingObjective(NamedTuple):
-    """Kind of reward whose gradient is computed."""
+    """Kind of reward whose gradient is computed, and the weight of a teacher's estimates in it."""
 
     kind: str
     """Kind of reward."""

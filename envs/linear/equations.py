@@ -38,7 +38,7 @@ from .sensors import Channel
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceModel:
-    """Equations of a state-space model: f, Q, h and R.
+    """Equations of a state-space model, such as f, Q, h and R.
 
     Functions of the motion take the state, then the interval where the model is timed, s, and then the inputs.
     """
@@ -216,7 +216,7 @@ def find_invalid_noise(
 
 
 class StateSpaceMeasurement(NamedTuple):
-    """Values of all sensors at one time, with the interval and the inputs."""
+    """Values of all sensors at one time, with the interval, the inputs, and delayed values."""
 
     values: Array
     """Measured values, ``(m, N)``; arbitrary where nothing was received."""
@@ -234,7 +234,7 @@ class StateSpaceMeasurement(NamedTuple):
 
 
 class Passage(NamedTuple):
-    """Interval and inputs up to a measurement that has not been made yet."""
+    """Interval and inputs up to the next measurement."""
 
     interval: Array | None
     inputs: Array | None

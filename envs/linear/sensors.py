@@ -31,7 +31,7 @@ EARLY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Sensor of a state-space model: its numbers, rate and gate.
+    """Sensor of a state-space model: its equation, noise, rate, availability and gate.
 
     Raises:
         ValueError: if a field is outside its limits.
@@ -107,7 +107,7 @@ def missing_value_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
 
 
 class SensorStates(NamedTuple):
-    """State of the sensors in a simulation."""
+    """State of the simulated sensors: time since the last value, gaps, offset."""
 
     waited: Array | None = None
     """Time since each sensor with an interval was due, s, ``(sensors, N)``."""

@@ -42,7 +42,7 @@ from .state_space_banks import StateSpaceKalmanNetBank, bank_tables
 
 
 class StateSpaceTruth(NamedTuple):
-    """True state, current model, noise factors and inputs."""
+    """True state of a state-space world, such as current model, noise factors and inputs."""
 
     state: Array
     """True state, ``(n, N)``."""

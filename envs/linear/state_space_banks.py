@@ -50,7 +50,7 @@ OFFSET = 5.0
 
 
 class ExtendedKalmanState(NamedTuple):
-    """State of an extended Kalman filter."""
+    """State of an extended Kalman filter: estimate, innovation statistics, last action and correction."""
 
     mean: Array
     """Mean, ``(n, N)``; predicted between ``predict`` and the action."""
@@ -95,7 +95,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: normalised innovations, NIS, averages, availability, and the last action."""
+        """Observation blocks: innovation over sigma, NIS, its average, availability, the last action."""
         parts = tuple(map(str, range(1, self.sensors + 1))) if self.sensors > 1 else ()
         return (
             innovation_block(parts, text="innovations over their sigma"),
@@ -137,7 +137,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def compare(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
-        """Return the predicted state with innovation, NIS and log-likelihood of a measurement filled in."""
+        """Return the state with statistics of a measurement under its prediction, such as innovation and NIS."""
         xp = self.xp
         received = self.receive(state, measurement, state.action)
         P = state.covariance + self.process_noise(state.mean, measurement, state.action)
@@ -251,7 +251,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of one filter, the state, the last correction, and the log-deviations."""
+        """Observation blocks of one filter, and the state, the last correction and the log-deviations."""
         names = tuple(component.name for component in self.task.components)
         names = names if len(names) > 1 else ()
         xp = self.xp
@@ -335,7 +335,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
 
 
 class Mixture(NamedTuple):
-    """State of an interacting multiple model (IMM)."""
+    """State of an interacting multiple model (IMM): combined estimate, hypotheses, their probabilities."""
 
     mean: Array
     """Mean after an action, ``(n, N)``."""
@@ -391,7 +391,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of probabilities, likelihoods, availability and the last action."""
+        """Observation blocks: NIS, likelihoods, predicted and posterior probabilities, availability, last action."""
         xp, modes = self.xp, self.task.modes
         parts = tuple(map(str, range(1, self.task.definition.filters[0].h.size + 1)))
         return (

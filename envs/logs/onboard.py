@@ -27,7 +27,7 @@ LONGEST_GAP = 1.0
 
 
 class OnboardTrack(NamedTuple):
-    """Positions that a vehicle's own filter estimated."""
+    """Positions by time that a vehicle's own filter estimated, and their source."""
 
     source: str
     """Filter, autopilot and topic, as text."""

@@ -39,7 +39,7 @@ OFFSET_TOLERANCE = 0.3
 
 
 class TruthTable(NamedTuple):
-    """True values of a separate file, by time."""
+    """True values of a separate file, with their times, kind of clock, and notes."""
 
     clock: str
     """Kind of the times: dates, times of day, or seconds."""

@@ -59,7 +59,7 @@ class Innovations(NamedTuple):
 
 
 class GainState(NamedTuple):
-    """State of the plain scheme, whose gain is the action."""
+    """State of a filter whose gain is the action: position, variance, innovation statistics."""
 
     position: Array
     """Position estimate Xh, m, ``(A, N)``: predicted to the measurement, or updated by it."""
@@ -76,7 +76,7 @@ class GainState(NamedTuple):
 
 
 class Augmented(NamedTuple):
-    """State of the augmented filter, whose noises the action scales."""
+    """State of a filter of position and rate errors, whose noises the action scales."""
 
     position: Array
     """Position estimate Xh, m, ``(A, N)``: predicted to the measurement, or updated by it."""
@@ -186,7 +186,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Reported deviation and innovations in m, computed from the observation."""
+        """Reported variance, m^2, and innovations, m, computed from the observation."""
         nominal = self.parameters.receiver_variance
         return (
             Quantity(

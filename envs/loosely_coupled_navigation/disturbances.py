@@ -50,7 +50,7 @@ def measurement_number(time: Array, parameters: LooselyCoupledNavigationParamete
 
 
 class Levels(NamedTuple):
-    """State of :class:`NoiseChanges`."""
+    """State of the receiver's noise: true and reported levels in each part of the episode, and now."""
 
     true: Array
     """Standard deviation of the receiver noise before, between and after its changes, m, ``(3, N)``."""
@@ -153,7 +153,7 @@ class ReceiverColour(ColouredErrors):
 
 
 class Spell(NamedTuple):
-    """State of a receiver disturbance that occurs at most once in an episode."""
+    """State of a receiver disturbance that occurs at most once: its window, strength, the measurement's number."""
 
     window: Array
     """First measurement of the disturbance and the first one after it, ``(2, N)``."""

@@ -99,7 +99,7 @@ class Weighing(NamedTuple):
 
 
 class FaultState(NamedTuple):
-    """State of the fault bank."""
+    """State of the fault bank: estimate, hypotheses and noise levels, likelihood."""
 
     mean: Array
     """Mean of the whole bank, m, ``(A, N)``."""

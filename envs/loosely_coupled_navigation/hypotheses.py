@@ -63,7 +63,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of every bank here, the likelihood of the fix, and probabilities of hypotheses."""
+        """Observation blocks of every bank here, and others, such as probabilities of the hypotheses."""
         xp = self.xp
         nominal = 0.5 * self.parameters.axes * math.log(2.0 * math.pi * self.parameters.receiver_variance)
         return (
@@ -132,7 +132,7 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
     def add_observed(
         self, state: HypothesesState, result: Weighing, measurement: Measurement
     ) -> HypothesesState:
-        """Return the state with innovations, and the probabilities before and after the fix, filled in."""
+        """Return the state with innovation statistics, and probabilities before and after the fix, filled in."""
         bank, predicted, p = self.own, state.own.memory, result.weights
         age = bank.age(measurement.number)
         weights = bank.join_groups([predicted.free.weights, predicted.pulled.weights], 0)

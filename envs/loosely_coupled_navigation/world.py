@@ -17,7 +17,7 @@ from .parameters import LooselyCoupledNavigationParameters
 
 
 class Truth(NamedTuple):
-    """The true motion, the errors of the INS, and the disturbances of the receiver; A axes."""
+    """True motion, INS errors, and state of the receiver's disturbances; A axes."""
 
     number: Array
     """Number of measurements so far, ``(N,)``."""

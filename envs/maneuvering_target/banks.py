@@ -191,7 +191,7 @@ class GainBank(RadarBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovations, their averages, the gain, and the time."""
+        """Observation blocks: innovations, their averages, the prediction's share, the gain, detection and times."""
         xp = self.xp
         return (
             innovation_block("xy", value=lambda f, _: f.innovation / xp.sqrt(f.innovation_variance)),
@@ -213,7 +213,7 @@ class GainBank(RadarBank):
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Innovation in m, computed from the observation."""
+        """Innovation and its predicted standard deviation, m, computed from the observation."""
         sigma = self.parameters.range_sigma
         return (
             Quantity(
@@ -353,7 +353,7 @@ class FilterBank(RadarBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: those of each filter, likelihoods, probabilities, and the time."""
+        """Observation blocks: innovations of each filter, likelihoods, probabilities, detection and times."""
         xp = self.xp
         each = tuple(str(j + 1) for j in range(self.count))
 

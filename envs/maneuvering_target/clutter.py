@@ -37,7 +37,7 @@ class Echo(NamedTuple):
 
 
 class ClutterState(NamedTuple):
-    """State of the clutter."""
+    """State of the clutter: density of false plots, the target's own plot, whether a false one was taken for it."""
 
     density: Array
     """False plots per square metre, ``(N,)``."""

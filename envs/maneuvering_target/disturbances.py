@@ -14,7 +14,7 @@ from .parameters import ManeuveringTargetParameters
 
 
 class ColouredScanErrorsState(NamedTuple):
-    """State of :class:`ColouredScanErrors`."""
+    """Coloured errors of the scans: standard deviation, correlation time, current errors."""
 
     deviation: Array
     """Stationary standard deviation, ``(N,)``."""

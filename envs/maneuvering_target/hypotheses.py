@@ -74,7 +74,7 @@ class HypothesesBank(SettingsBank, RadarBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovation, predicted deviation, and probabilities of groups of hypotheses."""
+        """Observation blocks, such as innovation, predicted deviation, and probabilities of the hypotheses."""
         xp = self.xp
         area = 2.0 * math.pi * self.parameters.range_sigma**2
         return (
@@ -113,7 +113,7 @@ class HypothesesBank(SettingsBank, RadarBank):
     def add_observed(
         self, state: HypothesesState, result: SemiMarkovState, measurement: Measurement
     ) -> HypothesesState:
-        """Return the state with the innovation, and the probabilities before and after the scan, filled in."""
+        """Return the state with innovation statistics, and probabilities before and after the scan, filled in."""
         xp, tables = self.xp, [table.unpack() for table in state.own.track]
         weights = xp.concat([table.probability for table in tables])
         weights = weights / ordered_sum(weights)

@@ -153,7 +153,7 @@ def sensor_covariance(measurement: Measurement, xp: Any) -> Array:
 
 
 def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
-    """Return the mean predicted with a constant acceleration along and across: a turn, and a change of speed.
+    """Return the mean after a turn and change of speed by an acceleration, and the given mean with turn rate.
 
     Args:
         mean: x, y (m), vx, vy (m/s), ``(4, N)``.
@@ -187,7 +187,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovations, their predicted and measured deviations, the last action, and the time."""
+        """Observation blocks, such as innovation, last correction, predicted and measured deviations, and the time."""
         xp, p = self.xp, self.parameters
         return (
             innovation_block(FRAME, value=lambda f, _: f.innovation / xp.sqrt(f.prior + f.sensor)),

@@ -16,7 +16,7 @@ from .parameters import ManeuveringTargetParameters
 
 
 class Scan(NamedTuple):
-    """A scan of the radar."""
+    """A scan of the radar: motion at its time, whether it sees the target, times since earlier ones."""
 
     motion: Motion
     """Motion of the target at the time of the scan."""

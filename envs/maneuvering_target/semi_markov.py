@@ -130,7 +130,7 @@ class Turn(NamedTuple):
 
 
 class SemiMarkovState(NamedTuple):
-    """State of the semi-Markov filter."""
+    """State of the semi-Markov filter: estimate, hypotheses with their ages, likelihood."""
 
     mean: Array
     """Mean of all hypotheses together, ``(4, N)``."""

@@ -179,7 +179,7 @@ class UnscentedBank(SettingsBank, RadarBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovation, its averages, its predicted deviation, and the predicted motion."""
+        """Observation blocks: innovation statistics, predicted deviation and motion, detection and times."""
         xp = self.xp
         return (
             innovation_block("xy"),
@@ -221,7 +221,7 @@ class UnscentedBank(SettingsBank, RadarBank):
     def add_observed(
         self, state: UnscentedState, found: Prediction, measurement: Measurement
     ) -> UnscentedState:
-        """Return the state with the innovation, its averages and the prediction filled in."""
+        """Return the state with innovation statistics and the prediction filled in."""
         xp = self.xp
         innovation = found.innovation / xp.sqrt(found.innovation_variance)
         squares = innovation * innovation

@@ -147,7 +147,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: each filter's innovations and likelihoods, ESM decisions, last weights, the time."""
+        """Observation blocks, such as each filter's innovations and likelihoods, ESM decisions, last weights."""
         xp, p, classes = self.xp, self.parameters, self.task.modes
         none = self.task.types
         types = tuple(str(j) for j in range(none))

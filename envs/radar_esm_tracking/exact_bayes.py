@@ -128,7 +128,7 @@ class ClassTracks(NamedTuple):
 
 
 class ClassState(NamedTuple):
-    """State of the estimator :class:`ExactBayes`."""
+    """State of the estimator ``exact-bayes``: estimate, hypotheses of class and onset, likelihood."""
 
     mean: Array
     """Mean of all hypotheses together, ``(3, N)``."""
@@ -240,7 +240,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
     def normalise(
         self, mean: Array, covariance: Array, unchanged: Array, changed: Array, first: Array, later: Array
     ) -> ClassTracks:
-        """Return the hypotheses with T0, T1 and probabilities normalised to sums of one."""
+        """Return the hypotheses with class probabilities weighted by T0, and T0, T1 and these normalised to one."""
         xp = self.xp
         total = ordered_sum(ordered_sum(ordered_sum(first)))
         first, unchanged = first / total, unchanged * total

@@ -76,7 +76,7 @@ class HypothesesBank(SettingsBank):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: innovation, likelihood, probabilities of classes and second emitter, ESM, time."""
+        """Observation blocks, such as innovation, probabilities of classes and second emitter, ESM decisions."""
         xp, p = self.xp, self.parameters
         unit = math.log(2.0 * math.pi * p.range_sigma * p.range_rate_sigma)
         return (
@@ -142,7 +142,7 @@ class HypothesesBank(SettingsBank):
     def add_observed(
         self, state: HypothesesState, result: ClassState, measurement: Measurement
     ) -> HypothesesState:
-        """Return the state with the joint innovation, and the probabilities before and after the scan, filled in."""
+        """Return the state with innovation statistics, and probabilities before and after the scan, filled in."""
         xp, bank, tracks = self.xp, self.own, state.own.tracks
         size = tracks.weights.shape[0] * tracks.weights.shape[1]
         mean, P = bank.predict_motion(tracks)
@@ -176,5 +176,5 @@ class HypothesesBank(SettingsBank):
         return after._replace(**self.class_estimates(after.own))
 
     def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
-        """Return class probabilities and the radar measurement's likelihood to record at a scan, by name."""
+        """Return class probabilities, and likelihood and NIS of the radar measurement, to record, by name."""
         return {"mode_probability": state.probabilities, **state.likelihood._asdict()}

@@ -327,7 +327,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return ordered_sum(scaled * scaled) * (1.0 / 3.0)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return true class, true type and time to record at a scan, by name."""
+        """Return true class, true type, time and values of disturbances to record at a scan, by name."""
         xp = self.xp
         return {
             **self.disturbances.records(truth.disturbances),
@@ -337,7 +337,7 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return class and type, their change, second emitter, radar errors and silence, by name."""
+        """Return the draws of classes, emitters, radar errors and silences, and their current values, by name."""
         p, xp = self.parameters, self.xp
         never = 0 * truth.change_scan - 1
         changes = (p.class_change is not None) & (truth.change_scan <= p.horizon + 1)

@@ -107,7 +107,7 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks: statistics of each filter by group of sensors, readings, availability, the time."""
+        """Observation blocks, such as the NIS of each filter by group of sensors, innovations, availability, time."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in self.hypotheses]

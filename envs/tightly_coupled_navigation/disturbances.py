@@ -72,7 +72,7 @@ class _OfSatellites(Disturbance):
 
 
 class Fault(NamedTuple):
-    """State of a temporary disturbance of sensors."""
+    """State of a temporary sensor disturbance: its window, satellites, strength, whether it occurs now."""
 
     window: Array
     """First and last step of the disturbance, ``(2, N)``; -1 where it does not occur."""
@@ -251,7 +251,7 @@ class RangeColour(ColouredErrors):
 
 
 class Reception(NamedTuple):
-    """State of :class:`Reflections`."""
+    """State of the reception between houses: C/N0, multipath errors and their durations."""
 
     urban: Array
     """One for reception between houses, else zero, ``(N,)``."""

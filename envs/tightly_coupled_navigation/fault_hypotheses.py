@@ -106,7 +106,7 @@ VAGUE = FaultPrior(
 
 
 class Hypotheses(NamedTuple):
-    """Hypotheses of the bank; n = 17 + S states, M = 3 hypotheses on the motion."""
+    """Hypotheses on motion, rates' noise levels and last accelerometer readings; n = 17 + S states, M = 3."""
 
     means: Array
     """Means, ``(n, M, N)``."""

@@ -28,7 +28,7 @@ LARGEST_RATIO = 1e6
 
 
 class SensorGroup(NamedTuple):
-    """Group of sensors of one kind: name, number, unit, noise."""
+    """Group of sensors of one kind: places of their readings, standard deviation, aperture."""
 
     name: str
     readings: slice

@@ -55,7 +55,7 @@ class OneFault(FaultHypotheses):
 
 
 class SatelliteFaultState(NamedTuple):
-    """State of the bank :class:`SatelliteFaults`."""
+    """State of the bank over faulty satellites: its members, their weights, the likelihood."""
 
     members: tuple[FaultState, ...]
     """States of the members: without a fault, and with one of each satellite."""

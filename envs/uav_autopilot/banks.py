@@ -37,7 +37,7 @@ FLOORED_LOG = Compression(
 
 
 class KalmanState(NamedTuple):
-    """State of the Kalman filter."""
+    """State of the Kalman filter, with the estimate that the autopilot uses and innovation statistics."""
 
     mean: Array
     """Mean, predicted after ``predict`` and updated after ``act``, ``(n, N)``."""
@@ -83,7 +83,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Observation blocks of filter and autopilot; sigmas are those of the filter before the action."""
+        """Observation blocks of filter and autopilot, such as innovations, readings, command and control."""
         sensors, horizon = self.task.sensors, self.task.horizon
         unit = 1.0 / self.task.output_sigma
         return (

@@ -47,7 +47,7 @@ class _OfSensors(Disturbance):
 
 
 class SensorLevels(NamedTuple):
-    """State of :class:`NoisySensors`."""
+    """State of the sensors' noise: step signals of factors, and those at this measurement."""
 
     levels: StepSignal
     """Factors on the sensors' noise in each part, ``(J + 1, m, N)``."""
@@ -93,7 +93,7 @@ class NoisySensors(_OfSensors):
 
 
 class Holds(NamedTuple):
-    """State of :class:`Dropouts`."""
+    """State of the sensors' dropouts: their starts and ends, and the last valid readings."""
 
     starts: Array
     """First measurement without a reading, ``(D, m, N)``."""

@@ -103,7 +103,7 @@ def grid(limits: tuple[float, float], points: int) -> numpy.ndarray:
 
 
 class Levels(NamedTuple):
-    """State of the bank over noise levels."""
+    """State of the bank over noise levels: estimate, hypotheses, likelihood."""
 
     mean: Array
     """Mean of all hypotheses together, ``(n, N)``."""
