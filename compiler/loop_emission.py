@@ -125,7 +125,7 @@ class LoopText(Instructions):
         return first if way is None else way if first == 0 else self.new(f"add i64 {way}, {first}")
 
     def _way(self, places: tuple[int, ...]) -> tuple[int, str | None]:
-        """Return the first offset, and the LLVM name of a turn's distance from it; None: always zero."""
+        """Return an offset, and the LLVM name of a turn's distance from it; None: always zero."""
         step = common_difference(places)
         if step == 0:
             return places[0], None

@@ -31,7 +31,10 @@ class NotTraceable(TypeError):  # noqa: N818  (not an error in the function)
 
 @contextmanager
 def tracing(graph: Graph) -> Iterator[Graph]:
-    """Context manager: arithmetic on traced arrays adds its expressions to this graph; other threads wait."""
+    """Context manager: arithmetic on traced arrays adds its expressions to this graph; other threads wait.
+
+    Any exception inside becomes :class:`NotTraceable`, as functions may fail on symbols in any way.
+    """
     with without_collection():
         token = _OPEN.set(graph)
         try:
@@ -388,7 +391,7 @@ def clip(x: Any, min: Any = None, max: Any = None) -> Traced:
 
 
 def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
-    """Return the entries converted to another type; integers are truncated."""
+    """Return the entries converted to another type; conversion to integers truncates."""
     x, dtype = asarray(x), numpy.dtype(dtype)
     if dtype.kind not in "fiub":
         raise NotTraceable(f"arrays of {dtype} cannot be traced")

@@ -73,7 +73,7 @@ class SteerableFilter(Filter[TaskT, Measurement, State]):
         return 1.0
 
     def examine(self, state: State, measurement: Measurement) -> Any:
-        """Return the result of a measurement in the predicted state without an action, for the observation."""
+        """Return the result of an update with a measurement without an action, to compute the observation from."""
         return self.update(state, FilterInput(measurement))
 
 

@@ -73,7 +73,7 @@ class Disturbance(ABC):
         return True
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Any:
-        """Draw the disturbance of each episode; return its state at the start of the track.
+        """Draw the disturbance of each episode; return its state at the start, by default None.
 
         Args:
             draws: random quantities of each episode.
@@ -83,45 +83,45 @@ class Disturbance(ABC):
         return None
 
     def draw_further(self, state: Any, draws: Draws) -> Any:
-        """Return the state of :meth:`begin` with the quantities added that only some scenarios draw.
+        """Return the state of :meth:`begin` with draws added that only some scenarios have; by default none.
 
         They come after the draws of all scenarios, so that the other scenarios use the same numbers as without them.
         """
         return state
 
     def switch_off(self, state: Any, undisturbed: Array) -> Any:
-        """Return the initial state with the disturbance switched off in episodes without hidden disturbances.
+        """Return the state with the disturbance switched off in episodes without hidden ones; by default unchanged.
 
-        By default unchanged, as for a disturbance that the measurement reports, see :func:`draw_undisturbed`.
+        A disturbance that the measurement reports leaves it unchanged, see :func:`draw_undisturbed`.
         """
         return state
 
     def advance(self, state: Any, step: DisturbanceInput) -> Any:
-        """Return the disturbance's state at the next measurement."""
+        """Return the disturbance's state at the next measurement, by default unchanged."""
         return state
 
     def change_deviations(self, state: Any, deviations: Array) -> Array:
-        """Return the white errors' relative standard deviations, ``(..., N)``, changed by the disturbance."""
+        """Return the white errors' relative deviations, ``(..., N)``, as disturbed; by default unchanged."""
         return deviations
 
     def change_errors(self, state: Any, errors: Array) -> Array:
-        """Return the sensor errors, ``(n, N)`` in the world's units, changed by the disturbance."""
+        """Return the sensor errors, ``(n, N)`` in the world's units, as disturbed; by default unchanged."""
         return errors
 
     def change_reading(self, state: Any, reading: Array) -> tuple[Any, Array]:
-        """Return the state, and the sensor reading ``(n, N)`` changed by the disturbance."""
+        """Return the state, and the sensor reading ``(n, N)`` as disturbed; by default unchanged."""
         return state, reading
 
     def change_measurement(self, state: Any, measurement: Any, step: DisturbanceInput) -> tuple[Any, Any]:
-        """Return the state, and the whole measurement changed by the disturbance."""
+        """Return the state, and the whole measurement as disturbed; by default unchanged."""
         return state, measurement
 
     def context(self, state: Any) -> dict[str, Array]:
-        """Return the random draws of the disturbance by name, for the context of an episode."""
+        """Return the random draws of the disturbance by name, for the context of an episode; by default none."""
         return {}
 
     def records(self, state: Any) -> dict[str, Array]:
-        """Return further values to record at each measurement, by name (:meth:`.World.records`)."""
+        """Return further values to record at each measurement, by name; by default none."""
         return {}
 
 

@@ -117,12 +117,12 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Blocks of the agent's observation, computed from this filter's state and the measurement."""
+        """Blocks of the agent's observation, computed from this filter's state and the measurement; by default none."""
         return ()
 
     @property
     def quantities(self) -> Sequence[Quantity]:
-        """Further quantities that a policy can compute from an observation."""
+        """Further quantities that a policy can compute from an observation; by default none."""
         return ()
 
     @abstractmethod

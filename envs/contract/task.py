@@ -151,7 +151,7 @@ class Task(TaskBase):
         """Compute the constants that world and banks share; an optional method of an environment's author."""
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
-        """Return the feedback to the world in a closed loop, such as a control command, from an estimate.
+        """Return the feedback of an estimate to the world, such as a control command; by default None, an open loop.
 
         A filter may return another one, see :meth:`.Filter.feedback`.
 
@@ -176,7 +176,7 @@ def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
 
 
 def field_texts(cls: type) -> dict[str, str]:
-    """Return the docstring below each field of a class by name, as one line; empty where there is none."""
+    """Return the docstrings below the fields of a class by name, each as one line; fields without one are left out."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):

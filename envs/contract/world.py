@@ -96,9 +96,9 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return measurement
 
     def component_readings(self, measurement: Measurement) -> Array | None:
-        """Return the readings of the task's components, ``(C, N)`` in their units, for pictures.
+        """Return the readings of the task's components, ``(C, N)``, for pictures; by default None.
 
-        NaN where there is no reading; None, as by default, where the measured quantity is no component.
+        They are NaN where there is no reading, and None where the measured quantity is no component.
         """
         return None
 
@@ -118,9 +118,9 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.xp.sqrt(getattr(measurement, self.stated_field))
 
     def error_cost(self, error: Array) -> Array:
-        """Return the cost of an estimation error, ``(N,)``, without the truth.
+        """Return the cost of an estimation error, ``(N,)``, without the truth; a subclass defines it or :meth:`cost`.
 
-        Where it is defined, :meth:`cost` need not be, and recordings of the task can be evaluated.
+        Only with it recordings of the task can be evaluated.
 
         Args:
             error: estimate minus truth, ``(C, N)``, in the units of the task's components.
@@ -146,12 +146,12 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.cost(truth, mean)
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return further values of the truth to record at each measurement by name, ``(N,)``."""
+        """Return further values of the truth to record at each measurement by name, ``(N,)``; by default none."""
         return {}
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Return the random draws of the episode and their current values by name: finite arrays ``(..., N)``.
+        """Return the random draws of the episode and their current values by name, ``(..., N)``; by default none.
 
-        Their shapes are constant. The time of an event that does not occur is -1.
+        They are finite, their shapes constant. The time of an event that does not occur is -1.
         """
         return {}

@@ -12,7 +12,7 @@ class ScenarioData:
     """Base class of data from which an environment makes a scenario, such as flights or a recording."""
 
     def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
-        """Return the scenario that an environment makes of the data.
+        """Return the scenario that an environment makes of the data; subclasses define it.
 
         Args:
             cls: the environment.
@@ -24,7 +24,7 @@ class ScenarioData:
         raise NotImplementedError
 
     def fields(self) -> dict[str, Any]:
-        """Return the constructor's arguments by name; such a dictionary is also a valid scenario."""
+        """Return the constructor's arguments by name, also a valid scenario; subclasses define it."""
         raise NotImplementedError
 
 

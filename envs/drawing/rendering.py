@@ -121,7 +121,7 @@ class Picture:
         self.task: Any = model.task
 
     def records(self, state: Any) -> dict[str, float]:
-        """Return further values of a state for the picture's history, beside errors, sigmas and actions."""
+        """Return further values for the history, beside errors, sigmas and actions, by name; by default none."""
         return {}
 
     def strips(self) -> Sequence[Strip]:
@@ -144,24 +144,24 @@ class Picture:
         return [*errors, Strip(f"action, {self.model.control}", named, limits, steps=discrete)]
 
     def shows_observation(self) -> bool:
-        """Return whether the picture's last panel shows every component of the observation as a colour."""
+        """Return whether the picture's last panel shows the observation as colours; by default True."""
         return True
 
     def open(self, figure: Figure) -> None:
-        """Create the panels that a subclass draws beside the time series; called once for a figure."""
+        """Create the panels that a subclass draws beside the time series, once for a figure; by default none."""
 
     def begin(self, state: Any) -> None:
         """Prepare the picture for a new episode, whose first measurement has arrived; by default do nothing."""
 
     def shading(self) -> Sequence[tuple[float, float]]:
-        """Return intervals of measurements, first and last, that are shaded grey in every time series."""
+        """Return intervals of measurements that every time series shades grey, first and last; by default none."""
         return ()
 
     def arrange(self) -> None:
-        """Set the axis limits of the picture for a new episode, before its first drawing."""
+        """Set the picture's axis limits for a new episode, before its first drawing; by default do nothing."""
 
     def draw(self, history: History, state: Any) -> None:
-        """Update the panels of :meth:`open` to the current measurement.
+        """Update the panels of :meth:`open` to the current measurement; by default do nothing.
 
         ``history`` is of the measurements acted on; ``state`` is after the last measurement, not yet acted on.
         """

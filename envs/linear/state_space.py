@@ -265,7 +265,7 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         )
 
     def context(self, truth: StateSpaceTruth) -> dict[str, Array]:
-        """Return the index of the current model and the factors on Q and R, among other draws, by name."""
+        """Return the index of the current model and the noise factors on Q and R, by name."""
         return {
             "hypothesis": truth.hypothesis,
             "process_noise": truth.process_noise,

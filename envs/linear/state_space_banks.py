@@ -90,7 +90,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
 
     @property
     def action_names(self) -> Sequence[str]:
-        """Names of the components of the action, in order."""
+        """Names of the components of the action, in order; subclasses define them."""
         raise NotImplementedError
 
     @property

@@ -98,7 +98,7 @@ def check_pyins() -> None:
 
 
 def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0) -> Alignment:
-    """Align an INS at the standstill at the beginning of a log.
+    """Return the state of an INS at the end of the standstill at the beginning of a log (:class:`Alignment`).
 
     Args:
         inertial: measurements of the IMU.

@@ -204,7 +204,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
         )
 
     def last_action(self) -> Block:
-        """Return the observation block of the previous action."""
+        """Return the observation block of the previous action; subclasses define it."""
         raise NotImplementedError
 
     def no_innovations(self, zero: Array) -> Innovations:

@@ -42,7 +42,7 @@ class Course(ABC):
     def motion_at_early_scan(
         self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
-        """Return the motion at a scan that comes early by a share of the scan period.
+        """Return the motion at a scan that comes early; by default that of :meth:`advance` then.
 
         By default that of :meth:`advance`, for a course defined at any time.
 
@@ -68,7 +68,7 @@ class Course(ABC):
         return (self.parameters.sampling_interval * (1.0 + (before - now))) * velocity, velocity
 
     def context(self, flight: Any, scan: Array, time: Array) -> dict[str, Array]:
-        """Return the context of the flight by name: times and sizes of manoeuvres, and the current one.
+        """Return times and sizes of manoeuvres, and the current one, for the context, by name; by default none.
 
         ``time`` is that of the current scan, in scan periods since the start.
         """

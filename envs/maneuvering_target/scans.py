@@ -62,7 +62,7 @@ class RegularScans:
         return None, Scan(self.course.advance(flight, number, before), always, interval, interval)
 
     def time(self, scans: Any, number: Array) -> Array:
-        """Return the time of the current scan in scan periods, ``(N,)``."""
+        """Return the time of the current scan in scan periods, ``(N,)``: its number."""
         return number
 
     def context(self, scans: Any) -> dict[str, Array]:

@@ -199,7 +199,7 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
         return ClassState(initial.mean, initial.covariance, self.start_tracks(initial), unknown)
 
     def start_tracks(self, initial: Start) -> ClassTracks:
-        """Return the hypotheses of class and onset at the start, without the first ESM look."""
+        """Return the hypotheses of class and onset at the start, with T0 of the first ESM look."""
         xp, p, M = self.xp, self.prior, self.prior.onsets + 2
         none = 0.0 * initial.mean[0]
         state = xp.concat([initial.mean, xp.zeros((self.states - 3, 1)) + none])

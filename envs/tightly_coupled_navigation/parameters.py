@@ -282,7 +282,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
 
     @property
     def site(self) -> tuple[float, float, float]:
-        """Latitude and longitude, rad, and height, m, of the start."""
+        """Latitude and longitude, rad, and height, m, of the origin of east, north and up."""
         return self.latitude * DEGREE, self.longitude * DEGREE, self.height
 
     @property

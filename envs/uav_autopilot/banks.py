@@ -160,7 +160,7 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
         )
 
     def log_trace(self, state: Any) -> Array:
-        """Return the logarithm of the trace of the predicted covariance, ``(N,)``."""
+        """Return the log-trace of the predicted covariance, ``(N,)``; subclasses define it."""
         raise NotImplementedError
 
     def compare(self, state: Any, measurement: Measurement, readings: Array, S: Array) -> Any:
@@ -258,7 +258,7 @@ class _KalmanBank(AutopilotBank):
         return compared._replace(mean=mean, covariance=covariance)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Return the action as observed, ``(A, N)``, and its factor on the process noise, ``(N,)``."""
+        """Return the observed action, ``(A, N)``, and its factor on the process noise, ``(N,)``; abstract."""
         raise NotImplementedError
 
     def sensor_variances(self, action: Array) -> Any:
