@@ -92,7 +92,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return replaced
 
     def add_recorded_fields(self, measurement: Measurement) -> Measurement:
-        """Return the measurement with zeros instead of None in fields that only recordings contain."""
+        """Return the measurement with zeros for None in fields that only recordings have; by default unchanged."""
         return measurement
 
     def component_readings(self, measurement: Measurement) -> Array | None:

@@ -144,7 +144,7 @@ class Receptions:
         self.row_uniforms: int = len(self.lossy) + len(self.channels) * self.has_gaps
 
     def begin(self, draws: Draws, zero: Array) -> SensorStates | None:
-        """Draw gaps and offset, and return the sensors' state at the start; None where sensors have no state."""
+        """Draw a sensor's offset; return the sensors' state at the start, None where sensors have no state."""
         states = SensorStates(
             self.xp.stack([zero] * len(self.due)) if self.due else None,
             self.xp.stack([zero] * len(self.channels)) if self.has_gaps else None,

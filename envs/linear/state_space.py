@@ -182,9 +182,10 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def _receive(
         self, truth: StateSpaceTruth, values: Array, here: Sequence[Array | None]
     ) -> tuple[Array, Array]:
-        """Return the received values of all sensors, zero elsewhere, and their availability, both ``(m, N)``.
+        """Return the received values of all sensors, with offset and wrapped angles, and their availability.
 
-        ``here`` are masks of 1 where values are received, ``(N,)`` or ``(m, N)`` each.
+        Both are ``(m, N)``, values zero where not received. ``here`` are masks of 1 where values are received,
+        ``(N,)`` or ``(m, N)`` each.
         """
         available = 1.0 + 0.0 * values
         if truth.sensors is not None and truth.sensors.bias is not None:
