@@ -69,7 +69,7 @@ class SteerableFilter(Filter[TaskT, Measurement, State]):
     explores, then increases the cost by a twentieth at most."""
 
     def has_effect(self, measurement: Measurement) -> Array:
-        """Return 1 where an action affects the update with a measurement, 0 where nothing was measured, ``(N,)``."""
+        """Return 1 where an action affects the update with a measurement, else 0, ``(N,)``; by default 1."""
         return 1.0
 
     def examine(self, state: State, measurement: Measurement) -> Any:

@@ -22,7 +22,7 @@ import numpy
 
 @dataclasses.dataclass(frozen=True)
 class ParameterLimits:
-    """Limits of a parameter's value beside its type; for a sequence of each number."""
+    """Limits of a parameter's value beside its type; in a sequence they hold for each number."""
 
     above: float | None = None
     at_least: float | None = None

@@ -260,7 +260,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         return xp.concat([xp.concat([corner, middle], axis=1), xp.concat([middle, velocity], axis=1)])
 
     def act(self, state: KalmanNetState, measurement: Measurement, action: Array) -> KalmanNetState:
-        """Return the state updated with the gain of the action, whose acceleration is kept for the next prediction."""
+        """Return the state updated with noises and gain of the action, whose acceleration the next prediction uses."""
         xp, available = self.xp, measurement.available
         a = xp.clip(action, -1.0, 1.0)
         frame = frame_of(state.mean[2:])

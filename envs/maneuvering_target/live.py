@@ -25,7 +25,7 @@ def choose(condition: Any, first: Any, second: Any) -> Any:
 
 
 def is_finite(number: Any) -> Any:
-    """Return whether a float, or every number of an array, is finite."""
+    """Return whether a float, or each number of an array, is finite."""
     return math.isfinite(number) if number.__class__ is float else numpy.isfinite(number)
 
 

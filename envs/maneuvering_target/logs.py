@@ -359,7 +359,7 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
 
 
 def _displacements(columns: Columns) -> numpy.ndarray | None:
-    """Return the second sensor's displacement since the previous row, m, ``(rows, 2)``; NaN where it has none."""
+    """Return the second sensor's displacement since the previous row, m, ``(rows, 2)``; None if there is no sensor."""
     if columns.has("odometry_x", "odometry_speed"):
         raise ValueError("it has odometry_x and odometry_speed: leave one of them out")
     if columns.has("odometry_x"):

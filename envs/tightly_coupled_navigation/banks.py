@@ -293,7 +293,7 @@ class HypothesisBank(SatelliteBank):
         )
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
-        """Return each reading's threshold of the robust update; None for the paper's update."""
+        """Return each reading's threshold of the robust update; None, as here, for the paper's update."""
         return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
@@ -332,9 +332,9 @@ class HypothesisBank(SatelliteBank):
         return imm.combine(state.means, covariances, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Return probabilities, NIS, log-likelihood and the aperture to record at a measurement, by name.
+        """Return probabilities, NIS, log-likelihood, and whether a rate is outside its aperture, to record, by name.
 
-        NIS and its degrees of freedom are of the combination; the aperture is whether a rate is outside its own.
+        NIS and its degrees of freedom are those of the combination.
         """
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture

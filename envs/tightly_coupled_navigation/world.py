@@ -192,7 +192,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Return time, true hypothesis, and one where a sensor fails, to record at a measurement, by name.
+        """Return time, true hypothesis, whether a sensor fails, and values of disturbances, to record, by name.
 
         Failures are a noisier rate, stuck accelerometers, and a pseudorange error above five standard deviations.
         """
