@@ -60,5 +60,5 @@ def block_for(features: str) -> LaneBlock:
 
 @functools.cache
 def block_of(lanes: int) -> LaneBlock:
-    """Return the block with this number of lanes."""
+    """Return the :class:`LaneBlock` of this number of lanes."""
     return LaneBlock(lanes)

@@ -132,7 +132,6 @@ class Loops:
         ]
 
     def _entry(self, numbers: Sequence[int]) -> str:
-        """Return a C expression in ``i`` for entry ``i`` of a table of numbers."""
         if common_difference(numbers) is None:
             return f"{self._table(tuple(numbers))}[i]"
         least, text = self._term(numbers, "i")
@@ -189,7 +188,6 @@ class Loops:
         return f"({text} != {literal(0.0, self.scalar)})" if operand.logical else text
 
     def _place(self, operand: Operand, single: Callable[[int, int], str], rows: Mapping[int, Rows]) -> str:
-        """Return the C expression of the array element that an operand has in one turn of the loop."""
         array, places = operand.array, operand.places
         if array != SCRATCH and len(set(places)) == 1:
             return single(array, places[0])

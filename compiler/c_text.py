@@ -45,7 +45,7 @@ _RESERVED = frozenset(
 
 @dataclass(frozen=True)
 class Scalar:
-    """A floating-point type of C."""
+    """Floating-point type of C, double or float: name, suffix and limits."""
 
     name: str
     suffix: str
@@ -61,7 +61,7 @@ FLOAT = Scalar("float", "f", numpy.float32, "FLT_MAX", "FLT_MIN")
 
 
 class Parameter(NamedTuple):
-    """A parameter of a C function."""
+    """Type and name of a parameter of a C function."""
 
     type: str
     """C text before the name."""

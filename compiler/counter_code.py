@@ -131,7 +131,6 @@ def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str])
 def _loop(
     block: LaneBlock, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
 ) -> list[str]:
-    """Return the LLVM lines of the loop over pairs of random numbers, from label ``before`` to ``done_KIND``."""
     text = _VectorText(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [

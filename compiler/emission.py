@@ -112,7 +112,7 @@ def emit(
     part: int,
     loops: bool = False,
 ) -> str:
-    """Return the LLVM text of a program, which computes it for a range of lanes.
+    """Return LLVM text that computes a program for a range of lanes.
 
     A part of the text has ``part`` statements: computed steps and stored results. An argument that is ``lane_first``
     has layout ``(N, rows)``, else ``(rows, N)``. No function of the library takes more lanes than the block has.

@@ -124,7 +124,7 @@ class Instructions:
         return self.new(f"fcmp {how} {self.numbers} {one}, {other}", name)
 
     def call(self, function: str, *values: str, name: str | None = None) -> str:
-        """Append a call of a function of numbers; return the name of the value."""
+        """Append a call of a function, such as exp, in each lane; return the name of the value."""
         listed = ", ".join(f"{self.numbers} {value}" for value in values)
         return self.new(f"call {self.numbers} {function}({listed})", name)
 

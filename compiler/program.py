@@ -388,7 +388,6 @@ class Graph:
 
 
 def _callers() -> str:
-    """Return the nearest two functions on the stack outside this package and in different files, as text."""
     found: dict[str, str] = {}
     frame: types.FrameType | None = sys._getframe(2)
     while frame is not None and len(found) < 2:

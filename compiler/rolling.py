@@ -65,7 +65,7 @@ class Loop(NamedTuple):
 
 
 class Rolled(NamedTuple):
-    """A program as a list of loops."""
+    """A program as loops, with their number before a pause and the length of the scratch array."""
 
     loops: list[Loop]
     before: int
@@ -84,8 +84,6 @@ class _Read(NamedTuple):
 
 
 class _Draft:
-    """Statement of a loop before its array elements are assigned; members and operands are steps."""
-
     def __init__(
         self,
         operation: str,
@@ -232,7 +230,6 @@ class _Roller:
         self._add(draft)
 
     def _sources(self, columns: Sequence[numpy.ndarray]) -> list[int | None]:
-        """Return for each operand the argument, or constants, that hold all of it; None: the scratch array."""
         steps, starts, lengths = _join_columns(columns)
         sources = self.source[steps]
         own = sources[starts]
@@ -276,7 +273,6 @@ class _Roller:
                 yield _Read(None, number[i] if of_all[i] else None, statements)
 
     def _needs(self, draft: _Draft) -> dict[int, bool]:
-        """Return the statements that a draft reads, and whether the same turn of a loop suffices for each."""
         needs: dict[int, bool] = {}
         for _, turn, statements in draft.reads:
             for number in statements:

@@ -32,7 +32,7 @@ class Initial(NamedTuple):
 
 
 class FilterInput(NamedTuple):
-    """Input of a filter at a measurement."""
+    """Input of a filter at a measurement: the measurement, the truth for a reference, and the action."""
 
     measurement: Any
     truth: Any = None
@@ -42,7 +42,7 @@ class FilterInput(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """Likelihood of a measurement under its prediction."""
+    """Likelihood of a measurement under its prediction: log-likelihood, NIS and its degrees of freedom."""
 
     log_likelihood: Array
     """Log-density of the measurement as it was predicted, in nats, ``(N,)``; NaN where nothing was received."""

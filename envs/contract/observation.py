@@ -19,7 +19,7 @@ Array = Any
 
 
 class Field(NamedTuple):
-    """One component of the observation."""
+    """One component of the observation: name, unit and description."""
 
     name: str
     unit: str
@@ -268,7 +268,7 @@ class DecisionMeans:
         return total + observation[self.columns]
 
     def write(self, observation: numpy.ndarray, total: numpy.ndarray) -> None:
-        """Replace the averaged fields of an observation, in place, by their sums ``total`` over the interval."""
+        """Replace the averaged fields of an observation, in place, by ``total`` divided by the interval."""
         observation[self.columns] = total / self.interval
 
     def show(self, observation: Array, total: Array, xp: ModuleType) -> Array:

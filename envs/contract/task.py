@@ -96,7 +96,7 @@ class PaperPolicy(NamedTuple):
 
 
 class Reward(NamedTuple):
-    """Cost of an estimate, and the reward for it."""
+    """Description of a task's cost, its default kind of reward, and their units."""
 
     cost: str
     """Meaning and unit of the cost, in words."""

@@ -16,7 +16,7 @@ from .observation import Array
 
 
 class NoiseLayout(NamedTuple):
-    """Numbers of uniform and normal random numbers at the start and at each measurement of an episode.
+    """Counts of uniform and normal random numbers at the start and at each measurement of an episode.
 
     At its start these are ``uniforms`` numbers between 0 and 1 for the scenario and ``initial_normals`` standard normal
     ones for the start of the track, then one row for each measurement: ``normals`` standard normal numbers followed by

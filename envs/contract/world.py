@@ -103,7 +103,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return None
 
     def component_deviations(self, measurement: Measurement) -> Array | None:
-        """Return the stated standard deviations of :meth:`component_readings`, ``(C, N)``, or None."""
+        """Return the stated standard deviations of :meth:`component_readings`, ``(C, N)``; by default None."""
         return None
 
     def reading_deviations(self, measurement: Measurement) -> Array:

@@ -129,7 +129,6 @@ def _item_size(variable: Any) -> int:
 
 
 def _check_links(group: Any, h5py: Any) -> None:
-    """Raise ValueError if a variable of an HDF5 group has its values in another file."""
     for name in group:
         link = group.get(name, getlink=True)
         if isinstance(link, h5py.ExternalLink):
@@ -319,7 +318,6 @@ class _Bag(NamedTuple):
         return next(iter(counts.most_common(1)), ("", 0))[0]
 
     def rows(self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int) -> Any:
-        """Return numbers from each message of a topic as columns; messages need a hundred times the memory."""
         import numpy
 
         chosen = [c for c in self.reader.connections if c.topic == topic and c.msgtype == kind]

@@ -219,7 +219,7 @@ class Feed:
     has_whole_truth: ClassVar[bool] = False
 
     def has_interval(self, seconds: float) -> bool:
-        """Return whether measurements come this many seconds apart; True if the filters do not use times."""
+        """Return True: live measurements are taken to come at a task's constant interval."""
         return True
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:

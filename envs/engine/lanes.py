@@ -63,7 +63,7 @@ class EpisodeStepper(Protocol):
         ...
 
     def load(self, episode: Episode, observation: Array = None) -> None:
-        """Replace the running episodes; None: compute their observation, ``(fields, width)``."""
+        """Replace the running episodes and their observation, ``(fields, width)``; None: compute it."""
         ...
 
     def episode(self) -> Episode:
@@ -142,7 +142,7 @@ class ModelStepper:
         return uniforms, normals
 
     def load(self, episode: Episode, observation: Array = None) -> None:
-        """Replace the running episodes; None: compute their observation, ``(fields, width)``."""
+        """Replace the running episodes and their observation, ``(fields, width)``; None: compute it."""
         self._episode, self.shown = episode, observation
 
     def begin_some(
@@ -318,7 +318,6 @@ class Lanes:
             self._on_start(self.model.begin(*start))
 
     def _noise_of_some(self, count: int) -> EpisodeNoise:
-        """Return an :class:`EpisodeNoise` for at least ``count`` restarting lanes, from a cache."""
         width = LANES
         while width < count:
             width *= 2
@@ -443,7 +442,6 @@ class Lanes:
         return after
 
     def _settle(self) -> list[ModelStepper]:
-        """Move the running episodes into :class:`ModelStepper` objects, and return these."""
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):

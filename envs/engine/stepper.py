@@ -336,7 +336,6 @@ class Stepper:
     def _bound_copies(
         self, now: int, noise: EpisodeNoise, reported: Sequence[numpy.ndarray], moving: list[Moving]
     ) -> list[Call]:
-        """Return copies of a step's calls from copy ``now`` on; the report arrays are appended to ``moving``."""
         calls = [call.copy() for call in self._calls[now]]
         if self._world_of is None:
             calls[-2].table[self._row_entry] = noise.address

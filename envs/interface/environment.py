@@ -36,8 +36,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
             cost and the further records of an evaluation.
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
         dtype: type of observations and rewards: "float64" (default), or "float32", to which they are rounded on return.
-        context: whether ``info["context"]`` contains the random draws of the episode and their current values
-            (:meth:`.World.context`), at resets and steps.
+        context: whether ``info["context"]`` contains the episode's random draws (:meth:`.World.context`).
         observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
             and of "privileged" values, the context and the error after the last action in units of its reported
             standard deviation (zero at a reset). No policy may observe them where it is evaluated.

@@ -135,7 +135,6 @@ class EnvBase:
         return distribution
 
     def _apply_reset_options(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
-        """Set the scenario and parameters in the options of a reset for the next episodes of these lanes."""
         if not {"scenario", "parameters"} & wanted.keys():
             return
         parameters = wanted.get("parameters")
@@ -266,7 +265,6 @@ class EnvBase:
     def _step_part(
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
     ) -> tuple[Array, Array]:
-        """Apply an action in one task's lanes; return rewards, and the errors in sigmas of privileged observations."""
         task, count = lanes.task, lanes.count
         report = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
         results = lanes.decide(action, report)

@@ -19,7 +19,7 @@ from ..contract.observation import Array
 from ..data.recording import Recording
 from ..engine.lanes import Lanes
 from ..engine.reward import REWARD_FUNCTIONS, reward_baseline
-from .specification import plain
+from .specification import json_value
 
 ROOM = 8
 """Places by which lanes grow: a multiple of the width that arrays are padded to."""
@@ -43,8 +43,8 @@ class EpisodeDistribution(NamedTuple):
         if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long for a message
             alike = scenario is self.scenario
         else:
-            alike = repr(plain(self.scenario)) == repr(plain(scenario))
-        return alike and repr(plain(self.parameters)) == repr(plain(parameters))
+            alike = repr(json_value(self.scenario)) == repr(json_value(scenario))
+        return alike and repr(json_value(self.parameters)) == repr(json_value(parameters))
 
     def draw_task(self, generator: numpy.random.Generator) -> int:
         """Draw the index of the next episode's task by the weights; a single task needs no random number."""
@@ -168,7 +168,6 @@ class Fleet:
         return part
 
     def _arrange(self) -> None:
-        """Delete the lanes of tasks no longer in use, and number the others anew."""
         needed = [
             model.task.parameters for distribution in self._distributions for model in distribution.models
         ]

@@ -17,14 +17,14 @@ def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
     Gymnasium registers one length for an id; here it follows from scenario and parameters. The environment truncates
     by itself, without a ``TimeLimit`` wrapper.
     """
-    kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
+    kwargs = {name: json_value(value) for name, value in spec.kwargs.items()}
     return dataclasses.replace(spec, max_episode_steps=decisions, kwargs=kwargs)
 
 
-def plain(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Return a keyword's value in a form that JSON can store and that makes the same environment."""
     if isinstance(value, ScenarioData):
-        return {name: plain(item) for name, item in value.fields().items()}
+        return {name: json_value(item) for name, item in value.fields().items()}
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, numpy.ndarray | numpy.generic):
@@ -32,5 +32,5 @@ def plain(value: Any) -> Any:
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, dict):
-        return {name: plain(item) for name, item in value.items()}
-    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
+        return {name: json_value(item) for name, item in value.items()}
+    return type(value)(map(json_value, value)) if type(value) in (list, tuple) else value

@@ -49,8 +49,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         num_envs: number of sub-environments; sub-environment i equals the single environment with the same
             seed, for every number.
         control: name of a control; default: the first of the environment.
-        scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
-            mixture, ``{"random": 0.8, "paper": 0.2}``.
+        scenario: name of a scenario, a trajectory or its fields, a file with one, or a mixture, see :class:`.TaskEnv`.
         reward: "cost", "log-likelihood", "cost-and-likelihood", "relative" or "log-relative"; default: the
             environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
@@ -324,7 +323,6 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.pictures.close()
 
     def _with_masks(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
-        """Return ``info`` in Gymnasium's form: beside every key the mask of the sub-environments with it."""
         if not mask.any():
             return {}
         masked = {}

@@ -178,7 +178,7 @@ def nominal_sensor_noise(
 
 
 class InvalidNoise(NamedTuple):
-    """Place of a measurement whose R is not positive definite."""
+    """Measurement and sensor whose R is not positive definite, and that R."""
 
     place: int
     """Index of the measurement."""
@@ -335,7 +335,6 @@ class Equations:
         return R if self.model.D is None else R + self._through(self.model.D, x, passed)
 
     def _through(self, function: VectorFunction | None, given: Array, passed: Passed) -> Array | float:
-        """Return the covariance that noise of the inputs causes in the value of a function."""
         if function is None:
             return 0.0
         assert passed.inputs is not None

@@ -72,7 +72,6 @@ class StateSpaceInput(LiveInput):
         return self._checked(super().measure(memory, time, values), interval)
 
     def _checked(self, made: tuple[Any, Memory], interval: Any) -> tuple[Any, Memory]:
-        """Return ``made`` unchanged; raise ValueError if the inputs make a sensor's R not positive definite."""
         if not self._noise_varies:
             return made
         measurement, N = made[0], self.tracks

@@ -408,7 +408,6 @@ def is_true(values: "pandas.Series") -> "pandas.Series":
 
 
 def _rewrite_date(date: Any) -> str:
-    """Return a date in ISO 8601 if it has another unambiguous form, otherwise unchanged."""
     word = re.sub(r"(:\d{2}),(\d)", r"\1.\2", str(date).strip())
     found = DATE.match(word)
     if found is None:

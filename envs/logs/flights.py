@@ -414,7 +414,6 @@ def _median_site(rows: "pandas.DataFrame") -> tuple[float, float]:
 
 
 def _by_flight(rows: "pandas.DataFrame", flight: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
-    """Return the rows of every flight by name, sorted by time; one unsorted group if the file has no names."""
     if flight is None:
         return {"": rows}
     names = flight.astype(object).where(flight.notna(), "").astype(str).str.strip()
@@ -433,7 +432,6 @@ def _check_degrees(site: tuple[float, float] | None, rows: "pandas.DataFrame") -
 
 
 def _around(site: tuple[float, float], rows: "pandas.DataFrame") -> "pandas.DataFrame":
-    """Return the rows of one flight with x and y added, m east and north of a site."""
     latitude, longitude = (numpy.radians(rows[name].to_numpy()) for name in ("latitude", "longitude"))
     altitude = numpy.zeros_like(latitude)
     if "altitude" in rows:

@@ -99,7 +99,6 @@ def _read(
 def _check_noise(
     definition: "StateSpaceDefinition", made: Mapping[str, numpy.ndarray], rows: numpy.ndarray, usual: float
 ) -> None:
-    """Raise ValueError for a row in which a sensor's R is not positive definite, such as an accuracy of zero."""
     count = len(rows)
     interval = made.get("interval", numpy.full(count, usual))
     inputs = made.get("inputs", numpy.zeros((count, 0)))

@@ -53,7 +53,6 @@ def count_of(count: int, what: str, plural: str = "") -> str:
 
 
 def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
-    """Return a note on the number of skipped lines; raise ValueError if most are broken."""
     if count > MOST_BROKEN * (count + good):
         raise ValueError(f"{count_of(count, 'line')} of {count + good:,} {what}: is it whole?")
     return (f"{count_of(count, 'line')} {what}: left out",) if count else ()
@@ -241,12 +240,6 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
 
 
 def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
-    """Add the contents of an NMEA sentence to the epoch of its time.
-
-    Raises:
-        ValueError: if a field is no number, or there is no position.
-        AttributeError: if the sentence has no time.
-    """
     clock: datetime.time = message.timestamp
     time = 3600.0 * clock.hour + 60.0 * clock.minute + clock.second + 1e-6 * clock.microsecond
     kind = message.sentence_type

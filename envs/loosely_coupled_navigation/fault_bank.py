@@ -76,7 +76,7 @@ class Memory(NamedTuple):
 
 
 class Weighing(NamedTuple):
-    """Predicted hypotheses with their weights after a measurement: those without spoofing first, H in all."""
+    """Predicted hypotheses weighted by a measurement: weights, level probabilities, innovations; H in all."""
 
     log_likelihood: Array
     """Log-likelihood of the measurement, ``(N,)``."""

@@ -358,7 +358,7 @@ def aided_inertial(
     lever: Sequence[float],
     errors: InertialErrors | None,
 ) -> AidedInertial:
-    """Align an INS at the standstill, aid it by fixes, and check it against them.
+    """Return the INS aligned at the standstill and aided by fixes, after a check against them.
 
     Raises:
         ValueError: if it cannot be aligned, or does not follow the fixes.

@@ -126,7 +126,7 @@ class UnreliableScans(RegularScans):
 
 
 def has_regular_scans(recording: Recording | Feed, p: ManeuveringTargetParameters) -> bool:
-    """Return whether every scan of a recording has a plot and comes one sampling interval after the last."""
+    """Return whether every scan of a recording has a plot and comes one sampling interval after the previous."""
     if isinstance(recording, Feed):
         return recording.regular
     there = numpy.isfinite(recording.seconds)

@@ -26,14 +26,12 @@ from .world import RadarEsmWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return the object that draws an episode; imported late, because it needs matplotlib."""
-    from .picture import PICTURE
+    from .picture import PICTURE  # imports matplotlib
 
     return PICTURE(model)
 
 
 def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-    """Return the reported variances, and the true class's weight if there are weights, by name."""
     task: Any = model.task
     covariance = model.covariance(episode)
     own = {f"variance_{c.name}": covariance[i, i] for i, c in enumerate(task.components)}

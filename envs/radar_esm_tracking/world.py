@@ -81,7 +81,7 @@ class Measurement(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The initial estimate given to every filter."""
+    """Initial estimate given to every filter, with the first measurement."""
 
     mean: Array
     """First measured range (m) and range rate (m/s), acceleration 0, ``(3, N)``."""
@@ -199,7 +199,6 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
         return self.xp.take(self.type_thresholds, target_class, axis=1)
 
     def _another_class(self, draws: Draws, name: str, target_class: Array) -> Array:
-        """Draw the index of another class than the given one, all equally probable, ``(N,)``."""
         step = draws.integer(name, (1, self.task.classes - 1))
         return (target_class + self.xp.astype(step, self.xp.int64)) % self.task.classes
 

@@ -18,7 +18,7 @@ from .problem import NavigationProblem
 
 
 class Legs(NamedTuple):
-    """The L legs of a course: kinds and accelerations."""
+    """Legs of a course: first steps, kinds and initial accelerations; L legs."""
 
     start: Array
     """Last step before each leg, ``(L, N)``."""

@@ -53,7 +53,6 @@ class NavigationProblem(Task):
         self.transition: Array = constant(p.transition)
 
     def _row(self, number: Array) -> Array:
-        """Return the row of a measurement in the tables; beyond the episode the last row."""
         return self.xp.clip(number, None, self.horizon + 1)
 
     def satellites_at(self, number: Array) -> tuple[Array, Array]:

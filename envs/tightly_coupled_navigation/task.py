@@ -37,8 +37,7 @@ from .world import NavigationWorld
 
 
 def _picture(model: Model) -> Any:
-    """Return the object that draws an episode; imported late, because it needs matplotlib."""
-    from .picture import PICTURE
+    from .picture import PICTURE  # imports matplotlib
 
     return PICTURE(model)
 

@@ -42,7 +42,7 @@ class Truth(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The initial estimate given to every filter."""
+    """Initial estimate given to every filter, with the first command."""
 
     mean: Array
     """Mean, zero, ``(n, N)``."""
