@@ -433,7 +433,6 @@ class ProgramSteps(Sequence[ProgramStep]):
     """Steps of a program as arrays; a :class:`ProgramStep` is made on access.
 
     Args:
-        names: names of the operations.
         kinds: index in ``names`` of each step's operation, ``(n,)``.
         begins: offset of each step's arguments in ``arguments``, ``(n + 1,)``.
         arguments: arguments of all :class:`ProgramStep`, one after the other.

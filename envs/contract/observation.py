@@ -250,7 +250,6 @@ class DecisionMeans:
     """Averages of observation fields over the measurements for which one action holds.
 
     Args:
-        fields: of the observation.
         interval: measurements of a decision.
 
     Attributes:

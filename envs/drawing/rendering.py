@@ -462,7 +462,6 @@ class EpisodePictures:
 
     Args:
         model: of the episodes, on any backend.
-        count: number of episodes.
         frames_per_second: frame rate of a video.
     """
 

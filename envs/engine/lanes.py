@@ -239,7 +239,6 @@ class Lanes:
 
     Args:
         model: task with a filter; the task's namespace determines the device of the arrays.
-        count: number of lanes.
         baseline: baseline of a relative reward, run on the same noise.
         on_start: called with new episodes before their first measurement.
         longest: most decisions of an episode; default: the task's horizon.

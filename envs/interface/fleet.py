@@ -74,7 +74,6 @@ class Fleet:
     """``count`` lanes (parallel episodes) of one task or of several, as their distributions draw them.
 
     Args:
-        count: number of lanes.
         distribution: of the episodes of all lanes, until :meth:`set_distribution` sets another.
         kind: kind of reward, which may need a baseline beside every episode.
         longest: most decisions of an episode; default: its task's horizon.

@@ -113,7 +113,6 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
     """Estimator ``fault-bank``: Kalman filters over noises of INS and receiver and over the onset of spoofing.
 
     Args:
-        prior: of faults and noises.
         **changed: fields of the prior.
     """
 

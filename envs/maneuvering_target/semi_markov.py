@@ -149,7 +149,6 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
     linearise where no turn is.
 
     Args:
-        prior: of flights and measurements.
         **changed: fields of the prior.
     """
 

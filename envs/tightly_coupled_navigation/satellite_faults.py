@@ -68,7 +68,6 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
     """Estimator by a bank of :class:`FaultHypotheses`: no fault, or a lasting fault of one pseudorange.
 
     Args:
-        prior: that of all members.
         begins: expected number of faults per second, of all satellites together.
         walk: standard deviation of the wrong pseudorange's random walk in a second, m.
         **changed: fields of the prior.
