@@ -63,9 +63,9 @@ def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
 
 
 def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """Simulate an example of the initial estimate and measurement of a task in an open loop.
+    """Simulate an example of a task's initial estimate and measurement; ValueError for a closed loop.
 
-    Arguments as of :func:`measure_examples`; ValueError for a closed loop.
+    Arguments as of :func:`measure_examples`.
     """
     if task.closes_loop:
         raise ValueError(

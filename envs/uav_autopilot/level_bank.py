@@ -51,7 +51,7 @@ class Kind(NamedTuple):
 
 
 class LevelPrior(NamedTuple):
-    """Prior of the bank over noise levels."""
+    """Prior of the bank over noise levels: their ranges and changes, outliers, kinds of aircraft."""
 
     gusts: tuple[float, float] = (0.2, 5.0)
     """Limits of the disturbance's level, log-uniform."""
