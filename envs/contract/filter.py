@@ -147,7 +147,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         """
 
     def step(self, state: State, inputs: FilterInput) -> State:
-        """Return the state predicted to a measurement and updated with it, without an action."""
+        """Return the state predicted to the measurement of an input and updated with that input."""
         return self.update(self.predict(state, inputs.measurement), inputs)
 
     def mean(self, state: State) -> Array:
