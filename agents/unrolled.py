@@ -397,7 +397,7 @@ class Unrolled:
             rollout.shown_adjoint[:, :count] = policy.backward(decision, of_action)
             rollout.shown_adjoint[self._means.columns] /= interval
         policy.add_gradients(decisions)
-        rollout.go_on()
+        rollout.drop_stored()
         return -reward * share
 
     def _through_gate(self, decision: int, action: numpy.ndarray) -> numpy.ndarray:

@@ -194,7 +194,7 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
     def take(self, state: EstimateState, one: Past) -> EstimateState:
         """Return the state predicted to a measurement and updated with it."""
         measurement = one.measurement
-        mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
+        mean, carried = self.equations.predict_moments(state.mean, state.covariance, measurement)
         Q = self.process_noise(mean, measurement)
         R = self.sensor_noise(mean, measurement)
         result = _update(self.equations, mean, carried + Q, R, measurement, self.xp)
@@ -392,7 +392,7 @@ class KnownModel:
         (measurement, truth, _), xp, chosen = one, self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.is_switching else world.equations[:1]):
-            mean, carried = equations.carry(state.mean, state.covariance, measurement)
+            mean, carried = equations.predict_moments(state.mean, state.covariance, measurement)
             P = carried + truth.process_noise * equations.process_noise(mean, measurement)
             R = equations.sensor_noise(mean, measurement, truth.measurement_noise)
             result = _update(equations, mean, P, R, measurement, xp)

@@ -9,7 +9,7 @@ from models import KINDS, make_model
 import filtergym
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.envs.engine.reward import reference
+from filtergym.envs.engine.reward import reward_baseline
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -23,7 +23,7 @@ def test_reward_is_the_compressed_cost(env_id, own, kind, beyond):
     """
     model = make_model(env_id)
     unit = (kind == "log-relative" and model.task.reward.log_unit) or model.task.reward.unit
-    beside = reference(kind, model)
+    beside = reward_baseline(kind, model)
     watched, plain, relative = (Lanes(model, 8, each) for each in (beside, None, beside))
     for lanes in (watched, plain, relative):
         for lane in range(8):

@@ -78,7 +78,9 @@ class KnownTurn(KalmanModel):
             early = state.truth.scans.early, truth.scans.early
         one = xp.ones_like(truth.scan)
         identity = xp.stack([xp.stack([one, 0.0 * one]), xp.stack([0.0 * one, one])])
-        columns = [world.course.carry(truth.flight, truth.scan, early, identity[i]) for i in range(2)]
+        columns = [
+            world.course.propagate_deviation(truth.flight, truth.scan, early, identity[i]) for i in range(2)
+        ]
         by_velocity = xp.stack([xp.concat(column) for column in columns], axis=1)
         F = xp.concat([xp.concat([identity, 0.0 * identity]), by_velocity], axis=1)
         before, now = (xp.concat([state.position, state.velocity]) for state in (state.truth, truth))
