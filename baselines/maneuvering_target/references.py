@@ -31,8 +31,9 @@ class KnownTurn(KalmanModel):
 
     It knows begin, end and acceleration or turn rate of each; then the flight has no random disturbance. With
     x the state, z the given state of the target and F the transition that turns a deviation of the velocity
-    as the target turns (:meth:`.Course.carry`), the errors obey ``x(k) - z(k) = F (x(k-1) - z(k-1))``: its
-    prediction is ``x' = F x + (z(k) - F z(k-1))``, whose second term is the effect of thrust alone and zero
+    as the target turns (:meth:`.Course.propagate_deviation`), the errors obey
+    ``x(k) - z(k) = F (x(k-1) - z(k-1))``: its prediction is
+    ``x' = F x + (z(k) - F z(k-1))``, whose second term is the effect of thrust alone and zero
     in a turn. Of the measurements it knows the variances at the true position, the scans with glint, a
     constant bias, and in clutter the plot of the target. Of a coloured error it knows deviation and
     correlation time, and estimates its level as two more states.
