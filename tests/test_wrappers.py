@@ -172,10 +172,13 @@ def readings_of(sensors, steps, model=None, name="Pendulum-v1", lanes=200):
     env = vector.NoisyObservation(
         gymnasium.make_vec(name, num_envs=lanes, vectorization_mode="sync"), sensors
     )
-    readings, n = env._readings, len(env.model.names)
-    every, state = np.ones(lanes, dtype=bool), np.full((lanes, n), 0.3)
-    found = [readings.begin(every, state, list(range(lanes)))]
-    found += [readings.advance(None, state) for _ in range(steps - 1)]
+    every, state = np.ones(lanes, dtype=bool), np.full((lanes, len(env.model.names)), 0.3)
+    observation = state if env.model.observation is None else env.model.observation(state)
+    env._read(observation, every, ~every, list(range(lanes)))
+    found = [env.reading]
+    for _ in range(steps - 1):
+        env._read(observation)
+        found.append(env.reading)
     return tuple(np.array(part) for part in zip(*found, strict=True))
 
 

@@ -7,51 +7,48 @@ import gymnasium
 import numpy
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
-from .estimates import PARTS, Estimates
+from .estimates import PARTS, Estimate, Estimates
 from .models import CLASSIC_CONTROL, EnvironmentModel, find_model
-from .readings import EnvironmentSensor, Reading, Readings, sensors_of
+from .readings import EnvironmentSensor, Reading, Readings, read_sensors
 
 
 class SensorLanes(gymnasium.utils.RecordConstructorArgs):
     """Sensors of the lanes of an environment."""
 
-    reading: Reading
-    """The last readings of all lanes, not rounded to the type of the observation."""
-    events: list[tuple[bool, Any, Reading]]
-    """Readings of one time that a filter takes in at the last step or reset (:attr:`.Readings.complete`), after whether
-    lanes begin an episode or step and which lanes, booleans ``(N,)``; None: all."""
+    events: list[tuple[numpy.ndarray | None, numpy.ndarray | None, numpy.ndarray]]
+    """Of the last step or reset, what a filter takes in: which lanes begin an episode and which go on, booleans
+    ``(N,)``, None: none and all; and :attr:`.Readings.complete`."""
 
     def __init__(self, env: Any, sensors: Any, model: Any = None) -> None:
         super().__init__(sensors=sensors, model=model, _disable_deepcopy=True)
         space, _, lanes = _wrap(self, env)
         self.fields: int = check_observations(space, env.spec)
         self.model: EnvironmentModel | None = find_model(model, env.spec)
-        n = self.fields if self.model is None else check_state(self.model, self.fields)
-        self.sensors: dict[str, EnvironmentSensor]
-        self.sensors, interval = sensors_of(self.model, sensors, self.fields)
-        self._readings: Readings = Readings(self.sensors, n, interval, lanes)
+        if self.model is None:
+            names, angles = tuple(map(str, range(self.fields))), {}
+        else:
+            names, angles = check_state(self.model, self.fields), self.model.angles
+        self.sensors: dict[str, EnvironmentSensor] = read_sensors(sensors, names, angles)
+        self._readings: Readings = Readings(self.sensors, self.model, self.fields, lanes)
         is_real = numpy.issubdtype(space.dtype, numpy.floating)
         self._dtype: Any = numpy.dtype(space.dtype if is_real else numpy.float32)
         limit = self._readings.limit.astype(self._dtype)
         _set_space(self, "observation", gymnasium.spaces.Box(-limit, limit, dtype=self._dtype.type))
 
-    def _begin(
-        self, lanes: numpy.ndarray, observations: Any, seeds: Any, received: Any = False
-    ) -> numpy.ndarray:
-        """Begin episodes of some lanes, and return the readings of all."""
-        self.reading = self._readings.begin(lanes, self._state(observations), seeds, received)
-        self.events = [*self.events, (True, lanes, self._readings.complete)]
-        return self.reading.values.astype(self._dtype)
+    @property
+    def reading(self) -> Reading:
+        """The last readings of all lanes, not rounded to the type of the observation."""
+        values, available = numpy.atleast_2d(self._readings.values, self._readings.available)
+        return Reading(values.copy(), available > 0.0)
 
-    def _advance(self, lanes: numpy.ndarray | None, observations: Any) -> numpy.ndarray:
-        """Return the readings after a step of some lanes; None: of all."""
-        self.reading = self._readings.advance(lanes, self._state(observations))
-        self.events = [(False, lanes, self._readings.complete)]
-        return self.reading.values.astype(self._dtype)
-
-    def _state(self, observations: Any) -> numpy.ndarray:
-        state = numpy.asarray(observations, dtype=float)
-        return state if self.model is None else self.model.state(state)
+    def _read(
+        self, observations: Any, begins: Any = None, steps: Any = None, seeds: Any = None
+    ) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """Read the sensors, see :meth:`.Readings.read`; return the readings and whether they are received."""
+        readings = self._readings
+        readings.read(observations, begins, steps, seeds)
+        self.events = [(begins, steps, readings.complete)]
+        return readings.values.astype(self._dtype), readings.available.astype(bool)
 
 
 class FilterLanes(gymnasium.utils.RecordConstructorArgs):
@@ -67,50 +64,40 @@ class FilterLanes(gymnasium.utils.RecordConstructorArgs):
     ) -> None:
         given = {"model": model, "competitor": competitor, "show": show, "control": control}
         super().__init__(**given, _disable_deepcopy=True)
-        _, actions, lanes = _wrap(self, env)
+        space, actions, lanes = _wrap(self, env)
         self._sensors: SensorLanes = find_sensors(env)
         found = self._sensors.model if model is None else find_model(model, env.spec)
         self.model: EnvironmentModel = check_model(found, self._sensors, actions)
-        kept = competitor, control, check_shown(show, self.model), lanes
+        kept = competitor, control, check_shown(show, self.model), actions, lanes
         self._estimates: Estimates = Estimates(self.model, self._sensors.sensors, *kept)
         joined = joint_space(actions, self._estimates.action_space)
         self._joins, self._own_actions = isinstance(joined, gymnasium.spaces.Box), actions
-        _set_space(self, "observation", self._estimates.space(self._sensors._dtype.type))
+        self._dtype: Any = self._sensors._dtype
+        shape = self._estimates.shown.shape[-1:]
+        _set_space(self, "observation", gymnasium.spaces.Box(-numpy.inf, numpy.inf, shape, self._dtype.type))
         _set_space(self, "action", joined)
 
     @property
-    def estimates(self) -> Estimates:
-        """The filters, with mean, deviation, NIS and innovation of all lanes."""
-        return self._estimates
+    def estimates(self) -> Estimate:
+        """The last estimates of all lanes, not rounded to the type of the observation."""
+        return self._estimates.estimate
 
-    def _split(self, action: Any) -> tuple[Any, numpy.ndarray | None]:
+    def _split(self, action: Any) -> tuple[Any, Any]:
         """Return the environment's action, and that of the filter behind it on the last axis; None without control."""
         if self._estimates.action_space is None:
             return action, None
         if not self._joins:
-            return action[0], numpy.asarray(action[1], dtype=float)
+            return action
         count, joined = self._own_actions.shape[-1], numpy.asarray(action)  # type: ignore[index]
-        return joined[..., :count], joined[..., count:].astype(float)
+        return joined[..., :count], joined[..., count:]
 
-    def _take(self, actions: Any, own: numpy.ndarray | None) -> numpy.ndarray | None:
-        """Take in the readings of a step or reset; return the estimates before lanes began anew, None where none did.
-
-        Args:
-            actions: of all lanes; None: of a reset.
-            own: of the filters.
-        """
-        last, estimates = None, self._estimates
-        for begins, lanes, reading in self._sensors.events:
-            if begins:
-                last = None if actions is None else self._shown()
-                estimates.begin(lanes, reading)
-            else:
-                estimates.advance(lanes, inputs_of(self.model, numpy.asarray(actions)), reading, own)
-        return last
-
-    def _shown(self) -> numpy.ndarray:
-        """Return the observations of all lanes."""
-        return self._estimates.show(self._sensors._dtype)
+    def _take(self, actions: Any, own: Any) -> list[numpy.ndarray]:
+        """Take in the readings of a step, or of a reset without actions; return the observations after each event."""
+        shown, estimates = [], self._estimates
+        for begins, steps, complete in self._sensors.events:
+            estimates.advance(complete, actions, own, begins, steps)
+            shown.append(estimates.shown.astype(self._dtype))
+        return shown
 
 
 def _wrap(wrapper: Any, env: Any) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any], int]:
@@ -155,14 +142,14 @@ def check_observations(space: gymnasium.Space[Any], spec: Any) -> int:
     )
 
 
-def check_state(model: EnvironmentModel, fields: int) -> int:
-    """Return the number of components of a model, or raise ValueError where it makes no state of the observation."""
-    n = len(model.names)
+def check_state(model: EnvironmentModel, fields: int) -> tuple[str, ...]:
+    """Return the names of a model's components, or raise ValueError where it makes no state of the observation."""
+    names = tuple(model.names)
     with contextlib.suppress(IndexError):
-        if model.state(numpy.zeros((1, fields))).shape == (1, n):
-            return n
+        if model.state(numpy.zeros((1, fields))).shape == (1, len(names)):
+            return names
     raise ValueError(
-        f"the observation has {fields} fields, of which the model does not make its state of {n}, "
+        f"the observation has {fields} fields, of which the model does not make its state of {len(names)}, "
         f"{', '.join(model.names)}: let NoisyObservation stand below wrappers that change the observation, or give a "
         "model whose state= reads it"
     )

@@ -136,7 +136,7 @@ CLASSIC_CONTROL = {
             [numpy.arctan2(o[:, 1], o[:, 0]), numpy.arctan2(o[:, 3], o[:, 2]), o[:, 4], o[:, 5]]).T,
         observation=lambda x: numpy.array(
             [numpy.cos(x[:, 0]), numpy.sin(x[:, 0]), numpy.cos(x[:, 1]), numpy.sin(x[:, 1]), x[:, 2], x[:, 3]]).T,
-        action=lambda action: numpy.asarray(action, dtype=float)[:, None] - 1.0,
+        action=lambda action: action[:, None] - 1.0,
     ),
 }  # fmt: skip
 """Models by the names of Gymnasium's environments, without versions."""
